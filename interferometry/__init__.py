@@ -1,0 +1,1 @@
+"""Laser-interferometer files to compensated deviations, drift-free statistics and anomalies."""

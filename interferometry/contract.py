@@ -1,0 +1,16 @@
+"""What crosses the border of interferometry: names, dims, units and kinds of the deviations.
+
+A contract maps a variable's name to ``(dims, units, kind)``, kind being a NumPy dtype kind (``f``, ``i``, ``u``, ``M``).
+"""
+
+from __future__ import annotations
+
+Contract = dict[str, tuple[tuple[str, ...], str, str]]
+
+#: Deviations per cycle, direction ("positive", "negative") and target; missing readings are NaN with time NaT.
+DEVIATIONS: Contract = {
+    "deviation": (("cycle", "direction", "target"), "um", "f"),
+    "time": (("cycle", "direction", "target"), "", "M"),
+    "position": (("target",), "mm", "f"),
+    "quality_flag": (("cycle", "direction", "target"), "1", "u"),
+}

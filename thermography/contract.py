@@ -1,0 +1,20 @@
+"""What crosses the border of thermography: names, dims, units and kinds of the per-cycle fields.
+
+A contract maps a variable's name to ``(dims, units, kind)``, kind being a NumPy dtype kind (``f``, ``i``, ``u``, ``M``).
+"""
+
+from __future__ import annotations
+
+Contract = dict[str, tuple[tuple[str, ...], str, str]]
+
+#: Fields on the table plan; ``x`` and ``y`` are plan millimetres, ``cycle`` counts from 1.
+FIELDS: Contract = {
+    "temperature": (("cycle", "y", "x"), "degC", "f"),
+    "temperature_u": (("cycle", "y", "x"), "K", "f"),
+    "temperature_rise": (("cycle", "y", "x"), "K", "f"),
+    "temperature_rise_u": (("cycle", "y", "x"), "K", "f"),
+    "temperature_spread": (("cycle", "y", "x"), "K", "f"),
+    "count": (("cycle", "y", "x"), "1", "i"),
+    "cycle_time": (("cycle",), "", "M"),
+    "frame_temperature": (("time", "y", "x"), "degC", "f"),
+}
