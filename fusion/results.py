@@ -1,0 +1,129 @@
+"""L5 - results.json: one document with every finding of a run, and the JSON Schema that describes it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+SCHEMA_VERSION = 1
+CAUSES = ("structural", "local_temperature", "stick_slip", "step", "undetermined")
+VERDICTS = ("complete", "explained", "partial", "unexplained")
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something left out or doubtful: what, by how much it may move the result, and what to do about it.
+
+    Parameters
+    ----------
+    code : str
+        Short name, for programs.
+    message : str
+        One sentence with counts and names, for people.
+    effect_um : float or None
+        Size of the effect on the drift in um, None where it cannot be said.
+    remedy : str
+        What would remove the warning.
+    """
+
+    code: str
+    message: str
+    remedy: str
+    effect_um: float | None = None
+
+
+#: Parts of results.json that a run may add, besides schema, campaign and warnings.
+PARTS = ("registration", "alignment", "iso230", "neighbours", "drift", "anomalies", "hotspots", "loop")
+
+
+def assemble(title: str, parts: Mapping[str, Any], warnings: Sequence[Notice]) -> dict[str, Any]:
+    """Return the results document from what the stages found, in the order of the schema."""
+    document: dict[str, Any] = {
+        "schema": SCHEMA_VERSION,
+        "campaign": title,
+        "warnings": [asdict(item) for item in warnings],
+    }
+    document.update({name: parts[name] for name in PARTS if name in parts})
+    return document
+
+
+def _of(**properties: Any) -> dict[str, Any]:
+    """An object whose properties are all required and that holds no others."""
+    return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
+
+
+def _list(items: Any) -> dict[str, Any]:
+    return {"type": "array", "items": items}
+
+
+def _map(values: Any) -> dict[str, Any]:
+    return {"type": "object", "additionalProperties": values}
+
+
+def results_schema() -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of results.json. A number is null where the data do not determine it."""
+    text = {"type": "string"}
+    number = {"type": ["number", "null"]}
+    measured = _of(value=number, u=number)
+    by_direction = {
+        "type": "object",
+        "properties": {"positive": _list(number), "negative": _list(number)},
+        "additionalProperties": False,
+    }
+    step = _of(
+        effect=text,
+        parameters=_map({}),
+        p_value=number,
+        rmse_before_um=number,
+        rmse_after_um=number,
+        runner_up=_map({}),
+    )
+    properties = {
+        "schema": {"const": SCHEMA_VERSION},
+        "campaign": text,
+        "warnings": _list(_of(code=text, message=text, remedy=text, effect_um=number)),
+        "registration": _of(rms_mm=number, leave_one_out_mm=_map(number), frames_rejected=_list(_map({}))),
+        "alignment": _of(clock_offset_s=measured),
+        "iso230": _of(window=text, B_um=measured, R_um=measured, E_um=measured, M_um=measured, A_um=measured),
+        "neighbours": _of(conventional_s_um=by_direction, pair_s_um=by_direction, ratio=by_direction),
+        "drift": _of(profile_um=by_direction, profile_u_um=by_direction, scatter_um=by_direction),
+        "anomalies": _list(
+            _of(
+                target={"type": "integer", "minimum": 1},
+                direction={"enum": ["positive", "negative", "both"]},
+                p_value=number,
+                scatter_um=number,
+                cause={"enum": list(CAUSES)},
+                evidence=_map({}),
+            )
+        ),
+        "hotspots": _list(
+            _of(
+                x_mm=number,
+                y_mm=number,
+                peak_rise_K=number,
+                targets=_list({"type": "integer"}),
+                p_value=number,
+                lag_s=number,
+            )
+        ),
+        "loop": _of(
+            declared=_list(text),
+            held_out=text,
+            noise_floor_um=number,
+            rmse_declared_um=number,
+            rmse_final_um=number,
+            steps=_list(step),
+            verdict={"enum": list(VERDICTS)},
+            unexplained=_of(shape=text, rms_um=number),
+        ),
+    }
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "thermofuse results",
+        "type": "object",
+        "properties": properties,
+        "required": ["schema", "campaign", "warnings"],
+        "additionalProperties": False,
+    }
