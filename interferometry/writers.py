@@ -164,4 +164,5 @@ def write_environment_csv(path: str | Path, environment: xr.Dataset) -> None:
 
 
 def _iso_utc(time: np.datetime64) -> str:
-    return f"{time.astype("datetime64[ms]")}+00:00"
+    milliseconds = time.astype("datetime64[ms]")
+    return f"{milliseconds}+00:00"
