@@ -1,0 +1,21 @@
+"""around - A machine with known truth: simulates a campaign and writes the files that real instruments would write.
+
+`simulate` gives every reading and its parts without rendering a frame; `write_campaign` renders the frames and writes the folder;
+`simulate_campaign` does both from a RECIPE.toml.
+"""
+
+from fusion.twin.instruments import simulate_campaign, truth_folder, write_campaign
+from fusion.twin.recipe import Recipe, RecipeError
+from fusion.twin.recipe_file import read_recipe
+from fusion.twin.simulate import Truth, simulate
+
+__all__ = [
+    "Recipe",
+    "RecipeError",
+    "Truth",
+    "read_recipe",
+    "simulate",
+    "simulate_campaign",
+    "truth_folder",
+    "write_campaign",
+]

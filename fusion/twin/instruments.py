@@ -1,0 +1,249 @@
+"""around - The twin's instruments: a campaign folder as a laboratory would leave it, and the truth in a folder beside it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from fusion.twin.camera import SC660, Renderer, fiducial_points, make_view
+from fusion.twin.recipe import RecipeError
+from fusion.twin.recipe_file import read_recipe
+from fusion.twin.simulate import Truth, driver_log, environment_log, simulate, spread
+from fusion.twin.streams import stream
+from interferometry.writers import write_deviations_csv, write_environment_csv, write_rtl
+
+Progress = Callable[[int, int, str], None]
+TRUTH_CELL_MM = 2.5
+LOGGED = (
+    ("air_temperature", "degC"),
+    ("air_pressure", "hPa"),
+    ("relative_humidity", "percent"),
+    ("material_temperature", "degC"),
+)
+
+
+def simulate_campaign(recipe_path: Path, out: Path, *, progress: Progress | None = None) -> Path:
+    """Simulate the campaign of a RECIPE.toml and write it.
+
+    Parameters
+    ----------
+    recipe_path : Path
+        The recipe.
+    out : Path
+        Folder of the campaign; the truth goes to ``<out>-truth`` beside it. Both must be absent or empty.
+    progress : callable, optional
+        Called as ``progress(done, total, what)``.
+
+    Returns
+    -------
+    Path
+        The campaign file, ``<out>/campaign.toml``.
+
+    Raises
+    ------
+    RecipeError
+        The recipe is wrong, or a folder is in the way.
+    """
+    recipe = read_recipe(Path(recipe_path))
+    _check_free(Path(out))
+    return write_campaign(simulate(recipe), Path(out), progress=progress)
+
+
+def truth_folder(out: Path) -> Path:
+    """Return where the truth of the campaign in `out` is kept: beside it, never inside."""
+    out = Path(out).resolve()
+    return out.with_name(f"{out.name}-truth")
+
+
+def write_campaign(truth: Truth, out: Path, *, progress: Progress | None = None) -> Path:
+    """Write a simulated campaign: frames, laser, environment, drivers, fiducials, campaign file; the truth beside it.
+
+    Parameters
+    ----------
+    truth : Truth
+        From `simulate`.
+    out : Path
+        Folder of the campaign; must be absent or empty.
+    progress : callable, optional
+        Called as ``progress(done, total, what)``.
+
+    Returns
+    -------
+    Path
+        The campaign file.
+
+    Raises
+    ------
+    RecipeError
+        `out` or the truth's folder holds something already.
+    """
+    out = Path(out)
+    _check_free(out)
+    out.mkdir(parents=True, exist_ok=True)
+    truth_folder(out).mkdir(parents=True, exist_ok=True)
+    _write_laser(truth, out)
+    write_environment_csv(out / "environment.csv", environment_log(truth))
+    _write_drivers(truth, out / "drivers.csv")
+    _write_fiducials(truth, out / "fiducials.csv")
+    (out / "campaign.toml").write_text(campaign_text(truth), encoding="utf-8")
+    _write_truth(truth, truth_folder(out))
+    _write_frames(truth, out / "thermal", progress)
+    return out / "campaign.toml"
+
+
+def campaign_text(truth: Truth) -> str:
+    """Return the campaign file that the person at this machine would write, with what that person knows."""
+    recipe = truth.recipe
+    camera, plan = recipe.camera, recipe.plan
+    clock = f'clock_offset = "{camera.clock_offset_s:g} s"\n' if camera.state_clock_offset else ""
+    dead_path = 'dead_path = "0 mm"\n' if recipe.laser.file == "csv" else ""
+    environment = 'environment = "environment.csv"\n'
+    return f"""[campaign]
+title = {json.dumps(recipe.campaign.title)}
+axis = {json.dumps(recipe.campaign.axis)}
+
+[thermography]
+frames = ["thermal/*.{camera.file}"]
+emissivity = {camera.emissivity:g}
+reflected_temperature = "{camera.reflected_temperature_degC:g} degC"
+atmospheric_temperature = "{camera.atmospheric_temperature_degC:g} degC"
+relative_humidity = {camera.relative_humidity:g}
+object_distance = "{camera.distance_mm * 1e-3:g} m"
+{clock}table = "{camera.table}"
+
+[plan]
+size = ["{plan.width_mm:g} mm", "{plan.height_mm:g} mm"]
+cell_size = "5 mm"
+fiducials = "fiducials.csv"
+
+[plan.axis]
+origin = ["{plan.origin_mm[0]:g} mm", "{plan.origin_mm[1]:g} mm"]
+direction = [{plan.direction[0]:g}, {plan.direction[1]:g}]
+
+[interferometry]
+deviations = "laser.{recipe.laser.file}"
+{environment}{dead_path}expansion_coefficient = "{recipe.laser.stated_expansion_ppm_per_K:g} ppm/K"
+
+[drivers]
+file = "drivers.csv"
+
+[model]
+declared = ["axis_expansion", "table_offset"]
+"""
+
+
+def _check_free(out: Path) -> None:
+    """Refuse to write over anything."""
+    for folder in (out, truth_folder(out)):
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise RecipeError(f"{folder} exists and is not an empty folder; name another output folder or empty it")
+
+
+def _write_laser(truth: Truth, out: Path) -> None:
+    """Write the deviations in the order they were taken; a lost reading has no row (CSV) or the sentinel (.rtl)."""
+    deviations = truth.readings[["deviation", "time"]]
+    if truth.recipe.laser.file == "rtl":
+        log = environment_log(truth)
+        ends = {f"{name}_{unit}": (float(log[name][0]), float(log[name][-1])) for name, unit in LOGGED}
+        write_rtl(out / "laser.rtl", deviations, environment=ends, user_text={"axis": truth.recipe.campaign.axis})
+    else:
+        write_deviations_csv(out / "laser.csv", deviations)
+
+
+def _write_drivers(truth: Truth, path: Path) -> None:
+    """Write the load as logged once a minute."""
+    log = driver_log(truth)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(["time", "duty [1]"])
+        for time, duty in zip(log["time"].values, log["duty"].values, strict=True):
+            rows.writerow([f"{np.datetime_as_string(time, unit='ms')}+00:00", f"{duty:.3f}"])
+
+
+def _write_fiducials(truth: Truth, path: Path) -> None:
+    """Write the discs' places on the plan with pixel positions as rough as somebody reads them off a screen."""
+    plan = truth.recipe.plan
+    points = fiducial_points(plan)
+    pixels = make_view(truth.recipe.camera).to_sensor(points)
+    pixels += stream(truth.recipe.campaign.seed, "pixel hints").normal(0.0, plan.hint_error_px, pixels.shape)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(["name", "x_mm", "y_mm", "diameter_mm", "column_px", "row_px"])
+        for number, (point, pixel) in enumerate(zip(points, pixels, strict=True), 1):
+            rows.writerow(
+                [
+                    f"F{number}",
+                    f"{point[0]:g}",
+                    f"{point[1]:g}",
+                    f"{plan.fiducial_diameter_mm:g}",
+                    *(f"{p:.0f}" for p in pixel),
+                ]
+            )
+
+
+def _write_truth(truth: Truth, folder: Path) -> None:
+    """Write truth.nc (readings and their parts, fields at the frames' times) and truth.json (numbers)."""
+    plan, recipe = truth.recipe.plan, truth.recipe
+    x = np.arange(0.5 * TRUTH_CELL_MM, plan.width_mm, TRUTH_CELL_MM)
+    y = np.arange(0.5 * TRUTH_CELL_MM, plan.height_mm, TRUTH_CELL_MM)
+    per_cycle = (np.arange(truth.schedule.cycles) + 0.5) * truth.schedule.period_s
+    field_s = truth.session.frame_s if recipe.camera.table == "still" else per_cycle
+    fields = xr.Dataset(
+        {
+            "temperature": (
+                ("field_time", "y", "x"),
+                truth.temperature(field_s, x, y).astype(np.float32),
+                {"units": "degC"},
+            )
+        },
+        coords={"field_time": truth.clock(field_s).astype("datetime64[ns]"), "y": y, "x": x},
+    )
+    readings = truth.readings.drop_encoding()
+    xr.merge([readings, fields, truth.frames]).to_netcdf(folder / "truth.nc", engine="h5netcdf")
+    view = make_view(recipe.camera)
+    moving = {name: spread(truth.in_order(name), truth.session) for name in truth.parts}
+    content = {
+        "recipe": asdict(recipe),
+        "parts_rms_um": moving,
+        "declared": ["axis_expansion", "table_offset"],
+        "undeclared": [effect.name for effect in recipe.effect],
+        "anomalies": [asdict(anomaly) for anomaly in recipe.anomaly],
+        "clock_offset_s": recipe.camera.clock_offset_s,
+        "plan_to_sensor": view.homography.tolist(),
+        "distortion": {"k1": view.k1, "focal_px": view.focal_px, "centre_px": list(view.centre_px)},
+        "knock": {"cycle": recipe.camera.knock_cycle, "px": list(recipe.camera.knock_px)}
+        if recipe.camera.knock_cycle
+        else None,
+    }
+    (folder / "truth.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def _write_frames(truth: Truth, folder: Path, progress: Progress | None) -> None:
+    """Render every frame and write it as the camera would, with its clock, its settings and its own temperatures."""
+    from thermography.flir import CameraParameters, write_jpeg
+
+    camera = truth.recipe.camera
+    folder.mkdir()
+    renderer = Renderer(truth)
+    parameters = CameraParameters(
+        emissivity=camera.emissivity,
+        object_distance_m=camera.distance_mm * 1e-3,
+        reflected_temperature_K=camera.reflected_temperature_degC + 273.15,
+        atmospheric_temperature_K=camera.atmospheric_temperature_degC + 273.15,
+        window_temperature_K=camera.atmospheric_temperature_degC + 273.15,
+        window_transmission=1.0,
+        stored_transmission=0.0,
+        relative_humidity=camera.relative_humidity,
+        **SC660,
+    )
+    times = truth.clock(truth.session.frame_s + camera.clock_offset_s)
+    for number in range(times.size):
+        write_jpeg(folder / f"IR_{number + 1:04d}.jpg", renderer.render(number), parameters, times[number])
+        if progress is not None:
+            progress(number + 1, times.size, "render frames")
