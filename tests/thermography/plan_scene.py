@@ -1,0 +1,100 @@
+"""A table with known truth, rendered to the sensor with 4 x 4 rays per pixel through OpenCV's own lens model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from thermography.plan import Fiducial, PlanGrid
+
+GRID = PlanGrid(700, 180, 5)
+PLACES = [
+    (40, 20),
+    (200, 18),
+    (360, 16),
+    (520, 18),
+    (665, 22),
+    (40, 160),
+    (200, 163),
+    (360, 165),
+    (520, 162),
+    (665, 158),
+    (120, 90),
+    (600, 88),
+]
+DISCS = [Fiducial(f"F{i}", x, y, 16.0) for i, (x, y) in enumerate(PLACES, 1)]
+FOCAL_PX = 1530.0
+
+
+def smooth_field(x, y):
+    """Degrees Celsius: a gradient along the table and one warm zone of 90 mm."""
+    return 23.0 + 0.004 * x + 0.003 * y + 2.5 * np.exp(-((x - 450) ** 2 + (y - 80) ** 2) / (2 * 90.0**2))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Camera, lens and table of one rendered frame; the table may stand `shift_mm` off its place."""
+
+    corners_px: tuple = ((30, 118), (585, 92), (612, 325), (28, 352))
+    k1: float = 0.0
+    shape: tuple[int, int] = (480, 640)
+    disc_K: float = -1.5
+    discs: list = field(default_factory=lambda: DISCS)
+    field: Callable = smooth_field
+    outside: float = 22.5
+    shift_mm: tuple[float, float] = (0.0, 0.0)
+    shift_px: tuple[float, float] = (0.0, 0.0)
+    rays: int = 4
+
+    @property
+    def camera_matrix(self):
+        return np.array([[FOCAL_PX, 0, (self.shape[1] - 1) / 2], [0, FOCAL_PX, (self.shape[0] - 1) / 2], [0, 0, 1]])
+
+    @property
+    def plan_to_pixel(self):
+        corners = np.array([(0, 0), (700, 0), (700, 180), (0, 180)], "f4")
+        return cv2.getPerspectiveTransform(corners, np.array(self.corners_px, "f4"))
+
+    def to_plan(self, points_px):
+        """True plan place of sensor points (n, 2)."""
+        points = np.ascontiguousarray(points_px, float) - self.shift_px
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+        ideal = (
+            cv2.undistortPoints(
+                points.reshape(-1, 1, 2),
+                self.camera_matrix,
+                np.array([self.k1, 0, 0, 0]),
+                None,
+                None,
+                self.camera_matrix,
+                criteria,
+            )
+            if self.k1
+            else points.reshape(-1, 1, 2)
+        )
+        return cv2.perspectiveTransform(ideal, np.linalg.inv(self.plan_to_pixel)).reshape(-1, 2) - self.shift_mm
+
+    def render(self, rng=None, noise_K=0.05):
+        """One frame in degC, float64 (row, column)."""
+        rows, columns = self.shape
+        steps = (np.arange(self.rays) + 0.5) / self.rays - 0.5
+        column, row = np.meshgrid(
+            (np.arange(columns)[:, None] + steps).ravel(), (np.arange(rows)[:, None] + steps).ravel()
+        )
+        x, y = self.to_plan(np.stack([column, row], axis=-1).reshape(-1, 2)).T
+        value = np.where((x >= 0) & (x <= 700) & (y >= 0) & (y <= 180), self.field(x, y), self.outside)
+        for disc in self.discs:
+            inside = (x - disc.x_mm) ** 2 + (y - disc.y_mm) ** 2 < (disc.diameter_mm / 2) ** 2
+            value = np.where(inside, smooth_field(450, 80) - 2.5 + self.disc_K, value)
+        frame = value.reshape(rows, self.rays, columns, self.rays).mean(axis=(1, 3))
+        return frame if rng is None else frame + rng.normal(0, noise_K, frame.shape)
+
+    def registration_rms_mm(self, registration):
+        """Root mean square distance over the plan between the registration and the truth, mm."""
+        x, y = np.meshgrid(GRID.x_mm, GRID.y_mm)
+        plan = np.stack([x, y], axis=-1).reshape(-1, 2)
+        error = self.to_plan(registration.to_sensor(plan)) - plan
+        return float(np.sqrt((error**2).sum(axis=1).mean()))
