@@ -4,15 +4,21 @@
 `simulate_campaign` does both from a RECIPE.toml.
 """
 
+from fusion.twin.datasets import deviations_of, fields_of
 from fusion.twin.instruments import simulate_campaign, truth_folder, write_campaign
 from fusion.twin.recipe import Recipe, RecipeError
-from fusion.twin.recipe_file import read_recipe
-from fusion.twin.simulate import Truth, simulate
+from fusion.twin.recipe_file import packaged_recipe, read_recipe
+from fusion.twin.simulate import Truth, driver_log, environment_log, simulate
 
 __all__ = [
     "Recipe",
     "RecipeError",
     "Truth",
+    "deviations_of",
+    "driver_log",
+    "environment_log",
+    "fields_of",
+    "packaged_recipe",
     "read_recipe",
     "simulate",
     "simulate_campaign",

@@ -5,13 +5,16 @@ The forward formula is the vendor's measurement equation (FLIR user's manuals, "
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
+from fusion.twin.effects import EFFECTS
 from fusion.twin.recipe import Camera, Plan
 from fusion.twin.simulate import Truth
 from fusion.twin.streams import stream
@@ -32,7 +35,7 @@ SC660 = {
     "atmosphere_beta2": -0.006670,
     "atmosphere_x": 1.9,
 }
-SUBSAMPLES = 4
+SUBSAMPLES = 8
 FIELD_STEP_MM = 1.0
 SURROUND_EMISSIVITY = 0.95
 
@@ -78,7 +81,7 @@ class View:
         seen = (np.asarray(points_px, dtype=float) - self.centre_px) / self.focal_px
         radius = np.hypot(seen[:, 0], seen[:, 1])
         ideal = radius.copy()
-        for _ in range(12):
+        for _ in range(6):
             ideal -= (ideal * (1.0 + self.k1 * ideal**2) - radius) / (1.0 + 3.0 * self.k1 * ideal**2)
         scale = np.divide(ideal, radius, out=np.ones_like(radius), where=radius > 0)
         points = (
@@ -115,12 +118,12 @@ def fiducial_points(plan: Plan) -> Floats:
 
 @dataclass(frozen=True)
 class Scene:
-    """What every pixel looks at for one place of the table: coverage by table and discs (0..1), and the plan point, mm."""
+    """What every pixel looks at for one place of the table: coverage by table and discs (0..1), and where on the fine field."""
 
     table: Image
     disc: Image
-    x_mm: Image
-    y_mm: Image
+    column_of_field: Image
+    row_of_field: Image
 
 
 class Renderer:
@@ -148,6 +151,8 @@ class Renderer:
         self.transmission = air_transmission(
             self.camera.distance_mm * 1e-3, self.camera.atmospheric_temperature_degC, self.camera.relative_humidity
         )
+        self._looks_at: dict[bool, Floats] = {}
+        self._steps: dict[bool, Sequence[Floats]] = {}
         self._scene: tuple[tuple[float, bool], Scene] | None = None
 
     def scene(self, position_mm: float, knocked: bool) -> Scene:
@@ -159,30 +164,28 @@ class Renderer:
 
     def render(self, number: int) -> NDArray[np.uint16]:
         """Return the counts (row, column) of frame `number` (from 0)."""
-        frames = self.truth.frames.isel(frame=number)
-        scene = self.scene(float(frames["table_position"]), bool(frames["knocked"]))
-        time_s = float(frames["time_s"])
-        field = self.truth.temperature(np.array([time_s]), self.x_mm, self.y_mm)[0].astype(np.float32)
-        surface = np.asarray(
-            cv2.remap(field, scene.x_mm, scene.y_mm, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32
-        )
-        counts = self._radiance(surface, scene, time_s, float(frames["reflected_K"]))
+        frame = self.truth.frames.isel(frame=number)
+        scene = self.scene(float(frame["table_position"]), bool(frame["knocked"]))
+        field = self.truth.temperature(np.array([float(frame["time_s"])]), self.x_mm, self.y_mm)[0].astype(np.float32)
+        where = (scene.column_of_field, scene.row_of_field)
+        surface = np.asarray(cv2.remap(field, *where, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+        counts = self._radiance(surface, scene, frame)
         if self.camera.blur_px > 0:
             counts = np.asarray(cv2.GaussianBlur(counts, (0, 0), self.camera.blur_px), np.float32)
         noise = self.noise.standard_normal(counts.shape, dtype=np.float32) * np.float32(self.camera.netd_K * self.slope)
-        counts += noise + self.pattern + np.float32(float(frames["camera_offset_K"]) * self.slope)
+        counts += noise + self.pattern + np.float32(float(frame["camera_offset_K"]) * self.slope)
         return np.asarray(np.clip(np.rint(counts), 0, 65535), dtype=np.uint16)
 
-    def _radiance(self, surface: Image, scene: Scene, time_s: float, reflected_K: float) -> Image:
+    def _radiance(self, surface: Image, scene: Scene, frame: xr.Dataset) -> Image:
         """Return noiseless counts: table, discs and surround each send what they emit and mirror, through the air."""
         camera = self.camera
         mirrored = np.float32(counts_of(camera.reflected_temperature_degC))
         own = counts_of(surface).astype(np.float32)
         table = camera.emissivity * own + (1.0 - camera.emissivity) * mirrored
-        if reflected_K:
-            table += (1.0 - camera.emissivity) * self._spot(scene, reflected_K)
+        if float(frame["reflected_K"]) != 0.0:
+            table += (1.0 - camera.emissivity) * self._spot(bool(frame["knocked"]), float(frame["reflected_K"]))
         disc = camera.disc_emissivity * own + (1.0 - camera.disc_emissivity) * mirrored
-        room = float(np.interp(time_s, self.truth.session.grid_s, self.truth.session.air_degC))
+        room = float(np.interp(float(frame["time_s"]), self.truth.session.grid_s, self.truth.session.air_degC))
         surround = SURROUND_EMISSIVITY * counts_of(room) + (1.0 - SURROUND_EMISSIVITY) * mirrored
         leaving = surround + scene.table * (table - surround) + scene.disc * (disc - surround)
         through = self.transmission * leaving + (1.0 - self.transmission) * counts_of(
@@ -190,34 +193,58 @@ class Renderer:
         )
         return np.asarray(through, dtype=np.float32)
 
-    def _spot(self, scene: Scene, reflected_K: float) -> Image:
+    def _spot(self, knocked: bool, reflected_K: float) -> Image:
         """Return the additional counts of a warm body that mirrors in a part of the table; fixed in the room, not on the table."""
-        place = next(e for e in self.truth.recipe.effect if e.name == "reflected_source").parameters
-        x, y, width = place.get("x_mm", 480.0), place.get("y_mm", 60.0), place.get("spread_mm", 45.0)
-        weight = np.exp(-0.5 * ((scene.x_mm - x) ** 2 + (scene.y_mm - y) ** 2) / width**2)
+        recipe = self.truth.recipe
+        spot = (
+            EFFECTS["reflected_source"].parameters
+            | next(e for e in recipe.effect if e.name == "reflected_source").parameters
+        )
+        x_mm, y_mm = self._looks_at[knocked][..., 0], self._looks_at[knocked][..., 1]
+        weight = np.exp(-0.5 * ((x_mm - spot["x_mm"]) ** 2 + (y_mm - spot["y_mm"]) ** 2) / spot["spread_mm"] ** 2)
         background = self.camera.reflected_temperature_degC
         return np.asarray(weight * float(counts_of(background + reflected_K) - counts_of(background)), dtype=np.float32)
 
     def _make_scene(self, position_mm: float, knocked: bool) -> Scene:
+        """Cover every pixel: by its centre where it lies wholly on one thing, by `SUBSAMPLES` squared points at the edges."""
         camera, plan = self.camera, self.plan
         view = self.knocked_view if knocked else self.view
         moved = np.array(plan.direction) * position_mm
-        step = 1.0 / SUBSAMPLES
-        offsets = (np.arange(SUBSAMPLES) + 0.5) * step - 0.5
-        columns = (np.arange(camera.columns)[:, None] + offsets).ravel()
-        rows = (np.arange(camera.rows)[:, None] + offsets).ravel()
-        grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        at = view.to_plan(grid) + moved
-        on_table = (at[:, 0] >= 0) & (at[:, 0] <= plan.width_mm) & (at[:, 1] >= 0) & (at[:, 1] <= plan.height_mm)
-        on_disc = np.zeros(len(at), dtype=bool)
-        for x, y in fiducial_points(plan):
-            near = (np.abs(at[:, 0] - x) < plan.fiducial_diameter_mm) & on_table
-            on_disc[near] |= np.hypot(at[near, 0] - x, at[near, 1] - y) <= 0.5 * plan.fiducial_diameter_mm
-        shape = (camera.rows, SUBSAMPLES, camera.columns, SUBSAMPLES)
-        place = at.reshape(*shape, 2).mean(axis=(1, 3)).astype(np.float32)
+        if knocked not in self._looks_at:
+            pixels = np.stack(np.meshgrid(np.arange(camera.columns), np.arange(camera.rows)), axis=-1)
+            self._looks_at[knocked] = view.to_plan(pixels.reshape(-1, 2)).reshape(camera.rows, camera.columns, 2)
+            self._steps[knocked] = np.gradient(self._looks_at[knocked], axis=(1, 0))
+        at = self._looks_at[knocked] + moved
+        to_border, to_disc = self._distances(at.reshape(-1, 2))
+        per_column, per_row = (step.reshape(-1, 2) for step in self._steps[knocked])
+        reach = 0.8 * float(np.abs(per_column).max())
+        table = ((to_border > 0) & (to_disc < 0)).astype(np.float32)
+        disc = ((to_border > 0) & (to_disc >= 0)).astype(np.float32)
+        edge = np.flatnonzero(np.minimum(np.abs(to_border), np.abs(to_disc)) < reach)
+        offsets = (np.arange(SUBSAMPLES) + 0.5) / SUBSAMPLES - 0.5
+        right, down = (o.reshape(1, -1, 1) for o in np.meshgrid(offsets, offsets))
+        fine = at.reshape(-1, 2)[edge, None] + per_column[edge, None] * right + per_row[edge, None] * down
+        fine_border, fine_disc = self._distances(fine.reshape(-1, 2))
+        table[edge] = ((fine_border > 0) & (fine_disc < 0)).reshape(edge.size, -1).mean(axis=1)
+        disc[edge] = ((fine_border > 0) & (fine_disc >= 0)).reshape(edge.size, -1).mean(axis=1)
+        shape = (camera.rows, camera.columns)
+        size = np.array([plan.width_mm, plan.height_mm])
+        place = (np.clip(at, 0.0, size) / FIELD_STEP_MM).astype(np.float32)
         return Scene(
-            table=(on_table & ~on_disc).reshape(shape).mean(axis=(1, 3)).astype(np.float32),
-            disc=on_disc.reshape(shape).mean(axis=(1, 3)).astype(np.float32),
-            x_mm=np.ascontiguousarray(np.clip(place[..., 0], 0, plan.width_mm)) / np.float32(FIELD_STEP_MM),
-            y_mm=np.ascontiguousarray(np.clip(place[..., 1], 0, plan.height_mm)) / np.float32(FIELD_STEP_MM),
+            table=table.reshape(shape),
+            disc=disc.reshape(shape),
+            column_of_field=np.ascontiguousarray(place[..., 0]),
+            row_of_field=np.ascontiguousarray(place[..., 1]),
         )
+
+    def _distances(self, at_mm: Floats) -> tuple[Floats, Floats]:
+        """Return how far inside the table's border and inside the nearest disc's rim points (n, 2) lie, mm, negative outside."""
+        x, y = np.ascontiguousarray(at_mm[:, 0]), np.ascontiguousarray(at_mm[:, 1])
+        to_border = np.minimum(np.minimum(x, self.plan.width_mm - x), np.minimum(y, self.plan.height_mm - y))
+        diameter = self.plan.fiducial_diameter_mm
+        to_disc = np.full(len(at_mm), -diameter)
+        for disc_x, disc_y in fiducial_points(self.plan):
+            near = np.flatnonzero(np.abs(x - disc_x) < diameter)
+            near = near[np.abs(y[near] - disc_y) < diameter]
+            to_disc[near] = 0.5 * diameter - np.hypot(x[near] - disc_x, y[near] - disc_y)
+        return to_border, to_disc

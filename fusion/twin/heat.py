@@ -96,8 +96,9 @@ def solve_plate(
         else np.zeros((grid_s.size, rate.size))
     )
     heating[:, 0] += table.convection_W_per_m2K * air_rise / capacity
-    decay = np.exp(-rate * (grid_s[1] - grid_s[0]))
-    gain = (1.0 - decay) / rate
+    step_s = grid_s[1] - grid_s[0]
+    decay = np.exp(-rate * step_s)
+    gain = -np.expm1(-rate * step_s) / rate
     amplitudes = np.zeros((grid_s.size, rate.size))
     for step in range(grid_s.size - 1):
         amplitudes[step + 1] = decay * amplitudes[step] + gain * heating[step]

@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
-from fusion.twin.camera import SC660, Renderer, fiducial_points, make_view
+from fusion.twin.camera import KELVIN, SC660, Renderer, fiducial_points, make_view
 from fusion.twin.recipe import RecipeError
 from fusion.twin.recipe_file import read_recipe
 from fusion.twin.simulate import Truth, driver_log, environment_log, simulate, spread
 from fusion.twin.streams import stream
 from interferometry.writers import write_deviations_csv, write_environment_csv, write_rtl
+from thermography.flir import CalibratedRange, CameraIdentity, CameraParameters, Frame, write_jpeg, write_sequence
 
 Progress = Callable[[int, int, str], None]
 TRUTH_CELL_MM = 2.5
+CAMERA_WARM_UP_K = 6.0
+CAMERA_WARM_UP_S = 1500.0
+IDENTITY = CameraIdentity(
+    model="FLIR SC660", part="TWIN", serial="0", software="1.0", lens_model="FOL38", field_of_view_deg=23.9
+)
+RANGE = CalibratedRange(minimum_K=233.15, maximum_K=393.15, raw_minimum=8812, raw_maximum=57240)
 LOGGED = (
     ("air_temperature", "degC"),
     ("air_pressure", "hPa"),
@@ -226,24 +233,48 @@ def _write_truth(truth: Truth, folder: Path) -> None:
 
 def _write_frames(truth: Truth, folder: Path, progress: Progress | None) -> None:
     """Render every frame and write it as the camera would, with its clock, its settings and its own temperatures."""
-    from thermography.flir import CameraParameters, write_jpeg
-
-    camera = truth.recipe.camera
     folder.mkdir()
+    if truth.recipe.camera.file == "seq":
+        write_sequence(folder / "IR_0001.seq", _frames(truth, progress))
+        return
+    for number, frame in enumerate(_frames(truth, progress), 1):
+        write_jpeg(
+            folder / f"IR_{number:04d}.jpg",
+            frame.counts,
+            frame.parameters,
+            frame.time,
+            camera=frame.camera,
+            limits=frame.limits,
+            housekeeping=frame.housekeeping,
+        )
+
+
+def _frames(truth: Truth, progress: Progress | None) -> Iterator[Frame]:
+    """Yield the frames in the order they are taken."""
+    camera = truth.recipe.camera
     renderer = Renderer(truth)
     parameters = CameraParameters(
         emissivity=camera.emissivity,
         object_distance_m=camera.distance_mm * 1e-3,
-        reflected_temperature_K=camera.reflected_temperature_degC + 273.15,
-        atmospheric_temperature_K=camera.atmospheric_temperature_degC + 273.15,
-        window_temperature_K=camera.atmospheric_temperature_degC + 273.15,
+        reflected_temperature_K=camera.reflected_temperature_degC + KELVIN,
+        atmospheric_temperature_K=camera.atmospheric_temperature_degC + KELVIN,
+        window_temperature_K=camera.atmospheric_temperature_degC + KELVIN,
         window_transmission=1.0,
         stored_transmission=0.0,
         relative_humidity=camera.relative_humidity,
         **SC660,
     )
     times = truth.clock(truth.session.frame_s + camera.clock_offset_s)
-    for number in range(times.size):
-        write_jpeg(folder / f"IR_{number + 1:04d}.jpg", renderer.render(number), parameters, times[number])
+    housing = truth.session.at_frames(truth.session.air_degC) + KELVIN
+    housing += CAMERA_WARM_UP_K * (1.0 - np.exp(-truth.session.frame_s / CAMERA_WARM_UP_S))
+    for number, time in enumerate(times):
+        yield Frame(
+            counts=renderer.render(number),
+            parameters=parameters,
+            time=time,
+            camera=IDENTITY,
+            limits=RANGE,
+            housekeeping={"TSShutter": float(housing[number]), "TSLens": float(housing[number]) - 0.8},
+        )
         if progress is not None:
             progress(number + 1, times.size, "render frames")

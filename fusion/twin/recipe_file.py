@@ -186,3 +186,20 @@ def _suggest(key: str, known: typing.Iterable[str]) -> str:
     """Return ``", did you mean ...?"`` where a known key is close to what was written."""
     close = difflib.get_close_matches(key, list(known), 1)
     return f", did you mean {close[0]!r}?" if close else ""
+
+
+def packaged_recipe(name: str) -> Path:
+    """Return the path of a recipe that comes with the package, such as "paper".
+
+    Raises
+    ------
+    RecipeError
+        There is none of that name.
+    """
+    folder = Path(__file__).parents[1] / "recipes"
+    path = folder / f"{name}.toml"
+    if not path.is_file():
+        raise RecipeError(
+            f"no packaged recipe {name!r}; there are: {', '.join(sorted(p.stem for p in folder.glob('*.toml')))}"
+        )
+    return path
