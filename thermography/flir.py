@@ -9,31 +9,33 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
-from thermography.flir_record import (
-    HEADER_SIZE,
-    MAGIC,
+from thermography.flir_frame import (
     CalibratedRange,
     CameraIdentity,
     CameraParameters,
-    Directory,
-    FffSource,
     FlirFormatError,
     Frame,
     FrameHeader,
     Samples,
     Segments,
+)
+from thermography.flir_record import (
+    HEADER_SIZE,
+    MAGIC,
+    Directory,
+    FffSource,
     plausible_header,
-    read_counts,
     read_directory,
     read_header,
-    read_sample_place,
 )
+from thermography.flir_samples import read_counts, read_sample_place
 from thermography.flir_write import write_jpeg, write_sequence
 
 __all__ = [
@@ -82,15 +84,15 @@ class FrameReference(FrameHeader):
         """Read the frame with its pixels."""
         with self.path.open("rb", buffering=0) as file:
             source = FffSource(file, self.path, self.segments)
-            header, info = read_header(source, read_directory(source))
+            _, info = read_header(source, read_directory(source))
             counts = read_counts(source, self.samples)
-        return Frame(
-            **{**vars(header), "notes": self.notes},
-            counts=counts,
-            source=str(self.path),
-            index=self.index,
-            camera_info=info,
-        )
+        header = {each.name: getattr(self, each.name) for each in fields(FrameHeader)}
+        return Frame(**header, counts=counts, source=str(self.path), index=self.index, camera_info=info)
+
+    def read_counts(self) -> NDArray[np.uint16]:
+        """Read the pixels only, shape (row, column)."""
+        with self.path.open("rb", buffering=0) as file:
+            return read_counts(FffSource(file, self.path, self.segments), self.samples)
 
 
 @dataclass(frozen=True)
@@ -164,7 +166,8 @@ def _walk(path: Path) -> Iterator[FrameReference | Rejected]:
     with path.open("rb", buffering=0) as file:
         start = file.read(4)
         if start[:2] == b"\xff\xd8":
-            yield _reference(FffSource(file, path, _jpeg_segments(file, path)), 0)
+            source = FffSource(file, path, _jpeg_segments(file, path))
+            yield _reference(source, read_directory(source), 0)
         elif start == MAGIC:
             yield from _walk_sequence(file, path)
         else:
@@ -174,9 +177,8 @@ def _walk(path: Path) -> Iterator[FrameReference | Rejected]:
             )
 
 
-def _reference(source: FffSource, index: int) -> FrameReference:
+def _reference(source: FffSource, directory: Directory, index: int) -> FrameReference:
     """Read the headers of one FFF record."""
-    directory = read_directory(source)
     header, _ = read_header(source, directory)
     samples = read_sample_place(source, directory)
     notes = header.notes
@@ -207,7 +209,7 @@ def _walk_sequence(file: BinaryIO, path: Path) -> Iterator[FrameReference | Reje
             directory = read_directory(source)
             end, following = _next_frame(file, start, size, directory)
             source = FffSource(file, path, ((start, end - start),))
-            reference = _reference(source, index)
+            reference = _reference(source, directory, index)
             yield replace(reference, notes=notes + reference.notes) if notes else reference
         except FlirFormatError as error:
             yield Rejected(path, index, str(error))

@@ -13,19 +13,9 @@ import imagecodecs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thermography.flir_record import (
-    CAMERA_RECORD,
-    ENTRY_SIZE,
-    HEADER_SIZE,
-    MAGIC,
-    RAW_HEADER_SIZE,
-    RAW_RECORD,
-    CalibratedRange,
-    CameraIdentity,
-    CameraParameters,
-    Encoding,
-    Frame,
-)
+from thermography.flir_frame import CalibratedRange, CameraIdentity, CameraParameters, Encoding, Frame
+from thermography.flir_record import CAMERA_RECORD, ENTRY_SIZE, HEADER_SIZE, MAGIC
+from thermography.flir_samples import RAW_HEADER_SIZE, RAW_RECORD
 
 _CAMERA_INFO_SIZE = 2476
 #: Other readers expect 14 slots, and at least two more than are used.
@@ -122,7 +112,7 @@ def _frame(
     return Frame(
         counts=np.asarray(counts),
         parameters=parameters,
-        time=np.datetime64(time, "ms"),
+        time=np.asarray(time, "datetime64[ms]").reshape(1)[0],
         camera=camera or CameraIdentity(),
         limits=limits or CalibratedRange(),
         housekeeping=dict(housekeeping or {}),
