@@ -1,0 +1,227 @@
+"""L4 - Does a shape remain? Tests of what a model leaves, and a description of it in words a metrologist can check.
+
+The noise that the fit estimates for every reading is laid out as a matrix of cycles and sites (target and direction). Where the
+model is complete, cycles are exchangeable within a site; permuting them gives every statistic its null, whatever the tails or the
+scatter of the single site. The shape is described from the readings minus the fixed effects, freed of offset and stretch per cycle,
+not from the whitened noise: the drift swallows a part of slow patterns (statistics study, section 3.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.readings import Readings
+from interferometry.statespace import Array, DriftFit
+
+_PERMUTATIONS = 400
+_BLOCK = 5
+#: Chance at which "a shape remains" is said though nothing does, over all statistics together.
+LEVEL = 0.05
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """What a model leaves.
+
+    Attributes
+    ----------
+    p_value : chance of so much structure where nothing is missing, over all statistics
+    p_values : the same for each statistic alone
+    shape : in words, empty where nothing remains
+    rms_um : root mean square of the described shape over the readings
+    along_time, along_sites : the leading pattern (cycles,) in um and its weight per site, at most 1
+    """
+
+    p_value: float
+    p_values: dict[str, float]
+    shape: str
+    rms_um: float
+    cycles: NDArray[np.int64]
+    along_time: Array
+    sites: list[tuple[int, str]]
+    along_sites: Array
+
+
+def examine(
+    readings: Readings, fit: DriftFit, rng: np.random.Generator, *, set_aside: Collection[tuple[int, str]] = ()
+) -> Remainder:
+    """Test what the fit leaves for structure and describe the largest of it.
+
+    Parameters
+    ----------
+    readings, fit : the readings and the model fitted to them
+    set_aside : sites (target, direction) whose own anomaly has been diagnosed already; they are not tested again.
+    """
+    noise, share = fit.noise()
+    standard = noise / (fit.sigma * np.sqrt(np.maximum(share, 1e-12)))
+    cycles, sites, matrix = _matrix(readings, np.clip(standard, -4.0, 4.0))
+    kept = [k for k, site in enumerate(sites) if site not in set(set_aside)]
+    tested = matrix[:, kept]
+    tested = (tested - np.nanmean(tested, axis=0)) / np.maximum(np.nanstd(tested, axis=0), 1e-9)
+    signs = np.array([1.0 if sites[k][1] == "positive" else -1.0 for k in kept])
+    share_of = readings.positions_mm / readings.span_mm
+    place = np.array([share_of[np.flatnonzero(readings.targets == sites[k][0])[0]] for k in kept])
+
+    observed = _statistics(tested, signs, place)
+    null = np.array([_statistics(_permuted(tested, rng), signs, place) for _ in range(_PERMUTATIONS)])
+    names = ("pattern", "slow pattern", "one place", "direction", "direction along the axis", "curvature")
+    # Every statistic is referred to a normal tail of its null, so that few permutations still tell 0.01 from 0.0001.
+    centre, spread = null.mean(axis=0), np.maximum(null.std(axis=0), 1e-12)
+    largest = ((null - centre) / spread).max(axis=1)
+    values = (observed - centre) / spread
+    p_values = {
+        name: float((1 + (null[:, k] >= observed[k]).sum()) / (1 + _PERMUTATIONS)) for k, name in enumerate(names)
+    }
+    p_value = float((1 + (largest >= values.max()).sum()) / (1 + _PERMUTATIONS))
+    unwhitened = _unwhitened(readings, fit)
+    _, _, residual = _matrix(readings, unwhitened)
+    along_time, along_sites, rms = _leading(residual[:, kept])
+    named_sites = [sites[k] for k in kept]
+    shape = _describe(cycles, along_time, named_sites, along_sites, readings) if p_value < LEVEL else ""
+    return Remainder(p_value, p_values, shape, rms if shape else 0.0, cycles, along_time, named_sites, along_sites)
+
+
+def _matrix(readings: Readings, values: Array) -> tuple[NDArray[np.int64], list[tuple[int, str]], Array]:
+    """Values per cycle and site (cycles, sites); NaN where a reading is missing."""
+    cycles = np.unique(readings.cycle)
+    index = readings.target_index * 2 + (readings.sign < 0)
+    present = np.unique(index)
+    matrix = np.full((cycles.size, present.size), np.nan)
+    matrix[np.searchsorted(cycles, readings.cycle), np.searchsorted(present, index)] = values
+    sites = [(int(readings.targets[k // 2]), "negative" if k % 2 else "positive") for k in present]
+    return cycles, sites, matrix
+
+
+def _permuted(matrix: Array, rng: np.random.Generator) -> Array:
+    """Cycles shuffled within each site; missing readings move along."""
+    return rng.permuted(matrix, axis=0)
+
+
+def _statistics(matrix: Array, signs: Array, place: Array) -> Array:
+    """Six statistics that grow with structure: two of rank one, one of a single place, three of given shape over time."""
+    filled = np.nan_to_num(matrix)
+    blocks = filled[: filled.shape[0] // _BLOCK * _BLOCK].reshape(-1, _BLOCK, filled.shape[1]).mean(axis=1)
+    curved = (place - place.mean()) ** 2
+    basis = np.column_stack([np.ones_like(place), place])
+    curved = curved - basis @ np.linalg.lstsq(basis, curved, rcond=None)[0]
+    stretch = signs * (place - place.mean())
+    contrasts = [filled @ signs, filled @ stretch, filled @ curved]
+    return np.array(
+        [
+            np.linalg.norm(filled, 2),
+            np.linalg.norm(blocks, 2) if blocks.shape[0] > 1 else 0.0,
+            (blocks**2).sum(axis=0).max() if blocks.shape[0] > 1 else 0.0,
+            *(_slowness(contrast) for contrast in contrasts),
+        ]
+    )
+
+
+def _slowness(series: Array) -> float:
+    """Share of a series' variance that its first differences lack (von Neumann): 0 for white, 1 for very slow."""
+    centred = series - series.mean()
+    total = float(centred @ centred)
+    if total <= 0.0 or series.size < 4:
+        return 0.0
+    return 1.0 - 0.5 * float(np.diff(series) @ np.diff(series)) / total * series.size / (series.size - 1)
+
+
+def _unwhitened(readings: Readings, fit: DriftFit) -> Array:
+    """Readings minus fixed effects, freed of an offset and a stretch per cycle, (n,)."""
+    residual = fit.residual()
+    free = np.empty_like(residual)
+    for number in np.unique(readings.cycle):
+        here = readings.cycle == number
+        basis = np.column_stack([np.ones(here.sum()), readings.share[here]])
+        free[here] = residual[here] - basis @ np.linalg.lstsq(basis, residual[here], rcond=None)[0]
+    return free
+
+
+def _leading(matrix: Array) -> tuple[Array, Array, float]:
+    """Leading pattern over time (um) and sites (largest weight 1) of a matrix with gaps, and its rms (um)."""
+    filled = np.nan_to_num(matrix - np.nanmean(matrix, axis=0))
+    # Runs of three cycles are averaged, so that a pattern is preferred that lasts over a single outlier.
+    kernel = np.ones(3) / 3.0
+    smooth = np.apply_along_axis(lambda column: np.convolve(column, kernel, mode="same"), 0, filled)
+    u, s, vt = np.linalg.svd(smooth, full_matrices=False)
+    weight = np.abs(vt[0]).max()
+    sign = np.sign(vt[0][np.argmax(np.abs(vt[0]))])
+    along_sites = vt[0] / weight * sign
+    along_time = u[:, 0] * s[0] * weight * sign
+    return along_time, along_sites, float(np.sqrt(np.mean(np.outer(along_time, along_sites) ** 2)))
+
+
+def _describe(
+    cycles: NDArray[np.int64], along_time: Array, sites: list[tuple[int, str]], along_sites: Array, readings: Readings
+) -> str:
+    return f"{_time_words(cycles, along_time, readings)}; {_place_words(sites, along_sites)}"
+
+
+def _time_words(cycles: NDArray[np.int64], series: Array, readings: Readings) -> str:
+    """Course in time: one step, a rhythm, switching, or slow growth, whichever explains most of the series."""
+    centred = series - series.mean()
+    total = float(centred @ centred)
+    if total <= 0.0 or series.size < 8:
+        return "course in time not determined"
+    steps = [
+        (k * (series.size - k) / series.size) * (series[k:].mean() - series[:k].mean()) ** 2
+        for k in range(2, series.size - 1)
+    ]
+    at = int(np.argmax(steps)) + 2
+    spectrum = np.abs(np.fft.rfft(centred)) ** 2
+    line = int(np.argmax(spectrum[1:])) + 1
+    around = spectrum[max(1, line - 1) : line + 2].sum() / spectrum[1:].sum()
+    ramp = np.corrcoef(np.arange(series.size), series)[0, 1] ** 2
+    period = (readings.seconds[-1] - readings.seconds[0]) / 60.0 / line
+    candidates = {
+        f"one step at cycle {cycles[at]}": max(steps) / total,
+        f"a rhythm of about {period:.0f} min": float(around) if line > 2 else 0.0,
+        "slow growth or decay": float(ramp),
+    }
+    best = max(candidates, key=lambda words: candidates[words])
+    if candidates[best] > 0.6:
+        return best
+    high = centred > 0
+    changes = int((np.diff(high.astype(int)) != 0).sum())
+    return f"irregular, {changes} changes of side over {series.size} cycles (switching or wandering)"
+
+
+def _place_words(sites: list[tuple[int, str]], weights: Array) -> str:
+    """Where along the axis and in which direction of approach the pattern acts."""
+    strong = [site for site, weight in zip(sites, weights, strict=True) if abs(weight) > 0.5]
+    targets = sorted({target for target, _ in strong})
+    directions = {direction for _, direction in strong}
+    signs = {np.sign(weight) for weight in weights if abs(weight) > 0.5}
+    by_site = dict(zip(sites, weights, strict=True))
+    pairs = [
+        (by_site[(t, "positive")], by_site[(t, "negative")])
+        for t, d in sites
+        if d == "positive" and (t, "negative") in by_site
+    ]
+    even = sum((a + b) ** 2 for a, b in pairs)
+    odd = sum((a - b) ** 2 for a, b in pairs)
+    where = f"target {targets[0]}" if len(targets) == 1 else f"targets {_runs(targets)}"
+    if len(directions) == 1:
+        way = f"{next(iter(directions))} direction only"
+    elif odd > 4 * even:
+        way = "opposite in both directions"
+    else:
+        way = "both directions"
+    opposed = (
+        ", with opposite signs along the axis" if len(signs) == 2 and len(directions) == 2 and odd <= 4 * even else ""
+    )
+    return f"{where}, {way}{opposed}"
+
+
+def _runs(numbers: list[int]) -> str:
+    """Numbers as ranges: 1-3, 7."""
+    parts: list[list[int]] = []
+    for number in numbers:
+        if parts and number == parts[-1][-1] + 1:
+            parts[-1].append(number)
+        else:
+            parts.append([number])
+    return ", ".join(str(part[0]) if len(part) == 1 else f"{part[0]}-{part[-1]}" for part in parts)

@@ -1,0 +1,119 @@
+"""L4 - Reasons not to name an effect although it fits: too little excitation, or temperatures too noisy to carry a lag.
+
+A lagged copy of a noisy temperature is a smoother copy, and wins by denoising; one warm-up looks like every other warm-up
+(statistics study, sections 3.4 and 3.5). Both make false names, so both are tested before a name is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fusion.effects import Effect, Member, warm_up
+from fusion.model import ModelFit
+from fusion.readings import Readings, Series
+from fusion.scoring import FamilyScore
+from interferometry.statespace import Array, fit_fixed_effects
+
+#: Temperature noise over range beyond which a lag is not believed: where the machine is switched, and for one warm-up only.
+_NOISE_SHARE = {"switched": 0.01, "warm-up": 0.003}
+#: A state of which plain warm-ups explain more than this share has been excited by one warm-up only.
+_WARM_UP_SHARE = 0.98
+#: Log-likelihood that must be left beside free warm-ups of every time constant (protected test), and over a smoothed copy.
+_PROTECTED_GAIN = 4.0
+_SMOOTH_GAIN = 2.0
+_PROTECTION_MIN = (10.0, 30.0, 90.0, 170.0)
+
+
+def blocked_reason(
+    effect: Effect, member: Member, part: Readings, model: ModelFit, scores: Sequence[FamilyScore]
+) -> str | None:
+    """Why this effect must not be named although it fits, or None.
+
+    Parameters
+    ----------
+    effect, member : the candidate, with columns for the readings the model was fitted to
+    part : those readings
+    model : the model without the candidate
+    scores : of the whole library, for the effects that need no protection
+    """
+    if not effect.excited_by:
+        return None
+    share = _warm_up_share(part, member)
+    single = share > _WARM_UP_SHARE
+    if effect.excited_by == "field":
+        noise = noise_share(part.series["mean_rise"])
+        limit = _NOISE_SHARE["warm-up" if single else "switched"]
+        if noise > limit:
+            return (
+                f"the noise of the mean rise is {100 * noise:.2f} % of its range; above {100 * limit:.1f} % a lagged, smoother copy "
+                "wins by its smoothness alone"
+            )
+    gain = _gain(part, model, member, protection(part) if single else None)
+    if single and gain < _PROTECTED_GAIN:
+        return (
+            f"one warm-up only excited the machine ({100 * share:.1f} % of the candidate is a plain warm-up), and beside free "
+            f"warm-ups it gains only {gain:.1f} in log-likelihood; switch the load on purpose to tell"
+        )
+    if effect.excited_by == "field":
+        smoothed = smoothed_copy(part, float(member.parameters["time_constant_min"]))
+        advantage = _gain(part, model, member, None) - _gain(part, model, smoothed, None)
+        if advantage < _SMOOTH_GAIN:
+            return (
+                f"a copy of the field that is only smoothed, not delayed, fits as well (log-likelihood {advantage:+.1f}): the lag "
+                "wins by denoising, not by physics"
+            )
+    return None
+
+
+def noise_share(series: Series) -> float:
+    """Noise of a sampled series over its range, from its second differences (a smooth course cancels in them)."""
+    values = series.values
+    if values.size < 5:
+        return 1.0
+    second = np.diff(values, 2)
+    scatter = 1.4826 * np.median(np.abs(second - np.median(second))) / np.sqrt(6.0)
+    return float(scatter / max(np.ptp(values), 1e-12))
+
+
+def protection(part: Readings) -> Array:
+    """Free warm-ups of several time constants, common and along the axis, (n, 8)."""
+    curves = [warm_up(part, minutes) for minutes in _PROTECTION_MIN]
+    return np.column_stack([*curves, *(curve * part.share for curve in curves)])
+
+
+def smoothed_copy(part: Readings, minutes: float) -> Member:
+    """The seen temperatures averaged over a centred window as wide as the lag's memory, without delay."""
+    columns = [
+        part.at(_centred_mean(part.series[name], 60.0 * minutes)) * factor
+        for name, factor in (("mean_rise", 1.0), ("axis_integral", 1e-3))
+    ]
+    return Member(np.column_stack(columns), {}, ("um/K", "ppm/K"))
+
+
+def _centred_mean(series: Series, half_width_s: float) -> Series:
+    weights = np.abs(series.seconds[:, None] - series.seconds[None, :]) <= half_width_s
+    smoothed = (weights @ series.values.reshape(series.seconds.size, -1)) / weights.sum(axis=1, keepdims=True)
+    return Series(series.seconds, smoothed.reshape(series.values.shape), series.units)
+
+
+def _warm_up_share(part: Readings, member: Member) -> float:
+    """Share of the candidate's variance over time that constants, a trend and plain warm-ups explain (least of its columns)."""
+    basis = np.column_stack([np.ones(part.seconds.size), part.seconds, *(warm_up(part, m) for m in _PROTECTION_MIN)])
+    basis = np.column_stack([basis, basis * part.share[:, None]])
+    q, _ = np.linalg.qr(basis / np.linalg.norm(basis, axis=0))
+    shares = []
+    for column in member.columns.T:
+        centred = column - column.mean()
+        left = centred - q @ (q.T @ centred)
+        shares.append(1.0 - float(left @ left) / max(float(centred @ centred), 1e-300))
+    return min(shares)
+
+
+def _gain(part: Readings, model: ModelFit, member: Member, beside: Array | None) -> float:
+    """Log-likelihood that the candidate gains beside the model and further columns, the drift's variances kept."""
+    base = model.fit.design if beside is None else np.column_stack([model.fit.design, beside])
+    without = fit_fixed_effects(model.fit.system, model.fit.response, base)
+    with_member = fit_fixed_effects(model.fit.system, model.fit.response, np.column_stack([base, member.columns]))
+    return 0.5 * model.fit.response.size * float(np.log(without.rss / with_member.rss))

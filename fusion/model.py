@@ -1,0 +1,172 @@
+"""L4 - A model of the drift: static profile, named terms, and the drift that nobody explains, fitted to readings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.effects import Member
+from fusion.readings import Readings
+from interferometry.statespace import Array, DriftFit, drift_system, estimate, fit_fixed_effects
+
+#: The scatter of a site is trusted like this many further readings with the scatter of all sites.
+_SHRINKAGE_READINGS = 20
+
+
+@dataclass(frozen=True)
+class Term:
+    """One effect of the model with the member that was chosen."""
+
+    effect: str
+    member: Member
+
+    @property
+    def width(self) -> int:
+        """Number of coefficients."""
+        return self.member.columns.shape[1]
+
+
+@dataclass(frozen=True)
+class ModelFit:
+    """A model fitted to a part of the readings.
+
+    Attributes
+    ----------
+    readings : all readings
+    used : (n,) readings that the fit was made from
+    terms : the named effects
+    fit : the generalised least-squares fit to the used readings
+    profile : (n, k) static columns that the used readings determine
+    """
+
+    readings: Readings
+    used: NDArray[np.bool_]
+    terms: tuple[Term, ...]
+    fit: DriftFit
+    profile: Array
+
+    def place(self, term: Term) -> slice:
+        """Where the coefficients of a term stand in the fit."""
+        start = self.profile.shape[1]
+        for other in self.terms:
+            if other is term:
+                return slice(start, start + term.width)
+            start += other.width
+        raise KeyError(term.effect)
+
+    def coefficients(self) -> dict[str, float]:
+        """First coefficient of every term by effect name; the first term counts where an effect enters twice."""
+        found: dict[str, float] = {}
+        for term in self.terms:
+            found.setdefault(term.effect, float(self.fit.coefficients[self.place(term)][0]))
+        return found
+
+    def series(self, term: Term) -> tuple[Array, Array]:
+        """Predicted contribution of a term to every reading, um, and its standard uncertainty (n,), (n,)."""
+        place = self.place(term)
+        columns = term.member.columns
+        covariance = self.fit.covariance[place, place]
+        return columns @ self.fit.coefficients[place], np.sqrt(np.einsum("ni,ij,nj->n", columns, covariance, columns))
+
+    def _design(self) -> Array:
+        columns = [self.profile, *(term.member.columns for term in self.terms)]
+        design = np.column_stack(columns)
+        if self.fit.system.order == 2:
+            hours = (self.readings.seconds / 3600.0)[:, None]
+            design = np.column_stack([design, self.readings.loadings * hours])
+        return design
+
+    def open_loop_errors(self) -> tuple[Array, Array]:
+        """Errors of predicting the readings that were not used, um, and the predicted standard deviation, both (n_unused,).
+
+        Coefficients are frozen; the drift keeps the value it had at the last used reading. Readings of a site that the fit has
+        never seen are NaN.
+        """
+        system = self.fit.system
+        variance = np.ones(self.used.size)
+        variance[self.used] = system.variance
+        seen = drift_system(
+            self.readings.seconds,
+            self.readings.loadings,
+            order=system.order,
+            ratios=system.ratios,
+            variance=variance,
+            observed=self.used,
+        )
+        design = self._design()
+        errors, spread = seen.innovations(np.column_stack([self.readings.response, design]))
+        through = errors[:, 1:]
+        missed = errors[:, 0] - through @ self.fit.coefficients
+        own = np.einsum("ni,ij,nj->n", through, self.fit.covariance, through)
+        missed = np.where(self._known_site(), missed, np.nan)
+        return missed[~self.used], np.sqrt(self.fit.sigma**2 * spread + own)[~self.used]
+
+    def _known_site(self) -> NDArray[np.bool_]:
+        site = self.readings.target_index * 2 + (self.readings.sign < 0)
+        return np.isin(site, np.unique(site[self.used]))
+
+
+def fit_model(
+    readings: Readings,
+    terms: Sequence[Term],
+    *,
+    used: NDArray[np.bool_] | None = None,
+    like: DriftFit | None = None,
+) -> ModelFit:
+    """Fit profile, terms and drift to the used readings; outliers and noisy sites count less.
+
+    Parameters
+    ----------
+    like : an earlier fit to the same used readings, whose kind of drift and whose weights of readings are kept.
+    """
+    used = np.ones(readings.seconds.size, bool) if used is None else used
+    profile = readings.profile
+    profile = profile[:, _determined(profile[used])]
+    design = np.column_stack([profile, *(term.member.columns for term in terms)])[used]
+    seconds, loadings, response = readings.seconds[used], readings.loadings[used], readings.response[used]
+    if like is not None:
+        order, variance, start = like.system.order, like.system.variance, like.system.ratios
+    else:
+        fit = estimate(seconds, loadings, response, design, robust=True)
+        order, start = fit.system.order, fit.system.ratios
+        variance = _site_variance(readings.subset(used), fit) * fit.system.variance
+    fit = estimate(seconds, loadings, response, design, order=order, start=start, variance=variance)
+    return ModelFit(readings, used, tuple(terms), fit, profile)
+
+
+def refit_fixed(model: ModelFit, terms: Sequence[Term]) -> DriftFit:
+    """Fit another set of terms with the drift's variances kept (for comparing likelihoods of nested models)."""
+    design = np.column_stack([model.profile, *(term.member.columns for term in terms)])[model.used]
+    if model.fit.system.order == 2:
+        hours = (model.readings.seconds[model.used] / 3600.0)[:, None]
+        design = np.column_stack([design, model.readings.loadings[model.used] * hours])
+    return fit_fixed_effects(replace(model.fit.system), model.fit.response, design)
+
+
+def _determined(columns: Array) -> NDArray[np.bool_]:
+    """Columns that are not constant zero and, for reversals, not equal to half their target's column."""
+    present = np.abs(columns).max(axis=0, initial=0.0) > 0.0
+    kept = np.zeros(columns.shape[1], bool)
+    seen: set[bytes] = set()
+    for k in np.flatnonzero(present):
+        key = (columns[:, k] / columns[np.argmax(np.abs(columns[:, k])), k]).tobytes()
+        kept[k] = key not in seen
+        seen.add(key)
+    return kept
+
+
+def _site_variance(readings: Readings, fit: DriftFit) -> Array:
+    """Relative variance of each reading from the scatter of its site (target and direction), (n,), mean 1."""
+    noise, share = fit.noise()
+    # Readings that were given a larger variance as outliers tell nothing about their site's ordinary scatter.
+    ordinary = fit.system.variance == 1.0
+    site = readings.target_index * 2 + (readings.sign < 0)
+    relative = np.ones(noise.size)
+    for number in np.unique(site):
+        here = (site == number) & ordinary
+        squares = float((noise[here] ** 2).sum()) / fit.sigma**2 + _SHRINKAGE_READINGS
+        relative[site == number] = squares / (float(share[here].sum()) + _SHRINKAGE_READINGS)
+    return relative / np.mean(relative)

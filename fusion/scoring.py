@@ -1,0 +1,233 @@
+"""L4 - How much a candidate explains, against what the search would find where nothing is missing.
+
+Every candidate is judged by its gain in profile log-likelihood under a drift that is free to explain the same thing: the drift's
+variances are re-chosen for each candidate from a grid around their estimate, because a drift fitted without the candidate has
+already swallowed part of it (statistics study, section 1.5). The same gains are computed for simulated campaigns in which only the
+current model and its drift act, with noise drawn from the residuals; from them come the p-values, corrected for the whole search.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.effects import Member
+from interferometry.statespace import Array, DriftFit, DriftSystem
+
+#: log10 factors on the two drift variances: as estimated, or less drift in one or both, down to hardly any.
+_GRID = ((0.0, 0.0), (-1.0, 0.0), (-2.5, 0.0), (0.0, -1.0), (0.0, -2.5), (-1.0, -1.0), (-2.5, -2.5), (0.5, 0.5))
+#: A candidate of which the model explains all but this share adds nothing that these data can show.
+_SEPARABLE_SHARE = 1e-4
+_DRAWS = 200
+#: Effects with a larger p-value are not confirmed on unused readings, because they will not enter anyway.
+_WORTH_CONFIRMING = 0.1
+
+
+@dataclass(frozen=True)
+class FamilyScore:
+    """What the best member of an effect explains.
+
+    Attributes
+    ----------
+    name : the effect
+    member : its best member, or None where no member can be told from the model
+    gain : gain in log-likelihood of the best member
+    excess : gain minus the mean gain the same search finds where nothing is missing
+    p_value : chance of such a gain where nothing is missing, for this effect alone
+    family_wise_p : the same for the best of all effects that were tried
+    held_out_gain, held_out_p : gain on blocks that were not used for the coefficients, and its chance where nothing is missing
+    collinear : share of members that the model already contains
+    """
+
+    name: str
+    member: Member | None
+    gain: float
+    excess: float
+    p_value: float
+    family_wise_p: float
+    held_out_gain: float
+    held_out_p: float
+    collinear: float
+
+
+@dataclass(frozen=True)
+class Judge:
+    """A fitted model with simulated campaigns in which it is complete.
+
+    Attributes
+    ----------
+    fit : the current model on the training readings
+    draws : (n, draws) responses simulated from its drift and noise alone
+    blocks : (n,) number of the chronological block of each reading, from 0
+    halves : (n,) True for one half of the targets, for events that cannot be confirmed in time
+    """
+
+    fit: DriftFit
+    draws: Array
+    blocks: NDArray[np.int64]
+    halves: NDArray[np.bool_]
+
+    def score(self, families: dict[str, Sequence[Member]]) -> list[FamilyScore]:
+        """Score all members of all effects, best excess first."""
+        named = [(name, member) for name, members in families.items() for member in members]
+        if not named:
+            return []
+        columns = np.concatenate([member.columns for _, member in named], axis=1)
+        widths = np.array([member.columns.shape[1] for _, member in named])
+        gains, best_grid, separable = self._gains(columns, widths)
+        scores = []
+        for name in families:
+            rows = np.array([k for k, (family, _) in enumerate(named) if family == name], int)
+            if rows.size == 0:
+                continue
+            usable = rows[separable[rows]]
+            collinear = 1.0 - usable.size / rows.size
+            if usable.size == 0:
+                scores.append(FamilyScore(name, None, 0.0, 0.0, 1.0, 1.0, 0.0, 1.0, collinear))
+                continue
+            best = usable[np.argmax(gains[usable, 0])]
+            null = gains[usable, 1:].max(axis=0)
+            gain = float(gains[best, 0])
+            p_value = tail_probability(gain, null)
+            held_out, held_out_p = (0.0, 1.0)
+            if p_value < _WORTH_CONFIRMING:
+                held_out, held_out_p = self._held_out(named[best][1], int(best_grid[best]))
+            scores.append(
+                FamilyScore(
+                    name,
+                    named[best][1],
+                    gain,
+                    gain - float(null.mean()),
+                    p_value,
+                    np.nan,
+                    held_out,
+                    held_out_p,
+                    collinear,
+                )
+            )
+        tried = len(scores)
+        corrected = [replace(score, family_wise_p=1.0 - (1.0 - score.p_value) ** tried) for score in scores]
+        return sorted(corrected, key=lambda score: -score.excess)
+
+    def _systems(self) -> list[DriftSystem]:
+        system = self.fit.system
+        components = system.loadings.shape[1]
+        factors = [np.resize(10.0 ** np.asarray(pair), components) for pair in _GRID]
+        return [replace(system, ratios=system.ratios * factor) for factor in factors]
+
+    def _gains(self, columns: Array, widths: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
+        """Log-likelihood gain of every member for the response and every draw (members, 1 + draws)."""
+        responses = np.column_stack([self.fit.response, self.draws])
+        n = responses.shape[0]
+        starts = np.concatenate([[0], np.cumsum(widths)[:-1]])
+        best_null = np.full(responses.shape[1], -np.inf)
+        best = np.full((widths.size, responses.shape[1]), -np.inf)
+        best_grid = np.zeros(widths.size, int)
+        separable = np.zeros(widths.size, bool)
+        for place, system in enumerate(self._systems()):
+            everything, log_determinant = system.whiten(np.column_stack([responses, self.fit.design, columns]))
+            y, x, c = np.split(everything, [responses.shape[1], responses.shape[1] + self.fit.design.shape[1]], axis=1)
+            q, _ = np.linalg.qr(x)
+            own = np.linalg.norm(c, axis=0)
+            y = y - q @ (q.T @ y)
+            c = c - q @ (q.T @ c)
+            rss = (y**2).sum(axis=0)
+            reduced, separate = _reductions(c, y, starts, widths, own)
+            likelihood = -0.5 * (n * np.log(np.maximum(rss[None, :] - reduced, 1e-12 * rss)) + log_determinant)
+            best_null = np.maximum(best_null, -0.5 * (n * np.log(rss) + log_determinant))
+            better = likelihood[:, 0] > best[:, 0]
+            best_grid[better] = place
+            best = np.maximum(best, likelihood)
+            separable |= separate
+        return best - best_null[None, :], best_grid, separable
+
+    def _held_out(self, member: Member, place: int) -> tuple[float, float]:
+        """Gain in squared whitened error on unused readings, coefficients frozen, and its chance where nothing is missing."""
+        system = self._systems()[place]
+        responses = np.column_stack([self.fit.response, self.draws])
+        everything, _ = system.whiten(np.column_stack([responses, self.fit.design, member.columns]))
+        y, x, c = np.split(everything, [responses.shape[1], responses.shape[1] + self.fit.design.shape[1]], axis=1)
+        both = np.column_stack([x, c])
+        gain = np.zeros(responses.shape[1])
+        for train, test in self._splits(member):
+            normal, moment = both[train].T @ both[train], both[train].T @ y[train]
+            k = x.shape[1]
+            without = y[test] - x[test] @ _solve(normal[:k, :k], moment[:k])
+            with_member = y[test] - both[test] @ _solve(normal, moment)
+            gain += (without**2).sum(axis=0) - (with_member**2).sum(axis=0)
+        noise = (y[:, 0] - x @ _solve(x.T @ x, x.T @ y[:, :1])[:, 0]).var()
+        return float(gain[0] / (2.0 * noise)), float((1 + (gain[1:] >= gain[0]).sum()) / gain.size)
+
+    def _splits(self, member: Member) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
+        if member.event_s is not None:
+            return [(self.halves, ~self.halves), (~self.halves, self.halves)]
+        last = int(self.blocks.max())
+        first = max(1, last // 3)
+        return [(self.blocks < block, self.blocks == block) for block in range(first + 1, last + 1)]
+
+
+def _solve(normal: Array, moment: Array) -> Array:
+    """Normal equations of several responses; a ridge of 1e-9 keeps columns that a part of the readings lacks at zero."""
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-24))
+    scaled = normal / np.outer(scale, scale) + 1e-9 * np.eye(scale.size)
+    return np.asarray(np.linalg.solve(scaled, moment / scale[:, None]) / scale[:, None])
+
+
+def _reductions(
+    c: Array, y: Array, starts: NDArray[np.int64], widths: NDArray[np.int64], own: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Reduction of the residual sum of squares by every member (members, responses), and which members are separable."""
+    scaled = c / np.maximum(own, 1e-300)
+    moments = scaled.T @ y
+    reduced = np.zeros((widths.size, y.shape[1]))
+    separable = np.zeros(widths.size, bool)
+    for width in np.unique(widths):
+        rows = np.flatnonzero(widths == width)
+        index = starts[rows][:, None] + np.arange(width)
+        blocks = scaled[:, index]
+        gram = np.einsum("nmi,nmj->mij", blocks, blocks)
+        smallest = np.linalg.eigvalsh(gram)[:, 0]
+        good = smallest > _SEPARABLE_SHARE
+        moment = moments[index[good]]
+        if good.any():
+            reduced[rows[good]] = (moment * np.linalg.solve(gram[good], moment)).sum(axis=1)
+        separable[rows] = good
+    return reduced, separable
+
+
+def tail_probability(value: float, null: Array) -> float:
+    """Chance of a null gain at least as large: counted, and beyond the upper tenth of the draws with an exponential tail.
+
+    The mean excess of a log-likelihood gain is at least 1 (chi-squared tail), which keeps few draws from making a bold claim.
+    """
+    threshold = float(np.quantile(null, 0.9))
+    if value <= threshold:
+        return float((1 + (null >= value).sum()) / (1 + null.size))
+    excess = max(1.0, float((null[null > threshold] - threshold).mean()))
+    return float(0.1 * np.exp(-(value - threshold) / excess))
+
+
+def simulate_null(fit: DriftFit, rng: np.random.Generator, *, draws: int = _DRAWS) -> Array:
+    """Responses (n, draws) in which only the model's drift and noise act; the noise is drawn from the fit's residuals.
+
+    Fixed effects are left out, because every score is the same whatever they are.
+    """
+    noise, share = fit.noise()
+    relative = noise / np.sqrt(np.maximum(share, 1e-12))
+    drawn = rng.choice(relative, size=(noise.size, draws)) * np.sqrt(fit.system.variance)[:, None]
+    steps = np.diff(fit.system.seconds, prepend=fit.system.seconds[0])
+    for ratio, loading in zip(fit.system.ratios, fit.system.loadings.T, strict=True):
+        scale = fit.sigma * np.sqrt(ratio)
+        shocks = rng.standard_normal((noise.size, draws)) * np.sqrt(steps)[:, None]
+        if fit.system.order == 1:
+            drift = np.cumsum(shocks, axis=0)
+        else:
+            rate = np.cumsum(shocks, axis=0)
+            before = np.vstack([np.zeros(draws), rate[:-1]])
+            own = 0.5 * shocks + rng.standard_normal(shocks.shape) * np.sqrt(steps / 12.0)[:, None]
+            drift = np.cumsum((before + own) * steps[:, None], axis=0)
+        drawn += scale * drift * loading[:, None]
+    return drawn
