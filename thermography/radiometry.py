@@ -7,7 +7,8 @@ to 0.1 K at 5 m.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -54,37 +55,63 @@ def calibrate(counts: NDArray[np.uint16], parameters: CameraParameters) -> NDArr
     return temperature.reshape(counts.shape)
 
 
-def temperature_from_counts(counts: ArrayLike, parameters: CameraParameters) -> NDArray[np.float64]:
-    """Return the surface temperature (degC, float64) of counts that need not be whole numbers."""
-    gain, offset = count_line(parameters)
+def temperature_from_counts(
+    counts: ArrayLike, parameters: CameraParameters, *, emissivity: ArrayLike | None = None
+) -> NDArray[np.float64]:
+    """Return the surface temperature of counts that need not be whole numbers.
+
+    Parameters
+    ----------
+    counts : array, any shape
+    parameters : CameraParameters
+    emissivity : array that broadcasts with counts, optional
+        Emissivity of each pixel, instead of the one of the parameters.
+
+    Returns
+    -------
+    ndarray of float64
+        Temperature, degC; NaN where no temperature gives these counts.
+
+    Raises
+    ------
+    RadiometryError
+        Where a parameter makes the formula meaningless.
+    """
+    gain, offset = count_line(parameters, emissivity)
+    return temperature_of_signal((np.asarray(counts, np.float64) - offset) / gain, parameters)
+
+
+def temperature_of_signal(signal: ArrayLike, parameters: CameraParameters) -> NDArray[np.float64]:
+    """Return the temperature (degC) of a black body that gives `signal` counts in front of the lens: the inverse of S(T)."""
     p = parameters
-    signal = (np.asarray(counts, np.float64) - offset) / gain + p.planck_o
+    above_zero = np.asarray(signal, np.float64) + p.planck_o
     with np.errstate(invalid="ignore", divide="ignore"):
-        argument = p.planck_r1 / (p.planck_r2 * signal) + p.planck_f
+        argument = p.planck_r1 / (p.planck_r2 * above_zero) + p.planck_f
         temperature = p.planck_b / np.log(argument) - ZERO_CELSIUS_K
-    return np.where((signal > 0) & (argument > 1), temperature, np.nan)
+    return np.where((above_zero > 0) & (argument > 1), temperature, np.nan)
 
 
-def counts_from_temperature(temperature: ArrayLike, parameters: CameraParameters) -> NDArray[np.float64]:
+def counts_from_temperature(
+    temperature: ArrayLike, parameters: CameraParameters, *, emissivity: ArrayLike | None = None
+) -> NDArray[np.float64]:
     """Return the counts (float64, not rounded) that a surface of a temperature (degC) gives: the inverse of `calibrate`."""
-    gain, offset = count_line(parameters)
-    kelvin = np.asarray(temperature, np.float64) + ZERO_CELSIUS_K
-    return gain * planck_counts(kelvin, parameters) + offset
+    gain, offset = count_line(parameters, emissivity)
+    return gain * black_body_signal(np.asarray(temperature, np.float64) + ZERO_CELSIUS_K, parameters) + offset
 
 
-def planck_counts(temperature_K: ArrayLike, parameters: CameraParameters) -> NDArray[np.float64]:
+def black_body_signal(temperature_K: ArrayLike, parameters: CameraParameters) -> NDArray[np.float64]:
     """Return the counts of a black body (K) in front of the lens, S(T) = R1 / (R2 (exp(B/T) - F)) - O."""
     p = parameters
-    return (
-        p.planck_r1 / (p.planck_r2 * (np.exp(p.planck_b / np.asarray(temperature_K, np.float64)) - p.planck_f))
-        - p.planck_o
-    )
+    exponential = np.exp(p.planck_b / np.asarray(temperature_K, np.float64))
+    return p.planck_r1 / (p.planck_r2 * (exponential - p.planck_f)) - p.planck_o
 
 
-def count_line(parameters: CameraParameters) -> tuple[float, float]:
+def count_line(
+    parameters: CameraParameters, emissivity: ArrayLike | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return gain and offset of counts = gain * S(T_object) + offset.
 
-    Everything but the object itself (reflections, air, window) is in these two numbers.
+    Everything but the object itself (reflections, air, window) is in these two, which have the shape of the emissivity.
 
     Raises
     ------
@@ -93,13 +120,16 @@ def count_line(parameters: CameraParameters) -> tuple[float, float]:
     """
     check(parameters)
     p = parameters
-    tau = transmission(p)
-    reflected, air, window = planck_counts(
-        [p.reflected_temperature_K, p.atmospheric_temperature_K, p.window_temperature_K], p
-    )
-    gain = p.window_transmission * tau * p.emissivity
-    scene = tau * (1 - p.emissivity) * reflected + (1 - tau) * air
-    return gain, float(p.window_transmission * scene + (1 - p.window_transmission) * window)
+    e = np.asarray(p.emissivity if emissivity is None else emissivity, np.float64)
+    if not np.all((e > 0) & (e <= 1)):
+        raise RadiometryError(f"emissivity from {e.min():g} to {e.max():g}: expected fractions above 0 and up to 1")
+    tau, tau_window = transmission(p), p.window_transmission
+    reflected = black_body_signal(p.reflected_temperature_K, p)
+    air = black_body_signal(p.atmospheric_temperature_K, p)
+    offset = tau_window * (tau * (1 - e) * reflected + (1 - tau) * air)
+    if tau_window < 1:
+        offset = offset + (1 - tau_window) * black_body_signal(p.window_temperature_K, p)
+    return tau_window * tau * e, offset
 
 
 def transmission(parameters: CameraParameters) -> float:
@@ -148,25 +178,33 @@ def override(parameters: CameraParameters, **changes: float) -> CameraParameters
 
 def check(parameters: CameraParameters) -> None:
     """Raise a RadiometryError that lists every parameter with which no temperature can be calculated."""
-    p = parameters
+    if faults := _faults(parameters):
+        raise RadiometryError("; ".join(faults) + "; override what the file has wrong")
+
+
+@lru_cache(maxsize=256)
+def _faults(parameters: CameraParameters) -> tuple[str, ...]:
+    """Return what is wrong with each parameter, as text."""
+    values = asdict(parameters)
+    ranges = {
+        "emissivity": (1e-6, 1, "a fraction above 0 and up to 1"),
+        "window_transmission": (1e-6, 1, "a fraction above 0 and up to 1"),
+        "stored_transmission": (0, 1, "a fraction from 0 to 1"),
+        "relative_humidity": (0, 1, "a fraction from 0 to 1"),
+        "object_distance_m": (0, np.inf, "0 m or more"),
+        "reflected_temperature_K": (100, 3000, "kelvin between 100 and 3000"),
+        "atmospheric_temperature_K": (100, 3000, "kelvin between 100 and 3000"),
+        "window_temperature_K": (100, 3000, "kelvin between 100 and 3000"),
+        "planck_r1": (1e-9, np.inf, "a positive number (the file is not calibrated)"),
+        "planck_b": (1e-9, np.inf, "a positive number (the file is not calibrated)"),
+        "planck_r2": (1e-9, np.inf, "a positive number (the file is not calibrated)"),
+    }
+    if parameters.window_transmission == 1:
+        # Without a window its temperature means nothing, and cameras leave it at 0.
+        del values["window_temperature_K"]
     faults = []
-    for name in (field.name for field in fields(p)):
-        value = getattr(p, name)
-        if not np.isfinite(value):
-            faults.append(f"{name} = {value}: expected a finite number")
-    for name in ("emissivity", "window_transmission"):
-        if not 0 < getattr(p, name) <= 1:
-            faults.append(f"{name} = {getattr(p, name):g}: expected a fraction above 0 and up to 1")
-    for name in ("stored_transmission", "relative_humidity"):
-        if not 0 <= getattr(p, name) <= 1:
-            faults.append(f"{name} = {getattr(p, name):g}: expected a fraction from 0 to 1")
-    for name in ("reflected_temperature_K", "atmospheric_temperature_K", "window_temperature_K"):
-        if not 100 < getattr(p, name) < 3000:
-            faults.append(f"{name} = {getattr(p, name):g}: expected kelvin between 100 and 3000")
-    for name in ("planck_r1", "planck_b", "planck_r2"):
-        if not getattr(p, name) > 0:
-            faults.append(f"{name} = {getattr(p, name):g}: expected a positive number; the file is not calibrated")
-    if p.object_distance_m < 0:
-        faults.append(f"object_distance_m = {p.object_distance_m:g}: expected 0 or more")
-    if faults:
-        raise RadiometryError("; ".join(faults) + "; override the parameters where the file is wrong")
+    for name, value in values.items():
+        low, high, expected = ranges.get(name, (-np.inf, np.inf, "a finite number"))
+        if not (np.isfinite(value) and low <= value <= high):
+            faults.append(f"{name} = {value:g}: expected {expected}")
+    return tuple(faults)
