@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from fusion.twin.streams import first_order, random_levels, stream
 
 Floats = NDArray[np.floating[Any]]
+DRIVES = ("duty", "own", "constant", "table")
+INNER_PART = 0.15
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,9 @@ class Session:
     def state(self, follows: str, time_constant_min: float, name: str) -> Floats:
         """Return the state (grid) of a body that follows a drive with its own time constant, 0 when the test starts.
 
+        Heat reaches the body through a thinner part with `INNER_PART` of that time constant, so that no response of the twin is
+        the plain first-order lag that an analysis is likely to try.
+
         `follows` is "duty" (the logged load), "own" (a load that nobody logs), "constant" (a warm-up from the start) or
         "table" (the mean rise of the table).
         """
@@ -62,12 +67,11 @@ class Session:
             "constant": lambda: (self.grid_s >= 0).astype(float),
             "table": lambda: self.table_rise_K,
         }[follows]()
-        body = first_order(drive, self.grid_s[1] - self.grid_s[0], 60.0 * time_constant_min)
+        step_s = self.grid_s[1] - self.grid_s[0]
+        inner = first_order(drive, step_s, 60.0 * INNER_PART * time_constant_min)
+        body = first_order(inner, step_s, 60.0 * time_constant_min)
         return np.asarray(body - np.interp(0.0, self.grid_s, body))
 
     def start_of(self, cycle: int) -> float:
         """Return the time at which a cycle starts, s."""
         return (cycle - 1) * self.period_s
-
-
-DRIVES = ("duty", "own", "constant", "table")
