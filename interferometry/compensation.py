@@ -1,0 +1,260 @@
+"""L1 - Index of air, dead path and material expansion: what a laser's compensation did, undone and done again.
+
+A linear interferometer counts half wavelengths. Its display multiplies them by the environment factor
+``lambda_vac / (2 n (1 + alpha (T - 20 degC)))``: the wavelength in air of index n, and the scale of a material of
+expansion alpha brought to 20 degC. Where that factor is known, the displacement can be brought back to counts and
+compensated again, with the logged air and with any temperature of the axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import ref_index
+import xarray as xr
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Vacuum wavelength of the stabilised HeNe laser in nm, as genuine files imply it (632.990616 .. 632.990634).
+VACUUM_WAVELENGTH_NM = 632.990625
+REFERENCE_TEMPERATURE_DEGC = 20.0
+#: Readings farther than this from any logged condition are refused.
+LONGEST_GAP_S = 900.0
+
+
+class CompensationError(ValueError):
+    """The compensation cannot be done with these conditions; the message says what to change."""
+
+
+@dataclass(frozen=True)
+class SensorUncertainty:
+    """Standard uncertainties of what the compensation uses (defaults: an XL-80 with weather station, half its k = 2 figures).
+
+    Attributes
+    ----------
+    air_temperature_K, air_pressure_hPa, relative_humidity_percent : float
+    material_temperature_K : float
+    expansion_coefficient_ppm_per_K : float
+    formula_ppm : float
+        Of the equation for the index itself.
+    dead_path_mm : float
+    """
+
+    air_temperature_K: float = 0.1
+    air_pressure_hPa: float = 0.5
+    relative_humidity_percent: float = 3.0
+    material_temperature_K: float = 0.05
+    expansion_coefficient_ppm_per_K: float = 0.5
+    formula_ppm: float = 0.02
+    dead_path_mm: float = 2.0
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            if getattr(self, one.name) < 0:
+                raise CompensationError(f"{one.name}={getattr(self, one.name)} is negative; give 0 or more")
+
+
+def air_index(
+    air_temperature_degC: Array | float,
+    air_pressure_hPa: Array | float,
+    relative_humidity_percent: Array | float,
+    *,
+    wavelength_nm: float = VACUUM_WAVELENGTH_NM,
+) -> Array:
+    """Return the refractive index of air by Ciddor's equation.
+
+    Parameters
+    ----------
+    air_temperature_degC, air_pressure_hPa, relative_humidity_percent : array_like
+        Broadcast against each other.
+    wavelength_nm : float
+        In vacuum, 300 .. 1700.
+
+    Notes
+    -----
+    Ciddor (1996), Applied Optics 35, 1566, in the form of the NIST Engineering Metrology Toolbox, with 450 ppm CO2.
+    """
+    one = np.vectorize(lambda t, p, h: ref_index.ciddor(wavelength_nm, t, p * 100.0, h), otypes=[float])
+    return np.asarray(one(air_temperature_degC, air_pressure_hPa, relative_humidity_percent))
+
+
+def environment_factor(
+    index: Array | float,
+    *,
+    material_temperature_degC: Array | float = REFERENCE_TEMPERATURE_DEGC,
+    expansion_coefficient_ppm_per_K: float = 0.0,
+    wavelength_nm: float = VACUUM_WAVELENGTH_NM,
+) -> Array:
+    """Return the micrometres that one count stands for."""
+    stretch = 1.0 + expansion_coefficient_ppm_per_K * 1e-6 * (
+        np.asarray(material_temperature_degC) - REFERENCE_TEMPERATURE_DEGC
+    )
+    return wavelength_nm * 1e-3 / (2.0 * np.asarray(index) * stretch)
+
+
+def implied_wavelength_nm(
+    factor_um: Array | float,
+    index: Array | float,
+    *,
+    material_temperature_degC: Array | float,
+    expansion_coefficient_ppm_per_K: float,
+) -> Array:
+    """Return the vacuum wavelength that an instrument's environment factor implies: a check of file and sensors."""
+    unit = environment_factor(
+        index,
+        material_temperature_degC=material_temperature_degC,
+        expansion_coefficient_ppm_per_K=expansion_coefficient_ppm_per_K,
+        wavelength_nm=1.0,
+    )
+    return np.asarray(factor_um) / unit
+
+
+def dead_path_error_um(index: Array, start_index: float, *, dead_path_mm: float) -> Array:
+    """Return what a display gains in um, with nothing moving, when the index leaves its value at the zeroing."""
+    return dead_path_mm * 1e3 * (np.asarray(index) - start_index) / np.asarray(index)
+
+
+def compensate(
+    deviations: xr.Dataset,
+    environment: xr.Dataset,
+    *,
+    applied_factor_um: tuple[float, float] | None = None,
+    expansion_coefficient_ppm_per_K: float = 11.7,
+    material_temperature_degC: xr.DataArray | None = None,
+    dead_path_mm: float = 0.0,
+    zero_mm: float = 0.0,
+    away: bool = True,
+    wavelength_nm: float = VACUUM_WAVELENGTH_NM,
+    uncertainty: SensorUncertainty | None = None,
+) -> xr.Dataset:
+    """Undo the instrument's compensation where its factor is known, and compensate with the logged conditions.
+
+    Parameters
+    ----------
+    deviations : xarray.Dataset
+        Keeps ``contract.DEVIATIONS``; every reading needs a time.
+    environment : xarray.Dataset
+        What `readers.read_environment` returns.
+    applied_factor_um : (float, float), optional
+        Environment factor at the start and end of the test, as a .rtl holds it; between them it is taken as linear in
+        time. Left out: the instrument followed the same conditions, and only the dead path remains to be corrected.
+    expansion_coefficient_ppm_per_K : float
+        Of the axis or workpiece that is brought to 20 degC; 0 leaves the material as it is.
+    material_temperature_degC : xarray.DataArray, optional
+        (cycle, direction, target): temperature of the measured length at each reading, for instance seen by a camera.
+        Left out: the logged probe.
+    dead_path_mm : float
+        Distance from the interferometer to the reflector where the display was zeroed.
+    zero_mm : float
+        Axis position at which the display was zeroed.
+    away : bool
+        Whether the reflector moves away from the interferometer as the position grows.
+    wavelength_nm : float
+    uncertainty : SensorUncertainty, optional
+
+    Returns
+    -------
+    xarray.Dataset
+        The deviations compensated, and beside them, in um at every reading: correction_scale and correction_dead_path
+        (both already added), compensation_u; air_index (1). ``attrs["outside_environment"]`` counts readings before
+        the first or after the last logged condition, which take that condition.
+
+    Raises
+    ------
+    CompensationError
+        Readings have no time, or lie more than 15 minutes from any logged condition.
+    """
+    sensors = uncertainty or SensorUncertainty()
+    air, outside = _conditions_at(deviations, environment)
+    index = air_index(
+        air["air_temperature"], air["air_pressure"], air["relative_humidity"], wavelength_nm=wavelength_nm
+    )
+    material = air["material_temperature"] if material_temperature_degC is None else material_temperature_degC.values
+    travel_mm = deviations["position"].values - zero_mm
+    scale = np.zeros(index.shape)
+    if applied_factor_um is not None:
+        wanted = environment_factor(
+            index,
+            material_temperature_degC=material,
+            expansion_coefficient_ppm_per_K=expansion_coefficient_ppm_per_K,
+            wavelength_nm=wavelength_nm,
+        )
+        scale = wanted / _interpolate_factor(deviations, applied_factor_um) - 1.0
+    correction_scale = (travel_mm * 1e3 + deviations["deviation"].values) * scale
+    first = np.unravel_index(int(np.nanargmin(_seconds(deviations))), index.shape)
+    sign = 1.0 if away else -1.0
+    correction_dead_path = -sign * dead_path_error_um(index, float(index[first]), dead_path_mm=dead_path_mm)
+    per_mm = _relative_uncertainty(air, material, expansion_coefficient_ppm_per_K, sensors, wavelength_nm)
+    u = np.hypot(
+        np.abs(travel_mm) * 1e-3 * per_mm,
+        sensors.dead_path_mm * 1e3 * np.abs(index - index[first]) * (dead_path_mm > 0),
+    )
+    compensated = deviations.copy()
+    dims = deviations["deviation"].dims
+    attributes = deviations["deviation"].attrs
+    compensated["deviation"] = (
+        dims,
+        deviations["deviation"].values + correction_scale + correction_dead_path,
+        attributes,
+    )
+    compensated["correction_scale"] = (dims, correction_scale, {"units": "um"})
+    compensated["correction_dead_path"] = (dims, correction_dead_path, {"units": "um"})
+    compensated["compensation_u"] = (dims, u, {"units": "um"})
+    compensated["air_index"] = (dims, index, {"units": "1"})
+    compensated.attrs["outside_environment"] = outside
+    return compensated
+
+
+def _seconds(deviations: xr.Dataset) -> Array:
+    time = deviations["time"].values.astype("datetime64[ns]")
+    known = ~np.isnat(time)
+    if not known.any():
+        raise CompensationError("no reading has a time; compensation needs the conditions at each reading")
+    return np.where(known, (time - time[known].min()).astype("f8") * 1e-9, np.nan)
+
+
+def _conditions_at(deviations: xr.Dataset, environment: xr.Dataset) -> tuple[dict[str, Array], int]:
+    """Return logged conditions at every reading (linear in time), and how many readings lie outside the log."""
+    _seconds(deviations)
+    time = deviations["time"].values.astype("datetime64[ns]")
+    known = ~np.isnat(time)
+    logged = environment["time"].values.astype("datetime64[ns]")
+    at, log = time.astype("i8").astype("f8"), logged.astype("i8").astype("f8")
+    nearest = np.min(np.abs(at[known][:, None] - log[None, :]), axis=1) * 1e-9
+    if nearest.max() > LONGEST_GAP_S:
+        worst = time[known][int(np.argmax(nearest))]
+        raise CompensationError(
+            f"the reading at {worst} lies {nearest.max() / 60:.0f} min from any logged condition ({logged[0]} .. {logged[-1]}); "
+            "give the environment log of this test"
+        )
+    outside = int(np.count_nonzero((at[known] < log[0]) | (at[known] > log[-1])))
+    names = ("air_temperature", "air_pressure", "relative_humidity", "material_temperature")
+    return {name: np.where(known, np.interp(at, log, environment[name].values), np.nan) for name in names}, outside
+
+
+def _interpolate_factor(deviations: xr.Dataset, applied_factor_um: tuple[float, float]) -> Array:
+    seconds = _seconds(deviations)
+    length = max(float(np.nanmax(seconds)), 1e-9)
+    return applied_factor_um[0] + (applied_factor_um[1] - applied_factor_um[0]) * seconds / length
+
+
+def _relative_uncertainty(
+    air: dict[str, Array], material: Array, expansion_ppm_per_K: float, sensors: SensorUncertainty, wavelength_nm: float
+) -> Array:
+    """Return the standard uncertainty of the scale in ppm (um per m), by central differences of the index."""
+    typical = [float(np.nanmean(air[name])) for name in ("air_temperature", "air_pressure", "relative_humidity")]
+    squares = sensors.formula_ppm**2
+    inputs = (sensors.air_temperature_K, sensors.air_pressure_hPa, sensors.relative_humidity_percent)
+    for at, u in enumerate(inputs):
+        high, low = list(typical), list(typical)
+        high[at] += u / 2
+        low[at] -= u / 2
+        difference = air_index(*high, wavelength_nm=wavelength_nm) - air_index(*low, wavelength_nm=wavelength_nm)
+        squares += float(difference * 1e6) ** 2
+    if expansion_ppm_per_K == 0:
+        return np.full(material.shape, np.sqrt(squares))
+    squares += (expansion_ppm_per_K * sensors.material_temperature_K) ** 2
+    from_reference = material - REFERENCE_TEMPERATURE_DEGC
+    return np.sqrt(squares + (sensors.expansion_coefficient_ppm_per_K * from_reference) ** 2)
