@@ -123,7 +123,7 @@ def read_fiducials(path: str | Path) -> list[Fiducial]:
     return fiducials
 
 
-def mask_discs(points_mm: Array, fiducials: Sequence[Fiducial], *, margin_mm: float) -> NDArray[np.bool_]:
+def mask_discs(points_mm: Array, fiducials: Sequence[Fiducial], *, margin_mm: Array | float) -> NDArray[np.bool_]:
     """Tell which plan points, shape (..., 2), lie on a disc or nearer than `margin_mm` to its rim."""
     masked = np.zeros(points_mm.shape[:-1], bool)
     for disc in fiducials:

@@ -85,6 +85,8 @@ class Registration:
         Root mean square of `residual_mm`.
     left_out
         Reason by name for every listed fiducial that was not used.
+    masked
+        Every disc that lies on the table, used or not: their pixels do not show the table's temperature.
     shape
         (rows, columns) of the frames.
     """
@@ -99,6 +101,7 @@ class Registration:
     leave_one_out_mm: dict[str, float]
     rms_mm: float
     left_out: dict[str, str]
+    masked: tuple[Fiducial, ...]
     shape: tuple[int, int]
     covariance: Array = field(repr=False)
 
@@ -189,7 +192,7 @@ def register(
             )
         known = [disc for disc in listed if disc.name in located]
         projection, _ = _fit(_sightings(located, known), _shape(frame), lens)
-    return _registration(located, known, left_out | missed | _wrong_hints(located, known), _shape(frame), lens)
+    return _registration(located, listed, left_out | missed | _wrong_hints(located, known), _shape(frame), lens)
 
 
 def register_points(
@@ -217,7 +220,7 @@ def register_points(
         raise RegistrationError(f"{len(known)} points are picked; a plan needs at least 4")
     located = {disc.name: LocatedDisc(*points_px[disc.name], PICKED_U_PX, np.nan, np.nan) for disc in known}
     missed = {disc.name: "was not picked" for disc in listed if disc.name not in points_px}
-    return _registration(located, known, left_out | missed, shape, lens)
+    return _registration(located, listed, left_out | missed, shape, lens)
 
 
 def locate_fiducials(
@@ -247,13 +250,15 @@ def locate_fiducials(
 
 def _registration(
     located: dict[str, LocatedDisc],
-    known: list[Fiducial],
+    listed: list[Fiducial],
     left_out: dict[str, str],
     shape: tuple[int, int],
     lens: Lens | None,
 ) -> Registration:
     """Choose the model, leave out misplaced fiducials one by one, and gather the figures."""
     left_out = dict(left_out)
+    known = [disc for disc in listed if disc.name in located]
+    misplaced: dict[str, tuple[Fiducial, LocatedDisc]] = {}
     while True:
         seen = _sightings(located, known)
         projection, coefficients = _fit(seen, shape, lens)
@@ -262,7 +267,13 @@ def _registration(
         if worst is None:
             break
         left_out[known[worst].name] = f"misplaced by {loo[worst]:.2f} mm against the others; check its x_mm, y_mm"
-        del located[known[worst].name], known[worst]
+        disc = known.pop(worst)
+        misplaced[disc.name] = (disc, located.pop(disc.name))
+    # A misplaced disc hides the table where it is seen, not where it is listed.
+    moved = {}
+    for name, (disc, found) in misplaced.items():
+        x_mm, y_mm = projection.to_plan(np.array([found.column_px, found.row_px]))
+        moved[name] = replace(disc, x_mm=float(x_mm), y_mm=float(y_mm))
     residual = np.linalg.norm(seen.plan_error(projection), axis=1)
     names = [disc.name for disc in known]
     return Registration(
@@ -276,6 +287,7 @@ def _registration(
         leave_one_out_mm=dict(zip(names, loo.tolist(), strict=True)),
         rms_mm=float(np.sqrt(np.mean(residual**2))),
         left_out=left_out,
+        masked=tuple(moved.get(disc.name, disc) for disc in listed),
         shape=shape,
         covariance=parameter_covariance(seen, projection, coefficients),
     )

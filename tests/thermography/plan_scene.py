@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from thermography.flir import CameraParameters, Frame, index_frames, write_sequence
 from thermography.plan import Fiducial, PlanGrid
+from thermography.radiometry import counts_from_temperature
 
 GRID = PlanGrid(700, 180, 5)
 PLACES = [
@@ -98,3 +100,51 @@ class Scene:
         plan = np.stack([x, y], axis=-1).reshape(-1, 2)
         error = self.to_plan(registration.to_sensor(plan)) - plan
         return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
+#: SC660 constants as in the vendor's own files; air and surroundings as in a workshop.
+SC660 = CameraParameters(
+    emissivity=0.97,
+    object_distance_m=1.2,
+    reflected_temperature_K=295.15,
+    atmospheric_temperature_K=297.15,
+    window_temperature_K=297.15,
+    window_transmission=1.0,
+    stored_transmission=0.0,
+    relative_humidity=0.45,
+    planck_r1=21106.77,
+    planck_b=1501.0,
+    planck_f=1.0,
+    planck_o=-7340.0,
+    planck_r2=0.012545258,
+    atmosphere_alpha1=0.006569,
+    atmosphere_alpha2=0.012620,
+    atmosphere_beta1=-0.002276,
+    atmosphere_beta2=-0.006670,
+    atmosphere_x=1.9,
+)
+START = np.datetime64("2026-03-09T06:30:00.000", "ms")
+
+
+def record(path, images, *, interval_s=1.0, parameters=SC660, start=START):
+    """Write temperature images (degC) as a SEQ file, one every `interval_s`, and return the references to its frames."""
+
+    def frames():
+        for i, image in enumerate(images):
+            counts = np.round(counts_from_temperature(image, parameters)).astype(np.uint16)
+            time = start + np.timedelta64(round(1000 * interval_s * i), "ms")
+            yield Frame(counts=counts, parameters=parameters, time=time)
+
+    write_sequence(path, frames())
+    references, rejected = index_frames([path])
+    assert not rejected
+    return references
+
+
+def cell_truth(field=smooth_field, grid=GRID):
+    """Mean of a field over every cell, (y, x), from 10 x 10 points per cell."""
+    fine = grid.cell_size_mm / 10
+    x = (np.arange(grid.shape[1] * 10) + 0.5) * fine
+    y = (np.arange(grid.shape[0] * 10) + 0.5) * fine
+    values = field(*np.meshgrid(x, y))
+    return values.reshape(grid.shape[0], 10, grid.shape[1], 10).mean(axis=(1, 3))

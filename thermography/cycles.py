@@ -1,0 +1,270 @@
+"""L3 - One field per cycle: cells, their uncertainty and flags, as a Dataset with CF attributes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from thermography.averaging import AVERAGING_LIMIT_K, MeanTemperature
+from thermography.plan import PlanGrid
+from thermography.registration import Registration
+from thermography.resampling import PlanWeights
+
+Array = NDArray[Any]
+
+#: Cycle index of a frame that lies in no cycle.
+NOT_NUMBERED = -1
+#: Bits of `quality_flag`.
+FLAGS = {
+    "partly_seen": 1,
+    "calibrated_per_frame": 2,
+    "several_registrations": 4,
+    "not_seen": 8,
+    "no_frame": 16,
+}
+PARTLY_SEEN_BELOW = 0.99
+
+#: Second difference in both directions: blind to planes, 6 times the noise of one pixel (Immerkaer 1996).
+NOISE_KERNEL = np.outer([1, -2, 1], [1, -2, 1]).astype(float)
+
+DEGREES = {"units": "degC", "units_metadata": "temperature: on_scale"}
+KELVIN = {"units": "K", "units_metadata": "temperature: difference"}
+ATTRIBUTES: dict[str, dict[str, Any]] = {
+    "temperature": {
+        "standard_name": "surface_temperature",
+        "long_name": "mean surface temperature over the frames of the cycle",
+        "ancillary_variables": "temperature_u count quality_flag",
+        **DEGREES,
+    },
+    "temperature_u": {
+        "long_name": "standard uncertainty of the mean temperature from pixel noise and registration",
+        "comment": "what all cells share (emissivity, reflections, the camera's scale) is not in it",
+        **KELVIN,
+    },
+    "temperature_rise": {
+        "long_name": "rise of the mean temperature since the first cycle",
+        "ancillary_variables": "temperature_rise_u count quality_flag",
+        **KELVIN,
+    },
+    "temperature_rise_u": {"long_name": "standard uncertainty of the rise from pixel noise and registration", **KELVIN},
+    "temperature_rate": {
+        "long_name": "rate of the mean temperature over neighbouring cycles",
+        "units": "K h-1",
+        "units_metadata": "temperature: difference",
+    },
+    "temperature_spread": {
+        "long_name": "standard deviation of a pixel's temperature over the frames of the cycle, root mean square over the cell",
+        **KELVIN,
+    },
+    "count": {"long_name": "frames averaged", "units": "1"},
+    "quality_flag": {
+        "standard_name": "quality_flag",
+        "long_name": "what limits the temperature of the cell",
+        "flag_masks": np.array(list(FLAGS.values()), np.uint8),
+        "flag_meanings": " ".join(FLAGS),
+    },
+    "position_u": {
+        "long_name": "standard uncertainty of the place of a cell on the sensor, as length on the plan",
+        "units": "mm",
+    },
+    "coverage": {"long_name": "part of the cell's area that is seen unmasked", "units": "1"},
+    "frame_temperature": {
+        "standard_name": "surface_temperature",
+        "long_name": "mean surface temperature over a frame or a short block of frames",
+        **DEGREES,
+    },
+    "frame_cycle": {"long_name": "cycle that the frames belong to, 0 for none", "units": "1"},
+    "frame_count": {"long_name": "frames in the block", "units": "1"},
+    "cycle_time": {"long_name": "mean time of the frames of the cycle", "units_metadata": "leap_seconds: utc"},
+    "time": {
+        "standard_name": "time",
+        "long_name": "mean time of the frames of the block",
+        "units_metadata": "leap_seconds: utc",
+    },
+    "cycle": {"long_name": "measurement cycle", "units": "1"},
+    "x": {"standard_name": "projection_x_coordinate", "long_name": "table plan along x", "units": "mm", "axis": "X"},
+    "y": {"standard_name": "projection_y_coordinate", "long_name": "table plan along y", "units": "mm", "axis": "Y"},
+}
+
+
+@dataclass
+class CyclePart:
+    """What the frames of one cycle under one registration add up to: pixels while it is open, cells once it is finished."""
+
+    cycle: int
+    span: int
+    frames: int = 0
+    first_time: np.datetime64 = field(default=np.datetime64("NaT"))
+    seconds: float = 0.0
+    pixels: MeanTemperature | None = None
+    mean: Array = field(default_factory=lambda: np.empty(0))
+    spread: Array = field(default_factory=lambda: np.empty(0))
+    noise_variance: Array = field(default_factory=lambda: np.empty(0))
+    fell_back: Array = field(default_factory=lambda: np.empty(0))
+
+    def add(self, reduced: MeanTemperature, times: Array) -> None:
+        """Add a block of frames taken at `times`."""
+        if self.pixels is None:
+            self.first_time = times[0]
+        self.pixels = reduced if self.pixels is None else self.pixels.merge(reduced)
+        self.frames += reduced.frames
+        self.seconds += float(((times - self.first_time) / np.timedelta64(1, "ns")).sum()) / 1e9
+
+    def finish(self, weights: PlanWeights) -> None:
+        """Turn pixels into cells."""
+        assert self.pixels is not None
+        pixels = self.pixels
+        used = (np.asarray(weights.areas.sum(axis=0)).ravel() > 0).reshape(pixels.mean.shape)
+        self.mean = weights.resample(np.where(used, pixels.mean, 0.0))
+        sample = pixels.frames / (pixels.frames - 1) if pixels.frames > 1 else np.nan
+        self.spread = np.sqrt(weights.average(np.where(used, pixels.variance, 0.0)) * sample)
+        self.noise_variance = weights.propagate(pixel_noise(pixels.mean, used) ** 2)
+        self.fell_back = weights.average((pixels.bound_K > AVERAGING_LIMIT_K).astype(float)) > 0
+        self.pixels = None
+
+
+def pixel_noise(image: Array, used: NDArray[np.bool_]) -> float:
+    """Standard deviation of white noise in an image, from second differences of the used pixels; blind to smooth fields."""
+    difference = ndimage.convolve(np.where(used, image, 0.0), NOISE_KERNEL)
+    whole = ndimage.binary_erosion(used, np.ones((3, 3)))
+    if whole.sum() < 30:
+        return float("nan")
+    return 1.4826 * float(np.nanmedian(np.abs(difference[whole]))) / 6
+
+
+def position_covariance(registration: Registration, grid: PlanGrid) -> Array:
+    """Covariance of every cell's place, shape (y, x, 2, 2), mm2."""
+    return registration.position_covariance(np.stack(np.meshgrid(grid.x_mm, grid.y_mm), axis=-1))
+
+
+def assemble(
+    parts: Sequence[CyclePart],
+    cycles: int,
+    grid: PlanGrid,
+    covariances: Sequence[Array],
+    weights: Sequence[PlanWeights],
+) -> xr.Dataset:
+    """Put the cycles together: mean, rise, rate, spread, count, uncertainties and flags on the plan.
+
+    Parameters
+    ----------
+    parts
+        Finished, in the order of time.
+    cycles
+        How many cycles the campaign has, with frames or without.
+    grid
+        The plan.
+    covariances, weights
+        Of every registration: `position_covariance`, and the weights of the cells.
+    """
+    shape = (cycles, *grid.shape)
+    mean, spread, noise, place = (np.full(shape, np.nan) for _ in range(4))
+    count = np.zeros(shape, np.int32)
+    flags = np.zeros(shape, np.uint8)
+    time = np.full(cycles, np.datetime64("NaT"), "datetime64[ns]")
+    for cycle in range(cycles):
+        own = [part for part in parts if part.cycle == cycle]
+        if not own:
+            flags[cycle] = FLAGS["no_frame"]
+            continue
+        frames = np.array([part.frames for part in own], float)
+        time[cycle] = own[0].first_time + np.timedelta64(_mean_nanoseconds(own), "ns")
+        mean[cycle], spread[cycle], noise[cycle] = _together(own, frames)
+        seen = [np.isfinite(part.mean) for part in own]
+        count[cycle] = sum(part.frames * s for part, s in zip(own, seen, strict=True))
+        last = covariances[own[-1].span]
+        place[cycle] = _gradient_variance(mean[cycle], last, grid)
+        coverage = np.max([weights[part.span].coverage for part in own], axis=0)
+        flags[cycle] |= np.where(coverage < PARTLY_SEEN_BELOW, FLAGS["partly_seen"], 0).astype(np.uint8)
+        fell_back = np.any([part.fell_back for part in own], axis=0)
+        flags[cycle] |= np.where(fell_back, FLAGS["calibrated_per_frame"], 0).astype(np.uint8)
+        flags[cycle] |= np.uint8(FLAGS["several_registrations"] if len(own) > 1 else 0)
+        flags[cycle] |= np.where(np.isnan(mean[cycle]), FLAGS["not_seen"], 0).astype(np.uint8)
+    reference = min(part.cycle for part in parts)
+    rise = mean - mean[reference]
+    first_covariance = covariances[next(part.span for part in parts if part.cycle == reference)]
+    rise_place = np.stack([_gradient_variance(field, first_covariance, grid) for field in rise])
+    # The noise of the first cycle is in every rise but its own, which is zero by definition.
+    rise_noise = np.where(np.arange(cycles)[:, None, None] == reference, 0.0, noise + noise[reference])
+    values = {
+        "temperature": mean,
+        "temperature_u": np.sqrt(noise + place),
+        "temperature_rise": rise,
+        "temperature_rise_u": np.sqrt(rise_noise + rise_place),
+        "temperature_rate": _rate(mean, time),
+        "temperature_spread": spread,
+    }
+    plan = ("cycle", "y", "x")
+    dataset = xr.Dataset(
+        {name: (plan, array.astype(np.float32)) for name, array in values.items()}
+        | {
+            "count": (plan, count),
+            "quality_flag": (plan, flags),
+            "cycle_time": ("cycle", time),
+            "position_u": (("y", "x"), np.sqrt(np.trace(covariances[0], axis1=-2, axis2=-1)).astype(np.float32)),
+            "coverage": (("y", "x"), weights[0].coverage.astype(np.float32)),
+        },
+        coords={"cycle": np.arange(1, cycles + 1, dtype=np.int32), "y": grid.y_mm, "x": grid.x_mm},
+        attrs={"Conventions": "CF-1.11", "title": "Temperature fields on the table plan"},
+    )
+    return annotate(dataset)
+
+
+def annotate(dataset: xr.Dataset) -> xr.Dataset:
+    """Give every variable that is known its CF attributes, and coordinates no fill value."""
+    for name in dataset.variables:
+        dataset[name].attrs.update(ATTRIBUTES.get(str(name), {}))
+        if name in dataset.coords:
+            dataset[name].encoding["_FillValue"] = None
+    return dataset
+
+
+def _mean_nanoseconds(own: Sequence[CyclePart]) -> int:
+    """Mean time of all frames since the first one of the first part, ns."""
+    start = own[0].first_time
+    total = sum(part.seconds + part.frames * float((part.first_time - start) / np.timedelta64(1, "s")) for part in own)
+    return round(1e9 * total / sum(part.frames for part in own))
+
+
+def _together(own: Sequence[CyclePart], frames: Array) -> tuple[Array, Array, Array]:
+    """Mean, spread and noise variance of a cycle whose frames have one or, after a knock, several registrations."""
+    if len(own) == 1:
+        return own[0].mean, own[0].spread, own[0].noise_variance
+    means = np.stack([part.mean for part in own])
+    weight = np.where(np.isfinite(means), frames[:, None, None], 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        weight = weight / weight.sum(axis=0)
+    mean = np.where(weight > 0, weight * np.nan_to_num(means), 0.0).sum(axis=0)
+    noise = (weight**2 * np.nan_to_num([part.noise_variance for part in own])).sum(axis=0)
+    spread = np.sqrt((weight * np.nan_to_num([part.spread**2 for part in own])).sum(axis=0))
+    nowhere = np.isnan(means).all(axis=0)
+    return tuple(np.where(nowhere, np.nan, field) for field in (mean, spread, noise))  # type: ignore[return-value]
+
+
+def _gradient_variance(field_K: Array, covariance: Array, grid: PlanGrid) -> Array:
+    """Variance that the registration's uncertainty puts on a field through its gradient, K2."""
+    known = np.isfinite(field_K)
+    if not known.any():
+        return np.full(field_K.shape, np.nan)
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    # Over 3 cells, so that the noise of single cells does not pass for a gradient.
+    smooth = ndimage.gaussian_filter(field_K[tuple(nearest)], 1.0, mode="nearest")
+    gradient = np.stack(np.gradient(smooth, grid.cell_size_mm)[::-1], axis=-1)
+    variance: Array = np.einsum("...i,...ij,...j->...", gradient, covariance, gradient)
+    return np.where(known, variance, np.nan)
+
+
+def _rate(mean: Array, time: Array) -> Array:
+    """Central difference over the cycles that have a time, K/h; NaN where there are fewer than two."""
+    rate = np.full(mean.shape, np.nan)
+    known = np.flatnonzero(~np.isnat(time))
+    if known.size >= 2:
+        hours = (time[known] - time[known[0]]) / np.timedelta64(1, "s") / 3600
+        rate[known] = np.gradient(mean[known], hours, axis=0)
+    return rate
