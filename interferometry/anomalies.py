@@ -17,7 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import optimize, stats
+from scipy import stats
+
+from interferometry.outliers import generalised_esd
 
 Array = NDArray[np.float64]
 
@@ -110,64 +112,6 @@ def detectable_extra(estimated: xr.Dataset, *, level: float = 0.05, power: float
     needed = stats.norm.isf(level * WEIGHTS["scatter"] / targets) + stats.norm.ppf(power)
     ratio = np.exp(2 * needed / np.sqrt(2 * freedom))
     return float(estimated["sigma"]) * float(np.sqrt(ratio - 1))
-
-
-def resolve_links(pair_s_um: Array) -> Array:
-    """Resolve standard deviations of neighbour differences into those of positions.
-
-    A position with excess scatter raises both of its links. The squares obey s_link^2 = s_i^2 + s_(i+1)^2, one equation
-    fewer than positions: of all non-negative solutions the one nearest to equal scatter is taken.
-
-    Parameters
-    ----------
-    pair_s_um : (m - 1,) ndarray
-
-    Returns
-    -------
-    (m,) ndarray
-    """
-    variance = np.asarray(pair_s_um, float) ** 2
-    links = variance.size
-    sums = np.eye(links, links + 1) + np.eye(links, links + 1, 1)
-    usual = np.full(links + 1, float(np.median(variance)) / 2)
-    weak = 0.3 * np.eye(links + 1)
-    solution, _ = optimize.nnls(np.vstack([sums, weak]), np.concatenate([variance, weak @ usual]))
-    return np.sqrt(solution)
-
-
-def generalised_esd(values: Array, *, most: int, level: float = 0.05) -> NDArray[np.bool_]:
-    """Mark outliers by the generalised extreme Studentized deviate test (Rosner 1983).
-
-    Parameters
-    ----------
-    values : (n,) ndarray
-    most : int
-        Largest number of outliers looked for.
-    level : float
-
-    Returns
-    -------
-    (n,) bool ndarray
-    """
-    n = values.size
-    left = np.ones(n, dtype=bool)
-    order: list[int] = []
-    outliers = 0
-    for i in range(1, min(most, n - 2) + 1):
-        centre, spread = values[left].mean(), values[left].std(ddof=1)
-        if spread == 0:
-            break
-        deviation = np.where(left, np.abs(values - centre) / spread, -1.0)
-        at = int(np.argmax(deviation))
-        p = 1 - level / (2 * (n - i + 1))
-        t = stats.t.ppf(p, n - i - 1)
-        if deviation[at] > (n - i) * t / np.sqrt((n - i - 1 + t**2) * (n - i + 1)):
-            outliers = i
-        order.append(at)
-        left[at] = False
-    marked = np.zeros(n, dtype=bool)
-    marked[order[:outliers]] = True
-    return marked
 
 
 def _scatter_anomalies(

@@ -1,8 +1,6 @@
 """L3 - The joint estimate: profile of both directions and drift in real time, from every reading at its own time.
 
-Each reading is a profile value of its direction and target, plus a drift that wanders in time (a shift of all targets
-and a stretch that grows with position; where the readings ask for it, also a drift of the reversal and a bend), plus
-noise. Profile and drift are estimated together by generalised least squares; the drift's variances by restricted
+Profile and drift are estimated together by generalised least squares; the drift's variances by restricted
 maximum likelihood; a reading far from all others loses its weight. With complete readings the profile equals the plain
 mean and the chain of neighbour differences; where readings are missing, passes unequal or outliers present it is better
 than both, and it knows its own covariance.
@@ -16,56 +14,20 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import stats
 
 from interferometry import flags
-from interferometry.deviations import DIMS, sort_readings
+from interferometry.deviations import DIMS
 from interferometry.driftaverage import average_drift
-from interferometry.statespace import DriftFit, Order, estimate
+from interferometry.jointfit import DriftDataError, JointFit, fit_joint, loadings_of, span_mm
+from interferometry.statespace import Order
 
 Array = NDArray[np.float64]
 
-#: Share of a drift component in a reading, by its sign of approach (+1, -1) and its position (0 first target, 1 last).
-COMPONENTS = {
-    "shift": lambda sign, place: np.ones(place.size),
-    "stretch": lambda sign, place: place,
-    "reversal": lambda sign, place: sign / 2.0,
-    "bend": lambda sign, place: 4.0 * place * (1.0 - place),
-}
-BASE_COMPONENTS = ("shift", "stretch")
-#: A further component is added where its contrast over the cycles is serially dependent at this level.
-COMPONENT_LEVEL = 1e-3
+__all__ = ["DriftDataError", "describe", "estimate_drift", "fit_joint", "flag_outliers", "state_weights"]
+
 #: Deletion residual, in standard deviations, from which a reading is flagged as an outlier: among 10,000 normal
 #: readings the chance of one is 0.07.
 OUTLIER_LIMIT = 4.5
-
-
-class DriftDataError(ValueError):
-    """The deviations cannot be fitted jointly; the message says what is missing."""
-
-
-@dataclass(frozen=True)
-class JointFit:
-    """The joint estimate as numbers: readings in measuring order, and the fit.
-
-    Attributes
-    ----------
-    readings : xarray.Dataset
-        What `sort_readings` returns.
-    cells : (cell, 2) ndarray of int
-        Direction and target index of each profile column of the design.
-    cell : (reading,) ndarray of int
-        Profile column of each reading.
-    components : tuple of str
-        Names of the drift components, in the order of the loadings.
-    fit : DriftFit
-    """
-
-    readings: xr.Dataset
-    cells: NDArray[np.int64]
-    cell: NDArray[np.int64]
-    components: tuple[str, ...]
-    fit: DriftFit
 
 
 def estimate_drift(
@@ -111,115 +73,6 @@ def estimate_drift(
     """
     joint = fit_joint(deviations, robust=robust, order=order, components=components)
     return describe(deviations, joint, state=state)
-
-
-def fit_joint(
-    deviations: xr.Dataset,
-    *,
-    robust: bool = True,
-    order: Order | None = None,
-    components: Sequence[str] | None = None,
-) -> JointFit:
-    """Fit profile and drift; see `estimate_drift`, which also describes the result."""
-    readings = sort_readings(deviations)
-    _check_readings(deviations, readings)
-    cells, cell = _cells(deviations, readings)
-    if components is not None:
-        unknown = sorted(set(components) - set(COMPONENTS))
-        if unknown:
-            raise DriftDataError(f"components {unknown} are not known; choose from {', '.join(COMPONENTS)}")
-        return _fit(readings, cells, cell, tuple(components), robust, order, None)
-    joint = _fit(readings, cells, cell, BASE_COMPONENTS, robust, order, None)
-    wanted = tuple(name for name in ("reversal", "bend") if _asks_for(joint, name))
-    if not wanted:
-        return joint
-    start = np.concatenate([joint.fit.system.ratios, np.full(len(wanted), joint.fit.system.ratios.min() * 1e-2)])
-    return _fit(readings, cells, cell, (*BASE_COMPONENTS, *wanted), robust, joint.fit.system.order, start)
-
-
-def _check_readings(deviations: xr.Dataset, readings: xr.Dataset) -> None:
-    held = int(np.isfinite(deviations["deviation"].values).sum())
-    if held and not readings.sizes["reading"]:
-        raise DriftDataError("no reading has a time; the joint estimate needs times, recorded or reconstructed")
-    cycles, targets = np.unique(readings["cycle"].values).size, np.unique(readings["target"].values).size
-    if cycles < 2 or targets < 2:
-        raise DriftDataError(
-            f"{cycles} cycles and {targets} targets hold readings; the joint estimate needs two of each"
-        )
-
-
-def _cells(deviations: xr.Dataset, readings: xr.Dataset) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the (direction, target) indices that hold readings, and each reading's place among them."""
-    direction = np.where(readings["sign"].values > 0, 0, 1)
-    target = np.searchsorted(deviations["target"].values, readings["target"].values)
-    cells, cell = np.unique(np.column_stack([direction, target]), axis=0, return_inverse=True)
-    return cells, np.asarray(cell).ravel()
-
-
-def loadings_of(sign: Array, position_mm: Array, components: Sequence[str], span_mm: tuple[float, float]) -> Array:
-    """Return how each drift component enters readings of a sign at a position, (n, components)."""
-    place = (np.asarray(position_mm, float) - span_mm[0]) / (span_mm[1] - span_mm[0])
-    return np.column_stack([COMPONENTS[name](np.asarray(sign, float), place) for name in components])
-
-
-def _span(readings: xr.Dataset) -> tuple[float, float]:
-    return float(readings["position"].min()), float(readings["position"].max())
-
-
-def _fit(
-    readings: xr.Dataset,
-    cells: NDArray[np.int64],
-    cell: NDArray[np.int64],
-    components: tuple[str, ...],
-    robust: bool,
-    order: Order | None,
-    start: Array | None,
-) -> JointFit:
-    sign = readings["sign"].values.astype(float)
-    loadings = loadings_of(sign, readings["position"].values, components, _span(readings))
-    design = np.zeros((cell.size, len(cells)))
-    design[np.arange(cell.size), cell] = 1.0
-    fit = estimate(
-        readings["seconds"].values,
-        loadings,
-        readings["deviation"].values,
-        design,
-        order=order,
-        robust=robust,
-        start=start,
-    )
-    return JointFit(readings, cells, cell, components, fit)
-
-
-def _asks_for(joint: JointFit, component: str) -> bool:
-    """Tell whether the noise holds a component that changes slowly, by the von Neumann ratio of its contrast per cycle."""
-    readings = joint.readings
-    sign = readings["sign"].values.astype(float)
-    names = (component, *(name for name in COMPONENTS if name != component and name != "bend"))
-    if component == "reversal" and np.unique(sign).size < 2:
-        return False
-    basis = loadings_of(sign, readings["position"].values, names, _span(readings))
-    noise = joint.fit.noise()[0] / joint.fit.system.variance
-    contrasts = []
-    for cycle in np.unique(readings["cycle"].values):
-        own = readings["cycle"].values == cycle
-        wanted, others = basis[own, 0], basis[own, 1:]
-        wanted = wanted - others @ np.linalg.lstsq(others, wanted, rcond=None)[0]
-        size = float(wanted @ wanted)
-        if size > 1e-6 * own.sum():
-            contrasts.append(float(wanted @ noise[own]) / np.sqrt(size))
-    return _serial_p_value(np.array(contrasts)) < COMPONENT_LEVEL
-
-
-def _serial_p_value(series: Array) -> float:
-    """Return the one-sided p-value of positive serial dependence by the von Neumann ratio (normal approximation)."""
-    n = series.size
-    if n < 8:
-        return 1.0
-    centred = series - series.mean()
-    ratio = float((np.diff(series) ** 2).sum() / (centred**2).sum())
-    deviation = np.sqrt(4.0 * (n - 2.0) / (n**2 - 1.0))
-    return float(stats.norm.cdf((ratio - 2.0) / deviation))
 
 
 def describe(deviations: xr.Dataset, joint: JointFit, *, state: str | float = "mean") -> xr.Dataset:
@@ -348,7 +201,7 @@ def _describe_profile(deviations: xr.Dataset, joint: JointFit, at_state: _StateD
     fit = joint.fit
     sign = np.where(joint.cells[:, 0] == 0, 1.0, -1.0)
     position = deviations["position"].values[joint.cells[:, 1]]
-    loadings = loadings_of(sign, position, joint.components, _span(joint.readings))
+    loadings = loadings_of(sign, position, joint.components, span_mm(joint.readings))
     cells = len(joint.cells)
     to_profile = np.eye(cells, fit.coefficients.size) + loadings @ at_state.through
     profile = fit.coefficients[:cells] + loadings @ at_state.drift

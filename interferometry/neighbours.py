@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
-from scipy import stats
+from scipy import optimize, stats
 
 #: Probability that two standard deviations of a normal distribution cover; Student's t replaces the 2 below it.
 TWO_SIGMA_PROBABILITY = 0.9545
@@ -213,6 +213,29 @@ def telescoping_error(deviations: xr.Dataset) -> float:
     mean = x.mean("cycle").values
     chain = np.cumsum(evaluate_neighbours(deviations)["mean_difference"].values, axis=-1)
     return float(np.nanmax(np.abs(chain - (mean[:, :1] - mean[:, 1:]))))
+
+
+def resolve_links(pair_s_um: np.ndarray) -> np.ndarray:
+    """Resolve standard deviations of neighbour differences into those of positions.
+
+    A position with excess scatter raises both of its links. The squares obey s_link^2 = s_i^2 + s_(i+1)^2, one equation
+    fewer than positions: of all non-negative solutions the one nearest to equal scatter is taken.
+
+    Parameters
+    ----------
+    pair_s_um : (m - 1,) ndarray
+
+    Returns
+    -------
+    (m,) ndarray
+    """
+    variance = np.asarray(pair_s_um, float) ** 2
+    links = variance.size
+    sums = np.eye(links, links + 1) + np.eye(links, links + 1, 1)
+    usual = np.full(links + 1, float(np.median(variance)) / 2)
+    weak = 0.3 * np.eye(links + 1)
+    solution, _ = optimize.nnls(np.vstack([sums, weak]), np.concatenate([variance, weak @ usual]))
+    return np.sqrt(solution)
 
 
 def simulate_derived_sequence(samples: int, rng: np.random.Generator) -> xr.Dataset:
