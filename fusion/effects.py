@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 
 import numpy as np
-from interferometry.compensation import refractive_index
+from interferometry.compensation import air_index
 from numpy.typing import NDArray
 
 from fusion.readings import Readings, Series
@@ -157,7 +157,7 @@ def _unseen_heat_source(readings: Readings, _: Mapping[str, float]) -> Iterator[
 def refractivity_change_ppm(readings: Readings) -> Array:
     """Change of the index of air since the first reading, ppm (Ciddor), (n,)."""
     air = [readings.at(readings.series[name]) for name in ("air_temperature", "air_pressure", "relative_humidity")]
-    index = refractive_index(*air)
+    index = air_index(*air)
     return np.asarray((index - index[0]) * 1e6, float)
 
 
