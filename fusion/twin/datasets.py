@@ -59,17 +59,10 @@ def fields_of(truth: Truth, *, cell_size_mm: float = 5.0, noise_K: float | None 
         raise ValueError(
             "fields_of needs camera.table = 'still'; write the campaign and reduce its frames for a moving table"
         )
-    fine = 2
     centre_x = (np.arange(round(plan.width_mm / cell_size_mm)) + 0.5) * cell_size_mm
     centre_y = (np.arange(round(plan.height_mm / cell_size_mm)) + 0.5) * cell_size_mm
-    parts = (np.arange(fine) - 0.5 * (fine - 1)) * cell_size_mm / fine
-    x, y = (centre_x[:, None] + parts).ravel(), (centre_y[:, None] + parts).ravel()
-    true = truth.temperature(truth.session.frame_s, x, y)
-    frames, ny, nx = true.shape[0], centre_y.size, centre_x.size
-    seen = (
-        true.reshape(frames, ny, fine, nx, fine).mean(axis=(2, 4))
-        + truth.frames["camera_offset_K"].values[:, None, None]
-    )
+    seen = truth.temperature(truth.session.frame_s, centre_x, centre_y, cell_mm=cell_size_mm)
+    seen += truth.frames["camera_offset_K"].values[:, None, None]
     seen += truth.frames["reflected_K"].values[:, None, None] * _mirror_gain(truth, centre_x, centre_y)
     pixels = _pixels_per_cell(truth, cell_size_mm)
     sigma = camera.netd_K / np.sqrt(pixels) if noise_K is None else noise_K

@@ -40,11 +40,15 @@ class Plate:
         part = (place - low)[:, None]
         return np.asarray((1.0 - part) * self.amplitudes[low] + part * self.amplitudes[low + 1])
 
-    def field(self, time_s: Floats, x_mm: Floats, y_mm: Floats) -> Floats:
-        """Return the rise (time, y, x) in K on the grid of the given coordinates, mm."""
+    def field(self, time_s: Floats, x_mm: Floats, y_mm: Floats, *, cell_mm: float = 0.0) -> Floats:
+        """Return the rise (time, y, x) in K at the given coordinates, mm, or its exact mean over square cells around them."""
         modes = self.at(time_s).reshape(-1, MODES_X, MODES_Y)
-        along = cosines(x_mm, self.plan.width_mm, MODES_X)
-        across = cosines(y_mm, self.plan.height_mm, MODES_Y)
+        along = cosines(x_mm, self.plan.width_mm, MODES_X) * np.sinc(
+            np.arange(MODES_X) * cell_mm / (2 * self.plan.width_mm)
+        )
+        across = cosines(y_mm, self.plan.height_mm, MODES_Y) * np.sinc(
+            np.arange(MODES_Y) * cell_mm / (2 * self.plan.height_mm)
+        )
         return np.asarray(np.matmul(np.matmul(across, modes.transpose(0, 2, 1)), along.T))
 
     def mean(self) -> Floats:

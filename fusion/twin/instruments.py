@@ -205,7 +205,7 @@ def _write_truth(truth: Truth, folder: Path) -> None:
         {
             "temperature": (
                 ("field_time", "y", "x"),
-                truth.temperature(field_s, x, y).astype(np.float32),
+                truth.temperature(field_s, x, y, cell_mm=TRUTH_CELL_MM).astype(np.float32),
                 {"units": "degC"},
             )
         },

@@ -55,9 +55,11 @@ class Truth:
         ordered[:, 1] = ordered[:, 1, ::-1]
         return np.asarray(ordered.ravel())
 
-    def temperature(self, time_s: Floats, x_mm: Floats, y_mm: Floats) -> Floats:
-        """Return the true table temperature (time, y, x), degC."""
-        return np.asarray(self.plate.field(time_s, x_mm, y_mm) + self.recipe.table.initial_temperature_degC)
+    def temperature(self, time_s: Floats, x_mm: Floats, y_mm: Floats, *, cell_mm: float = 0.0) -> Floats:
+        """Return the true table temperature (time, y, x), degC, at points or averaged over square cells around them."""
+        return np.asarray(
+            self.plate.field(time_s, x_mm, y_mm, cell_mm=cell_mm) + self.recipe.table.initial_temperature_degC
+        )
 
 
 def simulate(recipe: Recipe) -> Truth:
