@@ -20,7 +20,7 @@ from interferometry.statespace import Array, DriftFit
 _PERMUTATIONS = 400
 _BLOCK = 5
 #: Chance at which "a shape remains" is said though nothing does, over all statistics together.
-LEVEL = 0.05
+LEVEL = 0.02
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ def cycle_bounds(deviations: xr.Dataset) -> NDArray[np.datetime64]:
 
 def camera_on_laser_clock(time: NDArray[np.datetime64], clock_offset_s: float) -> NDArray[np.datetime64]:
     """Frame times on the laser's clock; ``clock_offset_s`` is the camera's clock minus the laser's."""
-    return time.astype("datetime64[ns]") - np.timedelta64(round(clock_offset_s * 1e9), "ns")
+    return np.asarray(time.astype("datetime64[ns]") - np.timedelta64(round(clock_offset_s * 1e9), "ns"))
 
 
 def align(
@@ -239,7 +239,7 @@ def _interpolate(reading_time: NDArray[np.datetime64], series_time: NDArray[np.d
 
 def _add_table(fused: xr.Dataset, table: xr.Dataset, dim: str) -> xr.Dataset:
     """Every numeric column of a table along time: at the readings, and as a series on its own times; gaps stay NaN."""
-    added = {}
+    added: dict[str, tuple[tuple[str, ...], NDArray[np.generic], dict[str, object]]] = {}
     for name, column in table.data_vars.items():
         if column.dims != ("time",) or column.dtype.kind not in "fiu":
             continue

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from fusion.readings import Readings, Series
 
 Array = NDArray[np.float64]
+Parameters = dict[str, float | str]
 
 #: First-order time constants that are tried, minutes: from a thin part to a column or bed. Neighbours are so close that their
 #: responses to any input correlate by more than 0.98, so that a finer grid would find nothing more.
@@ -118,7 +119,7 @@ def warm_up(readings: Readings, minutes: float) -> Array:
     return 1.0 - np.exp(-readings.seconds / (60.0 * minutes))
 
 
-def _states(readings: Readings) -> Iterator[tuple[Array, dict[str, float | str]]]:
+def _states(readings: Readings) -> Iterator[tuple[Array, Parameters]]:
     """Thermal states that a part of the machine may follow: lagged table, lagged drivers, a plain warm-up."""
     if "mean_rise" in readings.series:
         for minutes in (0.0, *_STATE_LAGS_MIN):
@@ -133,12 +134,14 @@ def _states(readings: Readings) -> Iterator[tuple[Array, dict[str, float | str]]
 
 
 def _thermal_lag(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
-    for minutes in LAGS_MIN:
+    # Between two frames the field is a straight line; a shorter lag is not in the data.
+    frames_min = float(np.median(np.diff(readings.series["mean_rise"].seconds))) / 60.0
+    for minutes in (minutes for minutes in LAGS_MIN if minutes >= 2.0 * frames_min):
         axis = readings.at(readings.series["axis_integral"].lagged(60.0 * minutes)) * 1e-3
         offset = readings.at(readings.series["mean_rise"].lagged(60.0 * minutes))
         yield Member(_column(offset), {"time_constant_min": minutes, "shape": "flat"}, ("um/K",))
         yield Member(_column(axis), {"time_constant_min": minutes, "shape": "linear"}, ("ppm/K",))
-        both = {"time_constant_min": minutes, "shape": "flat and linear"}
+        both: Parameters = {"time_constant_min": minutes, "shape": "flat and linear"}
         yield Member(_column(offset, axis), both, ("um/K", "ppm/K"))
 
 
@@ -147,7 +150,7 @@ def _unseen_heat_source(readings: Readings, _: Mapping[str, float]) -> Iterator[
         unit = readings.series[name].units
         for minutes in LAGS_MIN:
             state = readings.at(readings.series[name].lagged(60.0 * minutes, at_rest=0.0))
-            found = {"follows": name, "time_constant_min": minutes}
+            found: Parameters = {"follows": name, "time_constant_min": minutes}
             per = (f"um/({unit})",)
             yield Member(_column(state), {**found, "shape": "flat"}, per)
             yield Member(_column(state * readings.share), {**found, "shape": "linear"}, per)
@@ -216,10 +219,15 @@ def _step_event(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
 
 
 def periods_min(readings: Readings) -> Array:
-    """Periods that are tried: evenly spaced in frequency at half the resolution of the record, 3 min to a third of it."""
+    """Periods that are tried: evenly spaced in frequency at half the resolution of the record, 3 min to a third of it.
+
+    Periods that the cycle or its halves would imitate are left out: every slow change of the profile has lines there.
+    """
     span = float(readings.seconds[-1] - readings.seconds[0]) / 60.0
-    lowest, highest, step = 3.0 / span, 1.0 / 3.0, 0.5 / span
-    return 1.0 / np.arange(lowest, highest, step) if highest > lowest else np.empty(0)
+    frequencies = np.arange(3.0 / span, 1.0 / 3.0, 0.5 / span)
+    cycle = 60.0 / float(np.median(np.diff(cycle_starts(readings))))
+    order = np.maximum(1.0, np.round(frequencies / cycle))
+    return np.asarray(1.0 / frequencies[np.abs(frequencies - order * cycle) > 4.0 / span])
 
 
 def _periodic_disturbance(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
@@ -269,7 +277,7 @@ def _laser_warm_up(readings: Readings, _: Mapping[str, float]) -> Iterator[Membe
         settling = 1.0 - warm_up(readings, minutes)
         linear = settling * readings.position_mm * 1e-3
         yield Member(_column(linear), {"time_constant_min": minutes, "shape": "linear"}, ("ppm",))
-        both = {"time_constant_min": minutes, "shape": "linear with dead path"}
+        both: Parameters = {"time_constant_min": minutes, "shape": "linear with dead path"}
         yield Member(_column(linear, settling), both, ("ppm", "um"))
 
 
@@ -295,7 +303,7 @@ def _camera_offset(readings: Readings, coefficients: Mapping[str, float]) -> Ite
     weight = _field_weight(readings, coefficients)
     for before, after, size in jumps(readings.series["mean_rise"]):
         seen = np.clip((readings.seconds - before) / (after - before), 0.0, 1.0)
-        parameters = {"time_s": after, "jump_of_the_field_K": size}
+        parameters: Parameters = {"time_s": after, "jump_of_the_field_K": size}
         yield Member(_column(seen * weight), parameters, ("K",), event_s=after)
 
 
@@ -334,12 +342,12 @@ def _needs_patterns(readings: Readings) -> str | None:
 def _sensor_fault(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
     for name, before, after, size in sensor_jumps(readings):
         late = (readings.seconds >= 0.5 * (before + after)).astype(float)
-        parameters = {"sensor": name, "time_s": after, "jump": size}
-        yield Member(_column(late * readings.position_mm * 1e-3), parameters, ("ppm",), event_s=after)
+        jumped: Parameters = {"sensor": name, "time_s": after, "jump": size}
+        yield Member(_column(late * readings.position_mm * 1e-3), jumped, ("ppm",), event_s=after)
     for name, start in stuck_sensors(readings):
         since = np.clip(readings.seconds - start, 0.0, None) / 3600.0
-        parameters = {"sensor": name, "time_s": start, "jump": 0.0}
-        yield Member(_column(since * readings.position_mm * 1e-3), parameters, ("ppm/h",), event_s=start)
+        stuck: Parameters = {"sensor": name, "time_s": start, "jump": 0.0}
+        yield Member(_column(since * readings.position_mm * 1e-3), stuck, ("ppm/h",), event_s=start)
 
 
 def sensor_jumps(readings: Readings) -> list[tuple[str, float, float, float]]:

@@ -99,16 +99,16 @@ def _centred_mean(series: Series, half_width_s: float) -> Series:
 
 
 def _warm_up_share(part: Readings, member: Member) -> float:
-    """Share of the candidate's variance over time that constants, a trend and plain warm-ups explain (least of its columns)."""
-    basis = np.column_stack([np.ones(part.seconds.size), part.seconds, *(warm_up(part, m) for m in _PROTECTION_MIN)])
-    basis = np.column_stack([basis, basis * part.share[:, None]])
-    q, _ = np.linalg.qr(basis / np.linalg.norm(basis, axis=0))
-    shares = []
-    for column in member.columns.T:
-        centred = column - column.mean()
-        left = centred - q @ (q.T @ centred)
-        shares.append(1.0 - float(left @ left) / max(float(centred @ centred), 1e-300))
-    return min(shares)
+    """Share of the candidate's course at the far end of the travel that one plain warm-up explains (least of its columns)."""
+    far = np.abs(part.position_mm) == np.abs(part.position_mm).max()
+    curves = [warm_up(part, minutes)[far] for minutes in np.geomspace(5.0, 400.0, 40)]
+    return min(1.0 - min(_residual_share(course, curve) for curve in curves) for course in member.columns[far].T)
+
+
+def _residual_share(course: Array, curve: Array) -> float:
+    basis = np.column_stack([np.ones(course.size), curve])
+    left = course - basis @ np.linalg.lstsq(basis, course, rcond=None)[0]
+    return float(left @ left) / max(float(((course - course.mean()) ** 2).sum()), 1e-300)
 
 
 def _gain(part: Readings, model: ModelFit, member: Member, beside: Array | None) -> float:

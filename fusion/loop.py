@@ -23,8 +23,12 @@ from fusion.readings import Readings
 from fusion.scoring import FamilyScore, Judge, simulate_null
 from interferometry.statespace import Array, DriftModelError
 
-#: Chance of adding an effect where nothing is missing, over the whole search; the same for its confirmation on unused readings.
+#: Chance of adding an effect where nothing is missing, over the whole search.
 ENTRY_LEVEL = 0.05
+#: Chance that an effect which is not there passes its confirmation on unused readings; the search has been paid for already.
+CONFIRMATION_LEVEL = 0.2
+#: The same chance for the second look, after the seal has been opened.
+SECOND_LEVEL = 0.02
 SEALED_SHARE = 0.2
 #: Effects whose log-likelihoods differ by less than this (odds of 20 to 1) are reported as a tie.
 TIE_GAIN = 3.0
@@ -33,9 +37,9 @@ MOST_EFFECTS = 4
 MOST_EVENTS = 2
 _BLOCKS = 10
 _MAY_REPEAT = frozenset({"step_event", "camera_offset", "sensor_fault", "periodic_disturbance"})
-_EVENTS = frozenset({"step_event", "camera_offset", "sensor_fault"})
 
 Progress = Callable[[int, int, str], None]
+Chosen = list[tuple[FamilyScore, list[FamilyScore]]]
 
 
 class LoopError(ValueError):
@@ -170,7 +174,8 @@ def close_loop(
     terms = _declare(readings, declared, effects)
     report(0, MOST_EFFECTS + 2, "fitting the declared model")
     search = _Search(readings, used, effects, rng, seed)
-    models, rounds, chosen = [search.fit(terms)], [], []
+    models, rounds = [search.fit(terms)], list[list[FamilyScore]]()
+    chosen: Chosen = []
     while len(chosen) < MOST_EFFECTS:
         report(len(chosen) + 1, MOST_EFFECTS + 2, f"searching for effect {len(chosen) + 1}")
         scores = search.scores(models[-1])
@@ -187,17 +192,13 @@ def close_loop(
     report(MOST_EFFECTS, MOST_EFFECTS + 2, "opening the sealed cycles")
     errors = [_rmse(model.open_loop_errors()[0]) for model in models]
     whole = fit_model(readings, models[-1].terms)
-    late = search.late_event(whole, report)
-    if late is not None:
-        whole = fit_model(readings, [*whole.terms, Term(late.name, _member(late))])
-    remainder = adequacy.examine(readings, whole.fit, rng, set_aside=set_aside)
     steps = [
         _step(whole, whole.terms[len(terms) + k], score, scores, errors[k], errors[k + 1])
         for k, (score, scores) in enumerate(chosen)
     ]
-    if late is not None:
-        steps.append(_late_step(whole, late, errors[-1], used))
-    final_error = steps[-1].rmse_after_um if late is not None else errors[-1]
+    report(MOST_EFFECTS + 1, MOST_EFFECTS + 2, "second look, at all cycles")
+    whole, steps = _second_look(search, whole, steps, errors[-1], rounds)
+    remainder = adequacy.examine(readings, whole.fit, rng, set_aside=set_aside)
     report(MOST_EFFECTS + 2, MOST_EFFECTS + 2, "loop closed")
     return LoopResult(
         declared=list(declared),
@@ -210,7 +211,7 @@ def close_loop(
         noise_floor_um=whole.fit.sigma,
         rmse_persistence_um=_persistence(readings, used),
         rmse_declared_um=errors[0],
-        rmse_final_um=final_error,
+        rmse_final_um=steps[-1].rmse_after_um if steps else errors[0],
         steps=steps,
         verdict=_verdict(bool(steps), bool(remainder.shape)),
         remainder=remainder,
@@ -275,7 +276,6 @@ class _Search:
         seed: int,
     ) -> None:
         self.readings, self.used, self.effects, self.rng, self.seed = readings, used, effects, rng, seed
-        self.part = readings.subset(used)
         self.not_tried = {
             name: reason for name, effect in effects.items() if (reason := effect.needs(readings)) is not None
         }
@@ -284,11 +284,11 @@ class _Search:
     def fit(self, terms: Sequence[Term], like: ModelFit | None = None) -> ModelFit:
         return fit_model(self.readings, terms, used=self.used, like=like.fit if like else None)
 
-    def _families(self, model: ModelFit, *, only: Collection[str] | None = None) -> dict[str, list[Member]]:
+    def _families(self, model: ModelFit) -> dict[str, list[Member]]:
         present = {term.effect for term in model.terms}
         families = {}
         for name, effect in self.effects.items():
-            if name in self.not_tried or (only is not None and name not in only):
+            if name in self.not_tried:
                 continue
             if name in present and name not in _MAY_REPEAT:
                 continue
@@ -315,12 +315,15 @@ class _Search:
         blocks = np.searchsorted(numbers, part.cycle) * _BLOCKS // numbers.size
         return Judge(model.fit, simulate_null(model.fit, self.rng), blocks, part.target_index % 2 == 0)
 
-    def choose(self, scores: Sequence[FamilyScore], model: ModelFit) -> FamilyScore | None:
+    def choose(
+        self, scores: Sequence[FamilyScore], model: ModelFit, *, level: float = ENTRY_LEVEL
+    ) -> FamilyScore | None:
         """Best effect that is significant, confirmed and not blocked, rebuilt for all readings."""
         for score in scores:
-            if score.member is None or score.family_wise_p > ENTRY_LEVEL or score.held_out_p > ENTRY_LEVEL:
+            if score.member is None or score.family_wise_p > level or score.held_out_p > CONFIRMATION_LEVEL:
                 continue
-            reason = blocked_reason(self.effects[score.name], score.member, self.part, model, scores)
+            part = self.readings.subset(model.used)
+            reason = blocked_reason(self.effects[score.name], score.member, part, model, scores)
             if reason is not None:
                 self.blocked[score.name] = reason
                 continue
@@ -337,22 +340,6 @@ class _Search:
             f"effect {score.name!r} offers other members when asked twice; its members must depend on its input only"
         )
 
-    def late_event(self, whole: ModelFit, report: Progress) -> FamilyScore | None:
-        """An event among the sealed cycles, which no search before them could find; confirmed across targets, not in time."""
-        report(MOST_EFFECTS + 1, MOST_EFFECTS + 2, "looking for events among the sealed cycles")
-        sealed_from = self.readings.seconds[~self.used].min()
-        families = {
-            name: [member for member in members if member.event_s is not None and member.event_s >= sealed_from]
-            for name, members in self._families(whole, only=_EVENTS).items()
-        }
-        families = {name: members for name, members in families.items() if members}
-        if not families or sum(term.effect == "step_event" for term in whole.terms) >= MOST_EVENTS:
-            return None
-        for score in self._judge(whole).score(families):
-            if score.member is not None and score.family_wise_p <= ENTRY_LEVEL and score.held_out_p <= ENTRY_LEVEL:
-                return score
-        return None
-
 
 def _on(member: Member, used: NDArray[np.bool_]) -> Member:
     return Member(member.columns[used], member.parameters, member.units, member.event_s)
@@ -362,9 +349,6 @@ def _member(score: FamilyScore) -> Member:
     if score.member is None:
         raise LoopError(f"effect {score.name!r} has no member that can be told from the model")
     return score.member
-
-
-Chosen = list[tuple[FamilyScore, list[FamilyScore]]]
 
 
 def _re_examine(
@@ -458,21 +442,47 @@ def _step(
     )
 
 
-def _late_step(model: ModelFit, score: FamilyScore, before: float, used: NDArray[np.bool_]) -> Step:
-    """An event among the sealed cycles; its size comes from one half of the targets and is tested on the other."""
-    term = model.terms[-1]
-    half = model.readings.target_index % 2 == 0
-    reduced = []
-    for fitted in (half, ~half):
-        part = fit_model(model.readings, model.terms, used=used | fitted)
-        reduced.append(part.open_loop_errors()[0])
-    step = _step(model, term, score, [score], before, _rmse(np.concatenate(reduced)))
-    return Step(
-        **{
-            **vars(step),
-            "confirmed": "found among the sealed cycles; sized on one half of the targets, tested on the other",
-        }
-    )
+def _second_look(
+    search: _Search, whole: ModelFit, steps: list[Step], error: float, rounds: list[list[FamilyScore]]
+) -> tuple[ModelFit, list[Step]]:
+    """Search once more with the sealed cycles in view: what acted only there could not be found before.
+
+    Coefficients behind the error after still come from the cycles before the seal, but the name does not; the step says so.
+    """
+    while len(steps) < MOST_EFFECTS:
+        scores = search.scores(whole)
+        rounds.append(scores)
+        best = search.choose(scores, whole, level=SECOND_LEVEL)
+        if best is None or _events(steps) + (best.name == "step_event") > MOST_EVENTS:
+            return whole, steps
+        term = Term(best.name, _member(best))
+        whole = fit_model(search.readings, [*whole.terms, term])
+        sealed_from = search.readings.seconds[~search.used].min()
+        if term.member.event_s is not None and term.member.event_s >= sealed_from - _cycle_length(search.readings):
+            after = _late_event_error(search, whole)
+            confirmed = "found among the sealed cycles; sized on one half of the targets, tested on the other"
+        else:
+            after = _rmse(search.fit(whole.terms).open_loop_errors()[0])
+            confirmed = "named with the sealed cycles in view, coefficients from the cycles before: the error after is optimistic"
+        step = _step(whole, term, best, scores, error, after)
+        steps = [*steps, Step(**{**vars(step), "confirmed": confirmed})]
+        error = after
+    return whole, steps
+
+
+def _events(steps: Sequence[Step]) -> int:
+    return sum(step.effect == "step_event" for step in steps)
+
+
+def _cycle_length(readings: Readings) -> float:
+    return float(np.median(np.diff(cycle_starts(readings))))
+
+
+def _late_event_error(search: _Search, whole: ModelFit) -> float:
+    """Error on the sealed cycles where an event among them is sized on one half of the targets and tested on the other."""
+    half = search.readings.target_index % 2 == 0
+    parts = [fit_model(search.readings, whole.terms, used=search.used | fitted) for fitted in (half, ~half)]
+    return _rmse(np.concatenate([part.open_loop_errors()[0] for part in parts]))
 
 
 def _nuisance(model: ModelFit) -> dict[str, float | str]:

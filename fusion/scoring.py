@@ -150,23 +150,38 @@ class Judge:
         responses = np.column_stack([self.fit.response, self.draws])
         everything, _ = system.whiten(np.column_stack([responses, self.fit.design, member.columns]))
         y, x, c = np.split(everything, [responses.shape[1], responses.shape[1] + self.fit.design.shape[1]], axis=1)
-        both = np.column_stack([x, c])
-        gain = np.zeros(responses.shape[1])
-        for train, test in self._splits(member):
+        if member.event_s is not None:
+            gain = _gain_across(_without(x, y), _without(x, c), self.halves)
+        else:
+            gain = self._gain_in_time(y, x, c)
+        noise = _without(x, y[:, :1]).var()
+        return float(gain[0] / (2.0 * noise)), float((1 + (gain[1:] >= gain[0]).sum()) / gain.size)
+
+    def _gain_in_time(self, y: Array, x: Array, c: Array) -> Array:
+        """Forward chaining: coefficients from all blocks before, error on the next one, summed over the later two thirds."""
+        both, k, last = np.column_stack([x, c]), x.shape[1], int(self.blocks.max())
+        gain = np.zeros(y.shape[1])
+        for block in range(max(1, last // 3) + 1, last + 1):
+            train, test = self.blocks < block, self.blocks == block
             normal, moment = both[train].T @ both[train], both[train].T @ y[train]
-            k = x.shape[1]
             without = y[test] - x[test] @ _solve(normal[:k, :k], moment[:k])
             with_member = y[test] - both[test] @ _solve(normal, moment)
             gain += (without**2).sum(axis=0) - (with_member**2).sum(axis=0)
-        noise = (y[:, 0] - x @ _solve(x.T @ x, x.T @ y[:, :1])[:, 0]).var()
-        return float(gain[0] / (2.0 * noise)), float((1 + (gain[1:] >= gain[0]).sum()) / gain.size)
+        return gain
 
-    def _splits(self, member: Member) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
-        if member.event_s is not None:
-            return [(self.halves, ~self.halves), (~self.halves, self.halves)]
-        last = int(self.blocks.max())
-        first = max(1, last // 3)
-        return [(self.blocks < block, self.blocks == block) for block in range(first + 1, last + 1)]
+
+def _gain_across(y: Array, c: Array, half: NDArray[np.bool_]) -> Array:
+    """An event cannot be confirmed in time: its size from one half of the targets, its error on the other, and back."""
+    gain = np.zeros(y.shape[1])
+    for train, test in ((half, ~half), (~half, half)):
+        size = _solve(c[train].T @ c[train], c[train].T @ y[train])
+        gain += (y[test] ** 2).sum(axis=0) - ((y[test] - c[test] @ size) ** 2).sum(axis=0)
+    return gain
+
+
+def _without(x: Array, y: Array) -> Array:
+    """What the columns of x do not explain of y, by least squares."""
+    return y - x @ _solve(x.T @ x, x.T @ y)
 
 
 def _solve(normal: Array, moment: Array) -> Array:
