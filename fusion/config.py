@@ -118,7 +118,14 @@ class PlanTable(_Table):
 
     @model_validator(mode="after")
     def _cells_fit(self) -> PlanTable:
-        cells = self.size_mm[0] / self.cell_size_mm * self.size_mm[1] / self.cell_size_mm
+        along = [length / self.cell_size_mm for length in self.size_mm]
+        cells = along[0] * along[1]
+        if any(abs(count - round(count)) > 1e-6 for count in along):
+            text = (
+                f"cell_size {self.cell_size_mm:g} mm does not divide a plan of {self.size_mm[0]:g} x {self.size_mm[1]:g} mm; "
+                "choose one that divides both sides"
+            )
+            raise PydanticCustomError("cells", "{text}", {"text": text})
         if min(self.size_mm) < 2 * self.cell_size_mm or cells > 4e6:
             text = (
                 f"cell_size {self.cell_size_mm:g} mm on a plan of {self.size_mm[0]:g} x {self.size_mm[1]:g} mm "
@@ -196,17 +203,25 @@ class Campaign(_Table):
 
     def input_files(self) -> dict[str, Path]:
         """Return every file the campaign reads, keyed by its path relative to the campaign file."""
-        names = [self.path, *self.frame_paths()]
-        if self.plan is not None:
-            names.append(self.resolve(self.plan.fiducials))
-        if self.interferometry is not None:
-            names.append(self.resolve(self.interferometry.deviations))
-            if self.interferometry.environment is not None:
-                names.append(self.resolve(self.interferometry.environment))
-        for table in (self.drivers, self.record):
-            if table is not None:
-                names.append(self.resolve(table.file))
-        return {relative_name(path, self.folder): path for path in names}
+        files = {relative_name(self.path, self.folder): self.path}
+        for table in ("thermography", "plan", "interferometry", "drivers", "record"):
+            files |= self.files_of(table)
+        return files
+
+    def files_of(self, table: str) -> dict[str, Path]:
+        """Return the files that one table of the campaign names, keyed by their path relative to the campaign file."""
+        names: list[str | None] = []
+        if table == "plan" and self.plan is not None:
+            names = [self.plan.fiducials]
+        elif table == "interferometry" and self.interferometry is not None:
+            names = [self.interferometry.deviations, self.interferometry.environment]
+        elif table == "drivers" and self.drivers is not None:
+            names = [self.drivers.file]
+        elif table == "record" and self.record is not None:
+            names = [self.record.file]
+        paths = list(self.frame_paths()) if table == "thermography" else []
+        paths += [self.resolve(name) for name in names if name is not None]
+        return {relative_name(path, self.folder): path for path in paths}
 
 
 def relative_name(path: Path, folder: Path) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 
 from fusion.config import Campaign
 from fusion.products import file_sha256
+from fusion.progress import Report, silent
 
 #: Packages whose version can change a number in the results.
 PACKAGES = (
@@ -31,9 +32,14 @@ def versions() -> dict[str, str]:
     return found
 
 
-def hash_inputs(files: Mapping[str, Path]) -> dict[str, dict[str, Any]]:
+def hash_inputs(files: Mapping[str, Path], *, report: Report = silent) -> dict[str, dict[str, Any]]:
     """Return size and SHA-256 of each input, keyed by its name relative to the campaign file."""
-    return {name: {"bytes": path.stat().st_size, "sha256": file_sha256(path)} for name, path in files.items()}
+    hashed = {}
+    for done, (name, path) in enumerate(files.items()):
+        report("input files", done, len(files))
+        hashed[name] = {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
+    report("input files", len(files), len(files))
+    return hashed
 
 
 def describe_run(

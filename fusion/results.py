@@ -53,6 +53,11 @@ def _of(**properties: Any) -> dict[str, Any]:
     return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
 
 
+def _at_least(**properties: Any) -> dict[str, Any]:
+    """An object whose properties are all required and that may tell more."""
+    return {"type": "object", "properties": properties, "required": list(properties)}
+
+
 def _list(items: Any) -> dict[str, Any]:
     return {"type": "array", "items": items}
 
@@ -71,7 +76,7 @@ def results_schema() -> dict[str, Any]:
         "properties": {"positive": _list(number), "negative": _list(number)},
         "additionalProperties": False,
     }
-    step = _of(
+    step = _at_least(
         effect=text,
         parameters=_map({}),
         p_value=number,
@@ -108,7 +113,7 @@ def results_schema() -> dict[str, Any]:
                 lag_s=number,
             )
         ),
-        "loop": _of(
+        "loop": _at_least(
             declared=_list(text),
             held_out=text,
             noise_floor_um=number,
@@ -116,7 +121,7 @@ def results_schema() -> dict[str, Any]:
             rmse_final_um=number,
             steps=_list(step),
             verdict={"enum": list(VERDICTS)},
-            unexplained=_of(shape=text, rms_um=number),
+            unexplained=_at_least(shape=text, rms_um=number),
         ),
     }
     return {

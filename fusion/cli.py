@@ -1,0 +1,168 @@
+"""around - The command: run, simulate, inspect, iso230, schema, export. Bad input ends with one paragraph and exit code 2."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+app = typer.Typer(
+    help="Explain the thermal drift of a machine-tool axis from FLIR frames and laser readings.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+console = Console()
+errors = Console(stderr=True, soft_wrap=True)
+BAD_INPUT, STOPPED = 2, 130
+_PACKAGES = ("fusion", "thermography", "interferometry")
+
+
+class ExportFormat(StrEnum):
+    """What `export` can write."""
+
+    csv = "csv"
+    linuxcnc = "linuxcnc"
+    siemens840d = "siemens840d"
+    heidenhain = "heidenhain"
+    renishaw = "renishaw"
+
+
+@contextmanager
+def _answering() -> Iterator[None]:
+    """Turn bad input into one paragraph and exit code 2; a fault of the program itself keeps its traceback."""
+    try:
+        yield
+    except ValueError as error:
+        if type(error).__module__.split(".")[0] not in _PACKAGES:
+            raise
+        errors.print(f"thermofuse: {error}", style="bold", highlight=False, markup=False)
+        raise typer.Exit(BAD_INPUT) from None
+    except OSError as error:
+        if error.filename is None:
+            raise
+        errors.print(f"thermofuse: {error.filename}: {error.strerror}", style="bold", highlight=False, markup=False)
+        raise typer.Exit(BAD_INPUT) from None
+    except KeyboardInterrupt:
+        errors.print("thermofuse: stopped; finished stages are kept, add --resume to continue", highlight=False)
+        raise typer.Exit(STOPPED) from None
+
+
+@app.command()
+def run(
+    campaigns: Annotated[
+        list[Path], typer.Argument(metavar="CAMPAIGN.toml...", help="One campaign file, or two of one machine.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Results folder; left out: 'results' beside the campaign file.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue a run that is in the results folder.")] = False,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="dask scheduler for the per-frame work.")
+    ] = None,
+) -> None:
+    """Run the whole pipeline on a campaign: maps, drift, anomalies, the closed loop, report.html."""
+    from fusion.pipeline import run_campaign
+    from fusion.progress import Reporter
+    from fusion.summary import summary_table
+
+    with _answering():
+        for campaign, folder in _folders(campaigns, out):
+            with Reporter(console) as report:
+                results = run_campaign(campaign, folder, resume=resume, scheduler=scheduler, report=report)
+            console.print(summary_table(results))
+            console.print(f"report: {(folder / 'report.html').resolve()}", soft_wrap=True, highlight=False)
+
+
+def _folders(campaigns: list[Path], out: Path | None) -> list[tuple[Path, Path]]:
+    """Return each campaign with its results folder; several share `out` as subfolders named after their own folder."""
+    if len(campaigns) == 1:
+        return [(campaigns[0], out or campaigns[0].parent / "results")]
+    names = [path.resolve().parent.name for path in campaigns]
+    unique = names if len(set(names)) == len(names) else [f"{name}_{at}" for at, name in enumerate(names, start=1)]
+    base = out or Path("results")
+    return [(path, base / name) for path, name in zip(campaigns, unique, strict=True)]
+
+
+@app.command()
+def simulate(
+    recipe: Annotated[Path, typer.Argument(metavar="RECIPE.toml", help="What the machine of the twin does.")],
+    out: Annotated[Path, typer.Option(help="Folder of the campaign; must be empty or absent.")],
+) -> None:
+    """Simulate a campaign on the twin: the files that the instruments would write, with the truth kept apart."""
+    from fusion.progress import Reporter
+    from fusion.twin.instruments import simulate_campaign
+
+    with _answering(), Reporter(console) as report:
+        simulate_campaign(recipe, out, progress=lambda done, total, what: report(what, done, total))
+        console.print(f"campaign: {(out / 'campaign.toml').resolve()}", soft_wrap=True, highlight=False)
+
+
+@app.command()
+def inspect(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="FLIR, laser or environment files.")],
+) -> None:
+    """Tell what FLIR or laser files hold, with warnings for what looks wrong."""
+    from fusion.inspection import describe_file
+
+    with _answering():
+        for path in files:
+            for line in describe_file(path):
+                console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
+@app.command()
+def iso230(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Deviations: .rtl, CSV, or a log of a positioning test.")
+    ],
+    cycles: Annotated[str | None, typer.Option(help="Window, for example 1-5; left out: all cycles.")] = None,
+) -> None:
+    """Evaluate a file by ISO 230-2: B, R, E, M, A with their uncertainty."""
+    from fusion.summary import iso230_tables
+
+    with _answering():
+        for table in iso230_tables(file, cycles):
+            console.print(table)
+
+
+@app.command()
+def schema(
+    name: Annotated[str, typer.Argument(metavar="results|campaign", help="Which file to describe.")] = "results",
+) -> None:
+    """Print the JSON Schema of results.json, or of the campaign file."""
+    from fusion.config import Campaign
+    from fusion.results import results_schema
+
+    schemas = {"results": results_schema, "campaign": Campaign.model_json_schema}
+    if name not in schemas:
+        errors.print(f'thermofuse: there is no schema "{name}"; write results or campaign', highlight=False)
+        raise typer.Exit(BAD_INPUT)
+    sys.stdout.write(json.dumps(schemas[name](), indent=1) + "\n")
+
+
+@app.command()
+def export(
+    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Results folder of a run.")],
+    format: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for the files; left out: RESULTS/export.")] = None,
+) -> None:
+    """Export drift and fields as CSV, or the profile as the compensation table of a control."""
+    from fusion.exports import export_results
+
+    with _answering():
+        for path in export_results(results, format.value, out or results / "export"):
+            console.print(str(path), soft_wrap=True, highlight=False)
+
+
+def main() -> None:
+    """Run the command line."""
+    app()

@@ -1,0 +1,139 @@
+"""around - The main job: reads, checks contracts, calls the steps, writes products, records where everything comes from."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from fusion import stages
+from fusion.config import Campaign, load_campaign
+from fusion.products import StageStamps, digest, open_folder, read_dataset, write_dataset, write_json, write_text
+from fusion.progress import Report, silent
+from fusion.provenance import describe_run, hash_inputs, versions
+from fusion.report import render_report
+from fusion.results import Notice, assemble
+from fusion.sources import read_source
+from fusion.stages import Outcome
+
+
+@dataclass
+class Run:
+    """One run of a campaign into one folder: what it was asked, what it found, how long each stage took."""
+
+    campaign: Campaign
+    folder: Path
+    report: Report
+    stamps: StageStamps
+    inputs: Mapping[str, Mapping[str, Any]]
+    started: datetime
+    parts: dict[str, Any] = field(default_factory=dict)
+    notices: list[Notice] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+    keys: dict[str, str] = field(default_factory=dict)
+
+    def stage(
+        self, name: str, tables: tuple[str, ...], after: tuple[str, ...], compute: Callable[[], Outcome]
+    ) -> xr.Dataset:
+        """Return the Dataset of a stage: computed and stamped, or taken over where the stamp says nothing has changed.
+
+        Parameters
+        ----------
+        name : str
+            Name of the stage and of its file, ``<name>.nc``.
+        tables : tuple of str
+            Tables of the campaign file that decide its result, with the files that they name.
+        after : tuple of str
+            Stages it builds on; it is done again whenever one of them is.
+        compute : callable
+            Does the work.
+        """
+        asked = self.campaign.model_dump(mode="json", include=set(tables))
+        files = {file: self.inputs[file] for table in tables for file in self.campaign.files_of(table)}
+        key = digest(name, versions(), asked, files, [self.keys[earlier] for earlier in after])
+        path = self.folder / f"{name}.nc"
+        begun = time.monotonic()
+        if self.stamps.done(name, key):
+            note = self.stamps.note(name)
+            outcome = Outcome(read_dataset(path), note["parts"], tuple(Notice(**item) for item in note["notices"]))
+            self.report(f"{stages.LABELS[name]} (kept)", 1, 1)
+        else:
+            outcome = compute()
+            write_dataset(path, outcome.dataset)
+            self.stamps.record(
+                name, key, [path], {"parts": outcome.parts, "notices": [vars(item) for item in outcome.notices]}
+            )
+        self.keys[name] = key
+        self.parts.update(outcome.parts)
+        self.notices.extend(outcome.notices)
+        self.seconds[name] = time.monotonic() - begun
+        return outcome.dataset
+
+
+def run_campaign(
+    path: str | Path, out: str | Path, *, resume: bool = False, scheduler: str | None = None, report: Report = silent
+) -> dict[str, Any]:
+    """Run the whole pipeline on a campaign file and write its products.
+
+    Parameters
+    ----------
+    path : str or Path
+        The campaign file.
+    out : str or Path
+        Results folder; must be empty or absent unless `resume`.
+    resume : bool
+        Keep the stages that were finished from the same input, do the rest.
+    scheduler : str, optional
+        Address of a dask scheduler for the per-frame work.
+    report : callable
+        ``report(label, done, total)``, for progress.
+
+    Returns
+    -------
+    dict
+        The content of ``results.json``.
+
+    Raises
+    ------
+    ValueError
+        A subclass of this package or of the instruments', when the input cannot be used; nothing is written then.
+    """
+    campaign = load_campaign(path, effect_names=stages.effect_names())
+    folder = Path(out)
+    source = read_source(campaign)
+    open_folder(folder, resume=resume)
+    started = datetime.now(UTC)
+    inputs = hash_inputs(campaign.input_files(), report=report)
+    run = Run(campaign, folder, report, StageStamps(folder), inputs, started, notices=list(source.notices))
+    fields = run.stage(
+        "fields",
+        ("thermography", "plan", "interferometry"),
+        (),
+        lambda: stages.reduce_thermography(source, report=report),
+    )
+    deviations = run.stage("deviations", ("interferometry",), (), lambda: stages.evaluate_interferometry(source))
+    fused = run.stage(
+        "fusion",
+        ("plan", "interferometry", "drivers", "model"),
+        ("fields", "deviations"),
+        lambda: stages.fuse(source, fields, deviations, report=report),
+    )
+    stages.write_exr(folder / "maps", fields, report=report)
+    return _finish(run, {"fields": fields, "deviations": deviations, "fusion": fused})
+
+
+def _finish(run: Run, datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:
+    """Write results, provenance and report from what the stages found."""
+    results = assemble(run.campaign.campaign.title, run.parts, run.notices)
+    provenance = describe_run(run.campaign, run.inputs, started=run.started, seconds=run.seconds)
+    run.report("report", 0, 1)
+    write_json(run.folder / "results.json", results)
+    write_json(run.folder / "provenance.json", provenance)
+    write_text(run.folder / "report.html", render_report(results, provenance, datasets))
+    run.report("report", 1, 1)
+    return results

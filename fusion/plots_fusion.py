@@ -1,0 +1,180 @@
+"""L5 - Charts of the joint estimate, the correlation and the closed loop."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from fusion.plots import ACCENT, ARROWS, COLOURS, INK, MARKERS, MUTED, TIME_MAP, hours_since_start, new_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+BEFORE = "#9aa7ad"
+
+
+def plot_profile(drift: xr.Dataset, position: xr.DataArray, *, ax: Axes | None = None) -> Axes:
+    """Plot the drift-free profile of both approaches with its 95 % band."""
+    ax = new_axes(ax)
+    for direction in drift["direction"].values:
+        row = drift.sel(direction=direction)
+        value, band = row["profile"], 2 * row["profile_u"]
+        ax.plot(position, value, MARKERS[direction], linestyle="-", color=COLOURS[direction], label=ARROWS[direction])
+        ax.fill_between(position, value - band, value + band, color=COLOURS[direction], alpha=0.18, linewidth=0)
+    ax.set(xlabel="position / mm", ylabel="profile / µm")
+    ax.legend()
+    return ax
+
+
+def plot_drift(drift: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot the drift of every position over time, mean of both approaches, coloured by position."""
+    import matplotlib as mpl
+
+    ax = new_axes(ax)
+    hours = hours_since_start(deviations).mean("direction")
+    lines = drift["drift"].mean("direction")
+    position = deviations["position"].values
+    low, high = float(position.min()), float(position.max())
+    colour = mpl.colormaps[TIME_MAP]
+    for target, place in zip(deviations["target"].values, position, strict=True):
+        ax.plot(
+            hours.sel(target=target),
+            lines.sel(target=target),
+            color=colour(0.95 * (place - low) / (high - low)),
+            linewidth=0.9,
+        )
+    scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(low, high), TIME_MAP)
+    ax.figure.colorbar(scale, ax=ax, label="position / mm", pad=0.02, aspect=30).outline.set_visible(False)
+    ax.set(xlabel="time since first reading / h", ylabel="drift / µm")
+    return ax
+
+
+def plot_reversal(drift: xr.Dataset, position: xr.DataArray, *, ax: Axes | None = None) -> Axes:
+    """Plot the reversal (positive minus negative approach) of every position with its 95 % interval."""
+    ax = new_axes(ax)
+    ax.errorbar(position, drift["reversal"], 2 * drift["reversal_u"], fmt="o", color=INK, capsize=2, linewidth=1.0)
+    ax.axhline(0.0, color=MUTED, linewidth=0.8)
+    ax.set(xlabel="position / mm", ylabel="reversal / µm")
+    return ax
+
+
+def plot_position_scatter(drift: xr.Dataset, flagged: set[int], *, ax: Axes | None = None) -> Axes:
+    """Plot the random scatter of every position and approach with its 95 % interval; flagged positions are shaded."""
+    ax = new_axes(ax)
+    for target in sorted(flagged):
+        ax.axvspan(target - 0.4, target + 0.4, color=ACCENT, alpha=0.12, linewidth=0)
+    for shift, direction in zip((-0.12, 0.12), drift["direction"].values, strict=False):
+        row = drift.sel(direction=direction)
+        ax.errorbar(
+            row["target"] + shift, row["scatter"], 2 * row["scatter_u"], fmt=MARKERS[direction], color=COLOURS[direction],
+            capsize=2, linewidth=1.0, label=ARROWS[direction],
+        )  # fmt: skip
+    ax.set(xlabel="position", ylabel="scatter s / µm", ylim=(0, None))
+    ax.legend()
+    return ax
+
+
+def plot_cells(maps: xr.Dataset, name: str, channel: str, *, label: str, ax: Axes | None = None) -> Axes:
+    """Draw a map over the plan cells of one channel, cells with a family-wise p below 0.05 outlined."""
+    ax = new_axes(ax)
+    chosen = maps.sel(channel=channel)
+    values = chosen[name].values
+    x, y = chosen["x"].values, chosen["y"].values
+    half = float(np.median(np.diff(x))) / 2
+    extent = (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half)
+    limit = float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else 1.0
+    colours = (
+        {"cmap": "viridis_r", "vmin": 0.0, "vmax": 1.0}
+        if name == "p_value"
+        else {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
+    )
+    picture = ax.imshow(values, origin="lower", extent=extent, interpolation="nearest", **colours)
+    ax.figure.colorbar(picture, ax=ax, label=label, orientation="horizontal", aspect=40).outline.set_visible(False)
+    if (chosen["p_value"] <= 0.05).any():
+        ax.contour(
+            x, y, (chosen["p_value"].fillna(1) <= 0.05).astype(float), levels=[0.5], colors=[INK], linewidths=1.2
+        )
+    ax.set(xlabel="x / mm", ylabel="y / mm", title=f"drift that is {channel}")
+    ax.grid(visible=False)
+    return ax
+
+
+def plot_residual_time(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot the residual over time before and after the loop: every reading as a dot, the mean per cycle as a line."""
+    ax = new_axes(ax)
+    hours = hours_since_start(deviations)
+    for name, colour, text, size in (
+        ("residual_declared", BEFORE, "declared model", 1.4),
+        ("residual_final", COLOURS["positive"], "after the loop", 1.4),
+    ):
+        residual = loop[name]
+        ax.plot(hours.values.ravel(), residual.values.ravel(), ".", color=colour, markersize=size, alpha=0.5)
+        ax.plot(
+            hours.mean(["direction", "target"]),
+            residual.mean(["direction", "target"]),
+            color=colour,
+            linewidth=1.8,
+            label=text,
+        )
+    ax.axhline(0.0, color=MUTED, linewidth=0.8)
+    ax.set(xlabel="time since first reading / h", ylabel="residual / µm")
+    ax.legend()
+    return ax
+
+
+def plot_residual_position(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot the change of the residual from the first to the second half of the test, per position and approach, before and after.
+
+    The mean of a residual over all cycles is zero by construction, so the change shows what a mean would hide.
+    """
+    ax = new_axes(ax)
+    half = loop.sizes["cycle"] // 2
+    for name, solid in (("residual_declared", False), ("residual_final", True)):
+        change = loop[name][half:].mean("cycle") - loop[name][:half].mean("cycle")
+        for direction in loop["direction"].values:
+            ax.plot(
+                deviations["position"], change.sel(direction=direction), MARKERS[direction], linestyle="-" if solid else ":",
+                color=COLOURS[direction] if solid else BEFORE,
+                label=f"{ARROWS[direction]}, {'after' if solid else 'before'}",
+            )  # fmt: skip
+    ax.axhline(0.0, color=MUTED, linewidth=0.8)
+    ax.set(xlabel="position / mm", ylabel="residual, second minus first half / µm")
+    ax.legend(fontsize=7.5)
+    return ax
+
+
+def plot_residual_direction(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot half the difference of the residuals of both approaches over time, before and after the loop."""
+    ax = new_axes(ax)
+    hours = hours_since_start(deviations).mean(["direction", "target"])
+    for name, colour, text in (
+        ("residual_declared", BEFORE, "declared model"),
+        ("residual_final", COLOURS["positive"], "after the loop"),
+    ):
+        odd = (loop[name].sel(direction="positive") - loop[name].sel(direction="negative")).mean("target") / 2
+        ax.plot(hours, odd, color=colour, label=text)
+    ax.axhline(0.0, color=MUTED, linewidth=0.8)
+    ax.set(xlabel="time since first reading / h", ylabel="odd residual / µm")
+    ax.legend()
+    return ax
+
+
+def plot_contributions(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot what each effect of the final model contributes at the far end of the axis over time, with its 95 % band if known."""
+    ax = new_axes(ax)
+    far = int(deviations["target"][int(np.argmax(np.abs(deviations["position"].values)))])
+    hours = hours_since_start(deviations).sel(target=far).mean("direction")
+    for at, effect in enumerate(loop["effect"].values):
+        line = loop["contribution"].sel(effect=effect, target=far).mean("direction")
+        ax.plot(
+            hours,
+            line,
+            linestyle=("-", "--", "-.", ":")[at % 4],
+            label=str(effect).replace("_", " "),
+            color=(INK, ACCENT, COLOURS["positive"], COLOURS["negative"])[at % 4],
+        )
+    ax.set(xlabel="time since first reading / h", ylabel=f"contribution at position {far} / µm")
+    ax.legend()
+    return ax

@@ -1,0 +1,192 @@
+"""around - The inputs of a campaign, read and checked before the long work; everything left out is noted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from fusion.alignment import AxisGeometry, cycle_bounds
+from fusion.config import Campaign, InterferometryTable, PlanTable, ThermographyTable, relative_name
+from fusion.contracts import check
+from fusion.preflight import check_clocks
+from fusion.results import Notice
+from fusion.tables import read_drivers, read_record
+from interferometry.contract import DEVIATIONS
+from interferometry.readers import read_deviations, read_environment
+from thermography.flir import FrameReference, index_frames
+from thermography.plan import Fiducial, PlanGrid, read_fiducials
+
+#: So many left-out things are named in a message; all of them are in the products.
+_NAMED = 5
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a campaign with both instruments holds, before anything is calculated."""
+
+    campaign: Campaign
+    thermography: ThermographyTable
+    plan: PlanTable
+    interferometry: InterferometryTable
+    deviations: xr.Dataset
+    environment: xr.Dataset | None
+    drivers: xr.Dataset | None
+    fiducials: list[Fiducial]
+    frames: list[FrameReference]
+    frames_rejected: list[dict[str, Any]]
+    notices: list[Notice] = field(default_factory=list)
+
+    @property
+    def grid(self) -> PlanGrid:
+        """The plan's cells."""
+        return PlanGrid(*self.plan.size_mm, self.plan.cell_size_mm)
+
+    @property
+    def axis(self) -> AxisGeometry:
+        """Where the measured line lies on the plan."""
+        return AxisGeometry(self.plan.axis.origin_mm, self.plan.axis.direction)
+
+    @property
+    def frame_times(self) -> np.ndarray:
+        """Times of the usable frames on the camera's clock, (n,) datetime64[ns]."""
+        return np.array([frame.time for frame in self.frames], dtype="datetime64[ns]")
+
+
+def read_source(campaign: Campaign) -> Source:
+    """Read readings, logs, fiducials and the frames' headers of a campaign, and refuse what cannot be run.
+
+    Raises
+    ------
+    ValueError
+        A subclass of the instruments' packages or of this one: a file that cannot be used, cycles that overlap, clocks that never meet.
+    """
+    thermography, plan, interferometry = campaign.thermography, campaign.plan, campaign.interferometry
+    assert thermography is not None and plan is not None and interferometry is not None
+    laser = campaign.resolve(interferometry.deviations)
+    deviations = read_deviations(laser, feed_mm_per_min=interferometry.feed_mm_per_min, dwell_s=interferometry.dwell_s)
+    check(deviations, DEVIATIONS, name=laser.name)
+    cycle_bounds(deviations)
+    environment = None
+    if interferometry.environment is not None:
+        environment = read_environment(campaign.resolve(interferometry.environment))
+    drivers = read_drivers(campaign.resolve(campaign.drivers.file)) if campaign.drivers is not None else None
+    frames, rejected = index_frames(campaign.frame_paths())
+    listed = [
+        {"file": relative_name(one.path, campaign.folder), "index": one.index, "reason": one.reason} for one in rejected
+    ]
+    timed = [frame for frame in frames if not np.isnat(frame.time)]
+    listed += [
+        {"file": relative_name(frame.path, campaign.folder), "index": frame.index, "reason": "the frame has no time"}
+        for frame in frames
+        if np.isnat(frame.time)
+    ]
+    source = Source(
+        campaign, thermography, plan, interferometry, deviations, environment, drivers,
+        read_fiducials(campaign.resolve(plan.fiducials)), timed, listed,
+    )  # fmt: skip
+    source.notices.extend(_notices(source))
+    return source
+
+
+def read_record_source(campaign: Campaign) -> tuple[xr.Dataset, list[Notice]]:
+    """Read a record, and note the rows left out."""
+    record = read_record(campaign)
+    return record, left_out_notices(record, "record_rows_left_out")
+
+
+def _notices(source: Source) -> list[Notice]:
+    """Everything that is left out of the input or missing from it."""
+    notices = frames_notices(source.frames_rejected)
+    if len(source.frames) < 2:
+        reasons = "; ".join(item["reason"] for item in source.frames_rejected[:_NAMED])
+        raise SourceError(
+            f"{source.campaign.path}: {len(source.frames)} usable frames, at least 2 are needed for a rise ({reasons or 'none rejected'}); "
+            "check thermography.frames"
+        )
+    notices += check_clocks(
+        source.deviations,
+        source.frame_times,
+        clock_offset_s=source.thermography.clock_offset_s,
+        source=str(source.campaign.path),
+    )
+    notices += left_out_notices(source.deviations, "readings_left_out")
+    missing = int(np.isnan(source.deviations["deviation"].values).sum())
+    if missing:
+        notices.append(_missing_notice(source.deviations, missing))
+    for table, code in ((source.environment, "environment_rows_left_out"), (source.drivers, "driver_rows_left_out")):
+        if table is not None:
+            notices += left_out_notices(table, code)
+    if source.environment is None:
+        notices.append(
+            Notice(
+                "no_environment",
+                "No environment was logged, so effects of the air and of the material compensation cannot be told apart from the drift.",
+                "Log air temperature, pressure, humidity and material temperature, and name the file as interferometry.environment.",
+            )
+        )
+    return notices
+
+
+class SourceError(ValueError):
+    """The inputs of a campaign cannot be used together; the message says which and what to do."""
+
+
+def frames_notices(rejected: list[dict[str, Any]]) -> list[Notice]:
+    """Return one notice that counts the frames left out and names the first of them."""
+    if not rejected:
+        return []
+    named = [f"{item['file']} ({_reason(item)})" for item in rejected]
+    return [
+        Notice(
+            "frames_rejected",
+            f"{_count(len(rejected), 'frame')} left out: {_listed(named)}.",
+            "Copy damaged files again from the camera; a gap in the frames only widens the interpolation between its neighbours.",
+        )
+    ]
+
+
+def _reason(item: dict[str, Any]) -> str:
+    """Return why a frame was left out without the absolute path that the reader's message starts with."""
+    text = str(item["reason"])
+    return text.split(f"{Path(item['file']).name}: ", 1)[-1]
+
+
+def left_out_notices(dataset: xr.Dataset, code: str) -> list[Notice]:
+    """Return one notice that counts the lines of a file that were left out and names the first of them."""
+    lines = json.loads(dataset.attrs.get("left_out", "[]"))
+    if not lines:
+        return []
+    named = [f"line {item['line']} ({item['value']!r} {item['reason']})" for item in lines]
+    return [
+        Notice(
+            code,
+            f"{_count(len(lines), 'line')} of {lines[0]['path']} left out: {_listed(named)}.",
+            f"Correct these lines in {lines[0]['path']} and run again; the estimates allow for the gaps.",
+        )
+    ]
+
+
+def _missing_notice(deviations: xr.Dataset, missing: int) -> Notice:
+    gaps = np.isnan(deviations["deviation"].values)
+    cycles = [str(cycle) for cycle in deviations["cycle"].values[gaps.any(axis=(1, 2))]]
+    return Notice(
+        "readings_missing",
+        f"{_count(missing, 'reading')} of {gaps.size} missing, in {_count(len(cycles), 'cycle')}: {_listed(cycles)}.",
+        "Nothing has to be done: the joint estimate allows for gaps; conventional values are taken from the readings that are there.",
+    )
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def _listed(names: Iterable[str]) -> str:
+    names = list(names)
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return "; ".join(names[:_NAMED]) + more

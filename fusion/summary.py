@@ -1,0 +1,139 @@
+"""L5 - What the terminal shows at the end: the findings of a run, or of one ISO 230-2 evaluation, as a table."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from rich.table import Table
+
+from fusion import wording
+from fusion.config import CampaignError
+from interferometry import iso230
+from interferometry.readers import read_deviations
+
+
+def summary_table(results: Mapping[str, Any]) -> Table:
+    """Return the findings of a run in some ten lines."""
+    table = Table(title=f"{results['campaign']}", title_justify="left", show_header=False, pad_edge=False)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, text in summary_rows(results):
+        table.add_row(name, text)
+    return table
+
+
+def summary_rows(results: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return names and values of the summary."""
+    rows: list[tuple[str, str]] = []
+    if "registration" in results:
+        rows.append(("registration", f"{wording.number(results['registration']['rms_mm'], 2)} mm rms"))
+    if "iso230" in results:
+        iso = results["iso230"]
+        rows += [
+            (f"{name} ({iso['window']})", wording.measured(**iso[f"{name}_um"], unit="µm")) for name in ("A", "R", "B")
+        ]
+    if "drift" in results:
+        scatter = [value for values in results["drift"]["scatter_um"].values() for value in values if value is not None]
+        rows.append(
+            ("scatter per position", f"{min(scatter):.2f} to {max(scatter):.2f} µm, median {np.median(scatter):.2f} µm")
+        )
+    if "anomalies" in results:
+        named = [
+            f"position {item['target']} {item['direction']}: {wording.CAUSES[item['cause']][0]} (p {wording.p_value(item['p_value'])})"
+            for item in results["anomalies"]
+        ]
+        rows.append(("anomalies", "\n".join(named) or "none"))
+    if "loop" in results:
+        rows += _loop_rows(results["loop"])
+    for warning in results["warnings"]:
+        rows.append(("warning", warning["message"]))
+    return rows
+
+
+def _loop_rows(loop: Mapping[str, Any]) -> list[tuple[str, str]]:
+    rows = [("declared", ", ".join(loop["declared"]) or "nothing")]
+    for step in loop["steps"]:
+        before, after = (wording.number(step[name], 3) for name in ("rmse_before_um", "rmse_after_um"))
+        rows.append(
+            ("added", f"{step['effect']} (p {wording.p_value(step['p_value'])}), held-out error {before} -> {after} µm")
+        )
+    rows.append(
+        (
+            "held-out error",
+            f"{wording.number(loop['rmse_declared_um'], 3)} -> {wording.number(loop['rmse_final_um'], 3)} µm",
+        )
+    )
+    rows.append(("noise floor", f"{wording.number(loop['noise_floor_um'], 3)} µm"))
+    rows.append(("verdict", f"{loop['verdict']}: {wording.verdict_headline(loop)}"))
+    return rows
+
+
+def iso230_tables(path: Path, cycles: str | None) -> list[Table]:
+    """Evaluate a file by ISO 230-2 and return the axis values and the values per position.
+
+    Raises
+    ------
+    CampaignError, LaserFormatError
+        If the window is not understood or the file cannot be used.
+    """
+    deviations = read_deviations(path)
+    window = None if cycles is None else read_window(cycles, deviations)
+    try:
+        result = iso230.evaluate(deviations, cycles=window)
+    except ValueError as error:
+        raise CampaignError(f"{path}: {error}") from None
+    axis = Table(title=f"{path.name}, {result.attrs['window']}", title_justify="left")
+    axis.add_column("quantity")
+    axis.add_column("value ± U (k = 2) / µm", justify="right")
+    for name in iso230.QUANTITIES:
+        axis.add_row(name, wording.measured(float(result[name]), float(result[f"{name}_u"])))
+    axis.add_row("mean reversal", wording.number(float(result["mean_reversal"])))
+    for direction, sign in (("positive", "+"), ("negative", "-")):
+        for name in ("E", "R", "A"):
+            axis.add_row(
+                f"{name}{sign}", wording.number(float(result[f"{name}_unidirectional"].sel(direction=direction)))
+            )
+    return [axis, _position_table(deviations, result)]
+
+
+def _position_table(deviations: xr.Dataset, result: xr.Dataset) -> Table:
+    table = Table(title="per position / µm", title_justify="left")
+    for name in ("i", "mm", "mean +", "mean -", "s +", "s -", "B_i", "R_i"):
+        table.add_column(name, justify="right")
+    for target in result["target"].values:
+        row = result.sel(target=target)
+        values = [
+            *(row["mean_unidirectional"].sel(direction=name) for name in ("positive", "negative")),
+            *(row["standard_deviation"].sel(direction=name) for name in ("positive", "negative")),
+            row["reversal"],
+            row["repeatability_bidirectional"],
+        ]
+        position = float(deviations["position"].sel(target=target))
+        table.add_row(str(target), f"{position:g}", *(wording.number(float(value)) for value in values))
+    return table
+
+
+def read_window(text: str, deviations: xr.Dataset) -> list[int]:
+    """Return the cycle numbers of a window such as ``"1-5"`` or ``"3"``.
+
+    Raises
+    ------
+    CampaignError
+        If the text is no window, or names a cycle that was not measured.
+    """
+    match = re.fullmatch(r"\s*(\d+)(?:\s*-\s*(\d+))?\s*", text)
+    if match is None:
+        raise CampaignError(f'--cycles "{text}" is not a window of cycles; write for example 1-5')
+    first, last = int(match.group(1)), int(match.group(2) or match.group(1))
+    measured = deviations["cycle"].values.tolist()
+    window = [cycle for cycle in range(first, last + 1) if cycle in measured]
+    if len(window) != last - first + 1 or not window:
+        raise CampaignError(
+            f'--cycles "{text}" asks for cycles that were not measured; there are {measured[0]} to {measured[-1]}'
+        )
+    return window
