@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from numba import njit
 from numpy.typing import NDArray
 from scipy import stats
 
@@ -69,7 +70,7 @@ class Anomaly:
 
 
 def detect_anomalies(
-    estimated: xr.Dataset, deviations: xr.Dataset, *, level: float = 0.05, permutations: int = 999, seed: int = 0
+    estimated: xr.Dataset, deviations: xr.Dataset, *, level: float = 0.05, permutations: int = 399, seed: int = 0
 ) -> list[Anomaly]:
     """Find anomalous positions.
 
@@ -160,21 +161,37 @@ def _scatter_test(z: Array, permutations: int, rng: np.random.Generator) -> tupl
         Standardised readings, NaN where missing.
     """
     present = np.isfinite(z)
-    squares = np.minimum(z[present] ** 2, WINSOR**2)
     cycle, direction, target = np.nonzero(present)
-    one_pass = cycle * z.shape[1] + direction
-    counts = np.bincount(target, minlength=z.shape[2])
-    membership = np.zeros((squares.size, z.shape[2]))
-    membership[np.arange(squares.size), target] = 1.0 / np.sqrt(np.maximum(counts[target], 1))
+    squares = np.minimum(z[present] ** 2, WINSOR**2)
     centred = (squares - squares.mean()) / squares.std()
-    by_pass = np.argsort(one_pass, kind="stable")
-    observed = centred @ membership
+    weight = 1.0 / np.sqrt(np.maximum(np.bincount(target, minlength=z.shape[2]), 1))
+    observed = np.bincount(target, centred, minlength=z.shape[2]) * weight
+    starts = np.flatnonzero(np.diff(cycle * z.shape[1] + direction, prepend=-1))
+    return observed, _largest_sums(centred, target, np.append(starts, target.size), weight, permutations, rng)
+
+
+@njit(cache=True)
+def _largest_sums(
+    values: Array,
+    target: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    weight: Array,
+    permutations: int,
+    rng: np.random.Generator,
+) -> Array:
+    """Shuffle values within each pass (Fisher and Yates) and return the largest weighted sum of a target, per permutation."""
     largest = np.empty(permutations)
+    shuffled = values.copy()
     for k in range(permutations):
-        shuffled = np.empty(squares.size)
-        shuffled[by_pass] = centred[np.argsort(one_pass + rng.random(squares.size), kind="stable")]
-        largest[k] = (shuffled @ membership).max()
-    return observed, largest
+        sums = np.zeros(weight.size)
+        for one in range(starts.size - 1):
+            for at in range(starts[one + 1] - 1, starts[one], -1):
+                other = rng.integers(starts[one], at + 1)
+                shuffled[at], shuffled[other] = shuffled[other], shuffled[at]
+        for at in range(values.size):
+            sums[target[at]] += shuffled[at]
+        largest[k] = (sums * weight).max()
+    return largest
 
 
 def _scatter_direction(estimated: xr.Dataset, target: int, others: NDArray[np.int64]) -> str:
@@ -210,7 +227,7 @@ class _Series:
 def _series_anomalies(
     estimated: xr.Dataset, deviations: xr.Dataset, level: float, permutations: int, rng: np.random.Generator
 ) -> list[Anomaly]:
-    """Slow excess, steps and periods; cycles are permuted, all positions alike."""
+    """Slow excess, steps and periods; for the first two, cycles are permuted, all positions alike."""
     labels, values = _series(estimated)
     if not labels:
         return []
@@ -218,20 +235,21 @@ def _series_anomalies(
     seconds = _cycle_seconds(deviations)
     orders = np.array([rng.permutation(n) for _ in range(permutations)])
     found: list[Anomaly] = []
-    observed, shuffled = {}, {}
-    for kind, statistic in (("slow", _slow), ("step", _step), ("periodic", _Periodogram(seconds))):
-        observed[kind] = statistic(values[None])[0]
-        shuffled[kind] = np.concatenate(
+    periodogram = _Periodogram(seconds)
+    p_values = {"periodic": periodogram.p_values(values)}
+    for kind, statistic in (("slow", _slow), ("step", _step)):
+        observed = statistic(values)
+        shuffled = np.concatenate(
             [statistic(values[:, order].transpose(1, 0, 2)) for order in np.array_split(orders, 10)]
         )
+        centre, spread = shuffled.mean(axis=0), shuffled.std(axis=0)
+        largest = ((shuffled - centre) / spread).max(axis=1)
+        reached = np.count_nonzero(largest[:, None] >= (observed - centre) / spread, axis=0)
+        p_values[kind] = (1 + reached) / (permutations + 1)
     significant: dict[str, dict[int, tuple[float, int]]] = {}
-    for kind, largest in shuffled.items():
-        centre, spread = largest.mean(axis=0), largest.std(axis=0)
-        excess = (observed[kind] - centre) / spread
-        limit = ((largest - centre) / spread).max(axis=1)
-        p = (1 + np.count_nonzero(limit[:, None] >= excess, axis=0)) / (permutations + 1)
+    for kind, p in p_values.items():
         best: dict[int, tuple[float, int]] = {}
-        for at in np.argsort(-excess):
+        for at in np.argsort(p, kind="stable"):
             target = labels[at].target
             if p[at] <= level * WEIGHTS[kind] and target not in best:
                 best[target] = (float(p[at]) / WEIGHTS[kind], int(at))
@@ -303,8 +321,13 @@ class _Periodogram:
         energy = projected[..., :half] ** 2 + projected[..., half:] ** 2
         return energy * 2 / values.shape[-1] / values.var(axis=-1)[..., None]
 
-    def __call__(self, values: Array) -> Array:
-        return self.power(values).max(axis=-1)
+    def p_values(self, values: Array) -> Array:
+        """Return the p-value of each series' largest power, corrected for all frequencies and series (Bonferroni).
+
+        The power of a winsorised series without period follows chi-square with two degrees of freedom: no permutation needed.
+        """
+        largest = self.power(values).max(axis=-1)
+        return np.minimum(1.0, np.exp(-largest / 2) * self.frequency.size * values.shape[0])
 
 
 def _settle(significant: dict[str, dict[int, tuple[float, int]]], values: Array) -> list[tuple[str, int]]:
