@@ -31,6 +31,7 @@ from thermography.flir_record import (
     MAGIC,
     Directory,
     FffSource,
+    damaged_records,
     plausible_header,
     read_directory,
     read_header,
@@ -88,6 +89,12 @@ class FrameReference(FrameHeader):
             counts = read_counts(source, self.samples)
         header = {each.name: getattr(self, each.name) for each in fields(FrameHeader)}
         return Frame(**header, counts=counts, source=str(self.path), index=self.index, camera_info=info)
+
+    def damaged_records(self) -> list[int]:
+        """Compare the records with their checksums, which reading does not do for its cost; return the types that differ."""
+        with self.path.open("rb", buffering=0) as file:
+            source = FffSource(file, self.path, self.segments)
+            return damaged_records(source, read_directory(source))
 
     def read_counts(self) -> NDArray[np.uint16]:
         """Read the pixels only, shape (row, column)."""
@@ -269,7 +276,7 @@ def _jpeg_segments(file: BinaryIO, path: Path) -> Segments:
             offset += 1
             continue
         (length,) = struct.unpack_from(">H", head, 2)
-        if head[1] == 0xE1 and head[4:10] == b"FLIR\0\1" and length >= 10:
+        if head[1] == 0xE1 and head[4:10] == b"FLIR\0\1" and length >= 10 and len(head) == 12:
             if head[10] in pieces:
                 raise FlirFormatError(f"{path}: at 0x{offset:X}: expected FLIR segment {head[10]} once, found it again")
             pieces[head[10]] = (offset + 12, length - 10)

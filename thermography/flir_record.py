@@ -7,6 +7,7 @@ The layout was measured on some 250 real files of 40 camera models; the offsets 
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -84,7 +85,7 @@ class FffSource:
 
 @dataclass(frozen=True)
 class Directory:
-    """The records of one FFF: type -> (subtype, offset, length), the end of the last one, and the declared length (0: none)."""
+    """The records of one FFF: type -> (offset, length, checksum), the end of the last one, and the declared length (0: none)."""
 
     records: Mapping[int, tuple[int, int, int]]
     end: int
@@ -136,9 +137,9 @@ def _records(order: str, table: bytes) -> tuple[Mapping[int, tuple[int, int, int
     """Return the records of a directory and the end of the last one; most sequences repeat one directory, hence the cache."""
     records: dict[int, tuple[int, int, int]] = {}
     last = 0
-    for kind, subtype, _, _, offset, length, *_ in struct.iter_unpack(order + "2H7I", table):
+    for kind, _, _, _, offset, length, _, _, checksum in struct.iter_unpack(order + "2H7I", table):
         if kind and length:
-            records.setdefault(kind, (subtype, offset, length))
+            records.setdefault(kind, (offset, length, checksum))
             last = max(last, offset + length)
     return MappingProxyType(records), last
 
@@ -156,8 +157,17 @@ def find_record(source: FffSource, directory: Directory, kind: int, name: str) -
     if kind not in directory.records:
         found = ", ".join(f"0x{k:02X}" for k in directory.records) or "none"
         raise source.error(HEADER_SIZE, f"{name} (type 0x{kind:02X}) in the directory", f"types {found}")
-    _, offset, length = directory.records[kind]
+    offset, length, _ = directory.records[kind]
     return offset, length
+
+
+def damaged_records(source: FffSource, directory: Directory) -> list[int]:
+    """Return the types of the records that do not have the CRC-32 which their directory entry states (0 states none)."""
+    return [
+        kind
+        for kind, (offset, length, checksum) in directory.records.items()
+        if checksum and zlib.crc32(source.read(offset, length)) != checksum
+    ]
 
 
 def read_header(source: FffSource, directory: Directory) -> tuple[FrameHeader, bytes]:

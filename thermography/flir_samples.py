@@ -22,7 +22,11 @@ def read_sample_place(source: FffSource, directory: Directory) -> Samples:
     offset, length = find_record(source, directory, RAW_RECORD, "a raw image")
     if length <= RAW_HEADER_SIZE:
         raise source.error(offset, "a raw image longer than its header", f"{length} bytes")
-    head = source.take(offset, RAW_HEADER_SIZE + 8, "the header of a raw image")
+    head = source.read(offset, RAW_HEADER_SIZE + 8)
+    if len(head) < RAW_HEADER_SIZE:
+        raise source.error(
+            offset, f"the {RAW_HEADER_SIZE} bytes of a raw image's header", f"{len(head)} before the end"
+        )
     order = "<" if head[:2] == b"\x02\x00" else ">" if head[:2] == b"\x00\x02" else None
     if order is None:
         raise source.error(offset, "the byte-order mark 2 of a raw image", head[:2].hex(" "))

@@ -122,6 +122,7 @@ def _frame(
 
 def encode_record(frame: Frame, *, encoding: Encoding = "raw") -> bytes:
     """Return one FFF record: directory big-endian at 0x40, records little-endian, the raw image last."""
+    _check_counts(frame.counts)
     info = _camera_info(frame)
     raw = _raw_record(frame.counts, encoding)
     at_info = HEADER_SIZE + _SLOTS * ENTRY_SIZE
@@ -136,6 +137,14 @@ def encode_record(frame: Frame, *, encoding: Encoding = "raw") -> bytes:
         place = HEADER_SIZE + slot * ENTRY_SIZE
         struct.pack_into(">2H7I", head, place, kind, subtype, 100, identifier, at, len(data), 0, 0, zlib.crc32(data))
     return bytes(head) + info + raw
+
+
+def _check_counts(counts: NDArray[np.uint16]) -> None:
+    """Refuse what is no picture of 16-bit counts."""
+    if counts.ndim != 2 or counts.dtype.kind != "u" or counts.dtype.itemsize != 2:
+        raise ValueError(f"counts: expected uint16 with dims (row, column), got {counts.dtype} of shape {counts.shape}")
+    if not all(0 < length < 65536 for length in counts.shape):
+        raise ValueError(f"counts: expected 1 to 65535 rows and columns, got shape {counts.shape}")
 
 
 def _camera_info(frame: Frame) -> bytes:
@@ -216,11 +225,7 @@ def _pack_housekeeping(info: bytearray, frame: Frame) -> None:
 
 def _raw_record(counts: NDArray[np.uint16], encoding: Encoding) -> bytes:
     """Return the raw record: header and packed samples."""
-    if counts.ndim != 2 or counts.dtype.kind != "u" or counts.dtype.itemsize != 2:
-        raise ValueError(f"counts: expected uint16 with dims (row, column), got {counts.dtype} of shape {counts.shape}")
     rows, columns = counts.shape
-    if not (0 < rows < 65536 and 0 < columns < 65536):
-        raise ValueError(f"counts: expected 1 to 65535 rows and columns, got shape {counts.shape}")
     head = bytearray(RAW_HEADER_SIZE)
     struct.pack_into("<3H", head, 0, 2, columns, rows)
     struct.pack_into("<H", head, 0x0C, columns - 1)
@@ -232,11 +237,19 @@ def _raw_record(counts: NDArray[np.uint16], encoding: Encoding) -> bytes:
         # The cameras store the samples in the byte order of the record, which a PNG decoder then takes for big-endian.
         samples = bytes(imagecodecs.png_encode(native.byteswap(), level=1))
     elif encoding == "jpegls":
-        samples = bytes(imagecodecs.jpegls_encode(native))
+        samples = _without_spiff(bytes(imagecodecs.jpegls_encode(native)))
         samples += bytes(-len(samples) % 8)
     else:
         raise ValueError(f"encoding {encoding!r}: expected 'raw', 'png' or 'jpegls'")
     return bytes(head) + samples
+
+
+def _without_spiff(stream: bytes) -> bytes:
+    """Return a JPEG-LS stream that starts with its frame header, as the cameras write it, without the encoder's SPIFF segments."""
+    at = 2
+    while stream[at : at + 2] == b"\xff\xe8":
+        at += 2 + int.from_bytes(stream[at + 2 : at + 4], "big")
+    return stream[:2] + stream[at:]
 
 
 def _segment(payload: bytes) -> bytes:

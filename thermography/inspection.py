@@ -145,6 +145,7 @@ def inspect(path: Path) -> Inspection:
         *(_warned_rejected(rejected)),
         *(_warned_times(references)),
         *(_warned_parameters(references[0].parameters, references)),
+        *(_warned_damage([references[index] for index in chosen])),
         *(_warned_pixels(frames)),
         *(_warned_transmission(frames[:1])),
     ]
@@ -239,6 +240,18 @@ def _warned_parameters(p: CameraParameters, references: Sequence[FrameReference]
         yield Warned("humidity_percent", "relative humidity was stored in percent.", "It was divided by 100.")
     if min(p.planck_r1, p.planck_b, p.planck_r2) <= 0:
         yield Warned("not_calibrated", "the Planck constants are not positive.", "Only counts can be used.")
+
+
+def _warned_damage(references: Sequence[FrameReference]) -> Iterator[Warned]:
+    """Warn of records that differ from their checksum."""
+    for frame in references:
+        if kinds := frame.damaged_records():
+            names = ", ".join(f"0x{kind:02X}" for kind in kinds)
+            yield Warned(
+                "checksum",
+                f"frame {frame.index}: records {names} differ from their checksum.",
+                "Something changed the file after the camera wrote it; compare it with the original.",
+            )
 
 
 def _warned_pixels(frames: Sequence[Frame]) -> Iterator[Warned]:

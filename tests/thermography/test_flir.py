@@ -1,0 +1,480 @@
+"""FLIR files as read: every container, packing and byte order; what is left out is said."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.thermography.flir_mutations import CAMERA, HOUSEKEEPING, LIMITS, PARAMETERS, TIME, jpeg, sequence
+from thermography.flir import FlirFormatError, index_frames, read_frame, write_jpeg, write_sequence
+
+SC660_JPEG = "gtatters__Thermimage/inst/extdata/IR_2412.jpg"
+SC660_SEQ = "gtatters__Thermimage/inst/extdata/SampleSEQ.seq"
+T1030_CSQ = "gtatters__Thermimage/inst/extdata/SampleCSQ.csq"
+DUO_SEQ = "LJMUAstroecology__flirpy/test/test_data/test.seq"
+T420_FFF = "LJMUAstroecology__flirpy/test/test_data/frame_000000_le.fff"
+SC640_FFF = "VladimirSinitsin__flir_extractor/bin/examples/frame.fff"
+EX320_JPEG = "gpereyrairujo__IRimage/Windows/IRimage/sample_images/07 - BillHotFlashThermography.jpg"
+XT2_JPEG = "SanNianYiSi__thermal_parser/images/DJI_XT2.jpg"
+C3X_JPEG = "frkatona__ThermalImageFitter/Nov19/FLIR2167.jpg"
+
+
+def _segments(data: bytes) -> list[tuple[int, int]]:
+    """Return (offset, length) of every marker segment before the image."""
+    found, at = [], 2
+    while data[at + 1] == 0xE1:
+        (length,) = struct.unpack_from(">H", data, at + 2)
+        found.append((at, 2 + length))
+        at += 2 + length
+    return found
+
+
+# What files hold -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.real_data
+def test_sc660_jpeg_gives_every_field_of_its_header(real_file) -> None:
+    frame = read_frame(real_file(SC660_JPEG))
+    p = frame.parameters
+    assert frame.counts.shape == (480, 640) and frame.counts.dtype == np.uint16
+    # Printed by exiftool and by the vendor's program.
+    assert (round(p.planck_r1, 2), p.planck_b, p.planck_f, p.planck_o) == (21106.77, 1501.0, 1.0, -7340.0)
+    assert p.planck_r2 == pytest.approx(0.012545258, rel=1e-7)
+    assert p.emissivity == pytest.approx(0.95, rel=1e-7)
+    assert (p.object_distance_m, p.window_transmission, p.stored_transmission, p.relative_humidity) == (1, 1, 0, 0.5)
+    assert (frame.camera.model, frame.camera.serial, frame.camera.lens_model) == ("FLIR SC660", "404003980", "FOL38")
+    assert frame.time == np.datetime64("2013-05-10T02:22:23.335")
+    assert frame.utc_offset_minutes == -360
+    assert frame.limits.raw_minimum == 8812 and frame.limits.raw_maximum == 57240
+    assert frame.housekeeping["TSLens"] == pytest.approx(299.0975, abs=1e-4)
+    assert set(frame.housekeeping) == {"TSAperture", "TSCapsule", "TSLens", "TSShutter", "TSVcam", "TFpa"} or set(
+        frame.housekeeping
+    ) == {"TSAperture", "TSCapsule", "TSLens", "TSShutter", "TFpa"}
+    assert len(frame.camera_info) == 2476 and frame.camera_info[:2] == b"\x02\x00"
+
+
+@pytest.mark.real_data
+def test_sequence_is_walked_by_record_ends_not_by_magic(real_file) -> None:
+    path = real_file(SC660_SEQ)
+    # The pixels of this file hold the bytes of the magic, at which splitters cut it.
+    assert path.read_bytes().count(b"FFF\0") > 2
+    frames, rejected = index_frames([path])
+    assert [frame.time for frame in frames] == [
+        np.datetime64("2012-06-13T19:52:08.699"),
+        np.datetime64("2012-06-13T19:52:12.666"),
+    ]
+    assert rejected == []
+
+
+@pytest.mark.real_data
+def test_csq_whose_last_frame_lacks_padding_is_read_whole(real_file) -> None:
+    frames, rejected = index_frames([real_file(T1030_CSQ)])
+    assert len(frames) == 8 and rejected == []
+    assert frames[-1].notes == ("the last 4 padding bytes of the samples are missing",)
+    means = [frame.read().counts.mean() for frame in frames]
+    # A still scene at 30 Hz: neighbouring frames agree to a few counts of noise and drift.
+    assert np.ptp(means) < 30
+    steps = np.diff([frame.time for frame in frames]).astype(int)
+    assert steps.min() >= 33 and steps.max() <= 34
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize(
+    ("name", "shape", "frames"),
+    [
+        (DUO_SEQ, (512, 640), 7),
+        (T420_FFF, (240, 320), 1),
+        (SC640_FFF, (480, 640), 1),
+        (EX320_JPEG, (240, 320), 1),
+        (XT2_JPEG, (512, 640), 1),
+        (C3X_JPEG, (96, 128), 1),
+    ],
+)
+def test_other_cameras_give_smooth_pictures(real_file, name: str, shape: tuple[int, int], frames: int) -> None:
+    found, rejected = index_frames([real_file(name)])
+    assert len(found) == frames and rejected == []
+    counts = found[0].read().counts.astype(float)
+    assert counts.shape == shape
+    # Wrong byte order or a shifted line makes neighbours differ by thousands of counts.
+    assert np.median(np.abs(np.diff(counts, axis=1))) < 30
+
+
+# Containers ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("encoding", ["raw", "png", "jpegls"])
+def test_written_jpeg_and_sequence_come_back_equal(tmp_path: Path, encoding: str) -> None:
+    written = jpeg(tmp_path / "a.jpg", encoding)
+    sequence(tmp_path / "a.seq", encoding)
+    for frame in (read_frame(tmp_path / "a.jpg"), index_frames([tmp_path / "a.jpg"])[0][0].read()):
+        np.testing.assert_array_equal(frame.counts, written.counts)
+        assert frame.time == TIME and frame.utc_offset_minutes == 60
+        assert (frame.parameters, frame.camera, frame.limits) == (PARAMETERS, CAMERA, LIMITS)
+        assert frame.housekeeping == HOUSEKEEPING and frame.notes == ()
+    frames, rejected = index_frames([tmp_path / "a.seq"])
+    assert [frame.index for frame in frames] == [0, 1, 2] and rejected == []
+    assert {frame.samples.encoding for frame in frames} == {encoding}
+
+
+def test_segments_may_come_in_any_order(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    written = jpeg(path, rows=200, columns=400)
+    data = path.read_bytes()
+    segments = _segments(data)
+    assert len(segments) == 4
+    pieces = [data[at : at + length] for at, length in segments]
+    end = segments[-1][0] + segments[-1][1]
+    path.write_bytes(data[:2] + b"".join(pieces[i] for i in (2, 0, 3, 1)) + data[end:])
+    np.testing.assert_array_equal(read_frame(path).counts, written.counts)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_directory_and_records_are_read_in_either_byte_order(tmp_path: Path, order: str) -> None:
+    path = tmp_path / "a.seq"
+    (written,) = sequence(path, frames=1)
+    data = bytearray(path.read_bytes())
+    if order == "<":
+        for at in (0x14, 0x18, 0x1C, 0x20, 0x34, 0x38, 0x3C):
+            data[at : at + 4] = data[at : at + 4][::-1]
+        for at in range(0x40, 0x200, 32):
+            entry = struct.unpack_from(">2H7I", data, at)
+            struct.pack_into("<2H7I", data, at, *entry)
+    path.write_bytes(data)
+    np.testing.assert_array_equal(read_frame(path).counts, written.counts)
+
+
+def test_big_endian_samples_are_read_by_their_own_mark(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    (written,) = sequence(path, frames=1)
+    data = bytearray(path.read_bytes())
+    raw = len(data) - written.counts.nbytes - 0x20
+    data[raw : raw + 6] = struct.pack(">3H", 2, 16, 12)
+    data[raw + 0x20 :] = written.counts.astype(">u2").tobytes()
+    path.write_bytes(data)
+    counts = read_frame(path).counts
+    np.testing.assert_array_equal(counts, written.counts)
+    assert counts.dtype.isnative
+
+
+@pytest.mark.parametrize("padding", [1, 37, 5000])
+def test_undeclared_padding_is_stepped_over_and_said(tmp_path: Path, padding: int) -> None:
+    path = tmp_path / "a.seq"
+    written = sequence(path, frames=3, padding=padding)
+    data = bytearray(path.read_bytes())
+    size = len(data) // 3
+    for start in range(0, len(data), size):
+        struct.pack_into(">I", data, start + 0x34, 0)
+    path.write_bytes(data)
+    frames, rejected = index_frames([path])
+    assert [frame.index for frame in frames] == [0, 1, 2]
+    assert frames[1].notes == (f"{padding} bytes of padding before the frame were stepped over",)
+    np.testing.assert_array_equal(frames[2].read().counts, written[2].counts)
+    assert rejected == []
+
+
+def test_declared_padding_needs_no_search(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    sequence(path, frames=2, padding=100)
+    data = bytearray(path.read_bytes())
+    size = len(data) // 2
+    for start in (0, size):
+        struct.pack_into(">I", data, start + 0x34, size)
+    path.write_bytes(data)
+    frames, rejected = index_frames([path])
+    assert len(frames) == 2 and frames[1].notes == () and rejected == []
+
+
+def test_humidity_in_percent_is_understood_and_said(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    jpeg(path)
+    data = path.read_bytes()
+    stored = struct.pack("<f", 0.5)
+    at = data.index(stored, data.index(struct.pack("<f", PARAMETERS.emissivity)))
+    path.write_bytes(data[:at] + struct.pack("<f", 45.0) + data[at + 4 :])
+    frame = read_frame(path)
+    assert frame.parameters.relative_humidity == pytest.approx(0.45)
+    assert frame.notes == ("relative humidity 45 was stored in percent",)
+
+
+def test_a_file_without_time_is_read_without_one(tmp_path: Path) -> None:
+    write_jpeg(tmp_path / "a.jpg", np.full((4, 5), 18000, np.uint16), PARAMETERS, np.datetime64("NaT"))
+    frames, rejected = index_frames([tmp_path / "a.jpg"])
+    assert np.isnat(frames[0].time) and rejected == []
+
+
+def test_a_camera_info_of_the_shortest_kind_has_no_housekeeping(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    sequence(path, frames=1)
+    data = bytearray(path.read_bytes())
+    struct.pack_into(">I", data, 0x40 + 16, 0x47C)
+    path.write_bytes(data)
+    frame = read_frame(path)
+    assert frame.housekeeping == {} and frame.time == TIME and len(frame.camera_info) == 0x47C
+
+
+# Many files ----------------------------------------------------------------------------------------------------------
+
+
+def test_frames_of_many_files_come_in_order_of_time(tmp_path: Path) -> None:
+    names = ["c.jpg", "a.jpg", "b.jpg"]
+    for second, name in enumerate(names):
+        jpeg(tmp_path / name, seconds=second)
+    frames, rejected = index_frames(sorted(tmp_path.iterdir()))
+    assert [frame.path.name for frame in frames] == names and rejected == []
+
+
+def test_nothing_is_left_out_in_silence(tmp_path: Path) -> None:
+    jpeg(tmp_path / "good.jpg")
+    (tmp_path / "text.jpg").write_bytes(b"not a picture")
+    (tmp_path / "empty.seq").write_bytes(b"")
+    (tmp_path / "photo.jpg").write_bytes(b"\xff\xd8\xff\xe0\x00\x04ab\xff\xd9")
+    (tmp_path / "twin.jpg").write_bytes((tmp_path / "good.jpg").read_bytes())
+    frames, rejected = index_frames([*sorted(tmp_path.iterdir()), tmp_path / "absent.jpg"])
+    assert [frame.path.name for frame in frames] == ["good.jpg"]
+    reasons = {each.path.name: each.reason for each in rejected}
+    assert set(reasons) == {"text.jpg", "empty.seq", "photo.jpg", "twin.jpg", "absent.jpg"}
+    assert "expected a JPEG (FF D8) or an FFF record (46 46 46 00), found 6e 6f 74 20" in reasons["text.jpg"]
+    assert "found an empty file" in reasons["empty.seq"]
+    assert "expected FLIR APP1 segments, found none: the JPEG is not radiometric" in reasons["photo.jpg"]
+    assert f"has the same time {TIME} as frame 0 of" in reasons["twin.jpg"]
+    assert "No such file" in reasons["absent.jpg"]
+
+
+def test_a_damaged_frame_inside_a_sequence_costs_only_itself(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    written = sequence(path, frames=3)
+    data = bytearray(path.read_bytes())
+    size = len(data) // 3
+    # The second frame loses 100 bytes: the header of the third then stands inside its samples.
+    path.write_bytes(data[: 2 * size - 100] + data[2 * size :])
+    frames, rejected = index_frames([path])
+    assert [frame.index for frame in frames] == [0, 2]
+    np.testing.assert_array_equal(frames[1].read().counts, written[2].counts)
+    (cut,) = rejected
+    assert cut.index == 1 and "100 bytes fewer: the frame is cut short" in cut.reason
+
+
+def test_a_frame_reference_reads_in_another_process(tmp_path: Path) -> None:
+    import pickle
+
+    written = jpeg(tmp_path / "a.jpg")
+    (reference,), _ = index_frames([tmp_path / "a.jpg"])
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(reference)).read().counts, written.counts)
+
+
+# Bad input -----------------------------------------------------------------------------------------------------------
+
+
+def test_truncation_at_every_byte_of_the_headers_is_refused_with_its_place(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    sequence(path, frames=1)
+    data = path.read_bytes()
+    boundaries = [*range(0x60), 0x200, 0x201, 0x200 + 2475, 0x200 + 2476, 0x200 + 2476 + 0x20, len(data) - 1]
+    for length in boundaries:
+        path.write_bytes(data[:length])
+        with pytest.raises(FlirFormatError, match=r"a\.seq: at 0x[0-9A-F]+: expected .*, found"):
+            read_frame(path)
+
+
+def _patched(path: Path, at: int, value: bytes) -> Path:
+    data = bytearray(path.read_bytes())
+    data[at : at + len(value)] = value
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "message"),
+    [
+        (
+            0x14,
+            b"\xff\xff\xff\xff",
+            r"at 0x14: expected a version of 100 to 199 in either byte order, found ff ff ff ff",
+        ),
+        (0x18, b"\0\0\0\x10", r"at 0x18: expected a directory after the header \(offset >= 64\), found 16"),
+        (0x18, b"\x7f\xff\xff\xff", r"at 0x7FFFFFFF: expected a directory of 448 bytes, found 0 bytes before the end"),
+        (0x1C, b"\0\0\0\0", r"at 0x1C: expected 1 to 1024 directory slots, found 0"),
+        (0x1C, b"\xff\xff\xff\xff", r"expected 1 to 1024 directory slots, found 4294967295"),
+        (0x40, b"\0\x99", r"expected camera information \(type 0x20\) in the directory, found types 0x99, 0x01"),
+        (0x60, b"\0\x99", r"expected a raw image \(type 0x01\) in the directory, found types 0x20, 0x99"),
+        (
+            0x4C,
+            b"\x7f\0\0\0",
+            r"at 0x7F000000: expected camera information of 2476 bytes, found 0 bytes before the end",
+        ),
+        (0x50, b"\0\0\0\x20", r"at 0x200: expected camera information of at least 788 bytes, found 32 bytes"),
+        (0x70, b"\0\0\0\x10", r"expected a raw image longer than its header, found 16 bytes"),
+        (0x70, b"\0\0\0\x30", r"expected 16 x 12 samples of 2 bytes, found a record with 16 bytes of samples"),
+        (0x200, b"XX", r"at 0x200: expected the byte-order mark 2 of the camera information, found 58 58"),
+        (0xBAC, b"XX", r"at 0xBAC: expected the byte-order mark 2 of a raw image, found 58 58"),
+        (0xBAE, b"\0\0", r"at 0xBAE: expected 1 to 16777216 pixels, found 0 x 12"),
+        (0xBAE, b"\xff\xff\xff\xff", r"expected 1 to 16777216 pixels, found 65535 x 65535"),
+    ],
+)
+def test_a_broken_promise_is_named_with_file_and_place(tmp_path: Path, at: int, value: bytes, message: str) -> None:
+    path = tmp_path / "a.seq"
+    sequence(path, frames=1)
+    with pytest.raises(FlirFormatError, match=message):
+        read_frame(_patched(path, at, value))
+
+
+def test_a_directory_that_points_to_itself_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    sequence(path, frames=1)
+    with pytest.raises(FlirFormatError, match="byte-order mark"):
+        read_frame(_patched(path, 0x4C, struct.pack(">I", 0x40)))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "old", "new", "message"),
+    [
+        (
+            "png",
+            struct.pack(">2I", 16, 12),
+            struct.pack(">2I", 60000, 60000),
+            r"\(16, 12, 16, 0\), found \(60000, 60000",
+        ),
+        ("png", b"IEND", b"XXXX", "expected a PNG that ends with IEND"),
+        ("png", b"IDAT", b"IDAX", "expected a png stream that decodes"),
+        ("jpegls", struct.pack(">2H", 12, 16), struct.pack(">2H", 65535, 65535), r"found \(16, 65535, 65535, 1\)"),
+        ("jpegls", b"\xff\xda", b"\xff\xfe", "expected a jpegls stream that decodes"),
+        ("jpegls", b"\xff\xd9", b"\0\0", "expected a JPEG-LS stream that ends with FF D9"),
+    ],
+)
+def test_bombs_and_garbage_streams_are_refused(
+    tmp_path: Path, encoding: str, old: bytes, new: bytes, message: str
+) -> None:
+    path = tmp_path / "a.seq"
+    sequence(path, encoding, frames=1)
+    data = path.read_bytes()
+    start = data.index(b"\x89PNG" if encoding == "png" else b"\xff\xd8\xff\xf7")
+    path.write_bytes(data[:start] + data[start:].replace(old, new))
+    with pytest.raises(FlirFormatError, match=message):
+        read_frame(path)
+
+
+def test_segments_must_be_complete_and_single(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    jpeg(path, rows=200, columns=400)
+    data = path.read_bytes()
+    segments = _segments(data)
+    at, length = segments[2]
+    path.write_bytes(data[:at] + data[at + length :])
+    with pytest.raises(FlirFormatError, match=r"expected FLIR segments 0 to 2, found no \[1\]"):
+        read_frame(path)
+    path.write_bytes(data[: at + length] + data[at:])
+    with pytest.raises(FlirFormatError, match="expected FLIR segment 1 once, found it again"):
+        read_frame(path)
+
+
+def test_reading_a_small_file_that_claims_much_costs_little(tmp_path: Path) -> None:
+    import tracemalloc
+
+    path = tmp_path / "a.seq"
+    sequence(path, frames=1)
+    claim = struct.pack(">I", 0xFFFFFFF0)
+    _patched(_patched(path, 0x50, claim), 0x70, claim)
+    _patched(path, 0xBAE, struct.pack("<2H", 4096, 4096))
+    tracemalloc.start()
+    with pytest.raises(FlirFormatError, match=r"bytes fewer: the frame is cut short|before the end"):
+        read_frame(path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 1e6
+
+
+# Writing -------------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    rows=st.integers(1, 40),
+    columns=st.integers(1, 40),
+    encoding=st.sampled_from(["raw", "png", "jpegls"]),
+    seed=st.integers(0, 2**32 - 1),
+    milliseconds=st.integers(1000, 4_000_000_000_000),
+    offset=st.integers(-720, 840),
+)
+def test_random_frames_survive_a_round_trip(
+    tmp_path_factory: pytest.TempPathFactory,
+    rows: int,
+    columns: int,
+    encoding: str,
+    seed: int,
+    milliseconds: int,
+    offset: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    values = rng.uniform(0.1, 1, 18).astype(np.float32).astype(float)
+    parameters = type(PARAMETERS)(*values)
+    parameters = type(PARAMETERS)(**{**vars(parameters), "planck_o": float(rng.integers(-30000, 30000))})
+    counts = rng.integers(0, 65536, (rows, columns)).astype(np.uint16)
+    time = np.datetime64(milliseconds, "ms")
+    path = tmp_path_factory.mktemp("round") / "a.jpg"
+    write_jpeg(path, counts, parameters, time, utc_offset_minutes=offset, encoding=encoding)  # type: ignore[arg-type]
+    frame = read_frame(path)
+    np.testing.assert_array_equal(frame.counts, counts)
+    assert (frame.parameters, frame.time, frame.utc_offset_minutes) == (parameters, time, offset)
+
+
+def test_writing_leaves_its_input_alone_and_streams(tmp_path: Path) -> None:
+    frames = sequence(tmp_path / "a.seq")
+    copies = [frame.counts.copy() for frame in frames]
+    for encoding in ("raw", "png", "jpegls"):
+        assert write_sequence(tmp_path / "b.seq", iter(frames), encoding=encoding) == 3  # type: ignore[arg-type]
+    for frame, copy in zip(frames, copies, strict=True):
+        np.testing.assert_array_equal(frame.counts, copy)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"counts": np.zeros((3, 3))},
+            r"counts: expected uint16 with dims \(row, column\), got float64 of shape \(3, 3\)",
+        ),
+        ({"counts": np.zeros(3, np.uint16)}, r"got uint16 of shape \(3,\)"),
+        ({"time": "1965-01-01"}, "a FLIR file holds times from 1970 to 2106 only"),
+        (
+            {"housekeeping": {"TSLens": 20.0}},
+            r"housekeeping 'TSLens' = 20\.0: expected an ASCII name .* and 150 to 450 K",
+        ),
+        ({"housekeeping": {f"T{i}": 300.0 for i in range(60)}}, "a FLIR file holds 47 readings, not 60"),
+        ({"encoding": "tiff"}, "encoding 'tiff': expected 'raw', 'png' or 'jpegls'"),
+    ],
+)
+def test_what_the_format_cannot_hold_is_refused(tmp_path: Path, change: dict, message: str) -> None:
+    arguments = {"counts": np.ones((3, 3), np.uint16), "time": TIME} | change
+    with pytest.raises(ValueError, match=message):
+        write_jpeg(tmp_path / "a.jpg", parameters=PARAMETERS, **arguments)
+
+
+def test_a_frame_too_large_for_a_jpeg_is_sent_to_a_sequence(tmp_path: Path) -> None:
+    with pytest.raises(
+        ValueError, match="does not fit the 256 segments of a JPEG; use write_sequence, or encoding='png'"
+    ):
+        write_jpeg(tmp_path / "a.jpg", np.zeros((3000, 3000), np.uint16), PARAMETERS, TIME)
+
+
+def test_ten_thousand_frames_are_indexed_without_their_pixels(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    (template,) = sequence(path, frames=1, rows=100, columns=100)
+    record = path.read_bytes()
+    with path.open("wb") as file:
+        for second in range(10_000):
+            start = file.tell()
+            # A sparse file: the pixels are never written, so an index that read them would have to read 200 MB of zeros.
+            file.write(record[: 0x200 + 2476 + 0x40])
+            file.seek(start + 0x200 + 0x384)
+            file.write(struct.pack("<I", 1_772_000_000 + second))
+            file.seek(start + len(record))
+        file.truncate()
+    frames, rejected = index_frames([path])
+    assert len(frames) == 10_000 and rejected == []
+    assert frames[-1].shape == template.counts.shape
+    assert path.stat().st_size == 10_000 * len(record)
