@@ -64,6 +64,7 @@ class NullBank:
     values : (n,) the series
     best : grid point with the highest restricted likelihood without any regressor
     sigma : noise of one value at that point (values of relative variance 1)
+    log_likelihood : (grid,) restricted log-likelihood of the null at every grid point
     """
 
     whitenings: tuple[Whitening, ...]
@@ -71,6 +72,7 @@ class NullBank:
     values: Array
     best: int
     sigma: float
+    log_likelihood: Array
 
     @property
     def fitted(self) -> Whitening:
@@ -84,16 +86,16 @@ class NullBank:
 
     def only_fitted(self) -> NullBank:
         """The bank with the fitted point alone: whitening fixed under the null."""
-        return NullBank((self.fitted,), self.freedom, self.values, 0, self.sigma)
+        return NullBank((self.fitted,), self.freedom, self.values, 0, self.sigma, self.log_likelihood[[self.best]])
 
 
-def _grid() -> list[tuple[int, float]]:
-    walks = [(1, float(rate)) for rate in _WALK_PER_HOUR]
-    return [(0, 0.0), *walks, *[(2, float(rate)) for rate in _INTEGRATED_PER_HOUR]]
+def _grid(integrated: bool) -> list[tuple[int, float]]:
+    walks = [(0, 0.0), *[(1, float(rate)) for rate in _WALK_PER_HOUR]]
+    return [*walks, *[(2, float(rate)) for rate in _INTEGRATED_PER_HOUR]] if integrated else walks
 
 
-def null_bank(values: Array, seconds: Array, variance: Array, nuisance: Array) -> NullBank:
-    """Whiten under every drift of the grid and fit the null.
+def null_bank(values: Array, seconds: Array, variance: Array, nuisance: Array, *, integrated: bool = True) -> NullBank:
+    """Whiten under every drift of the grid (with or without integrated walks) and fit the null.
 
     Parameters
     ----------
@@ -106,7 +108,7 @@ def null_bank(values: Array, seconds: Array, variance: Array, nuisance: Array) -
     whitenings = []
     scores = []
     sigmas = []
-    for order, per_hour in _grid():
+    for order, per_hour in _grid(integrated):
         ratio = scale * per_hour**2 / 3600.0 if order < 2 else scale * per_hour**2 * 3.0 / 3600.0**3
         kind: Order = 2 if order == 2 else 1
         system = drift_system(seconds, np.ones((n, 1)), order=kind, ratios=np.array([ratio]), variance=variance)
@@ -124,7 +126,7 @@ def null_bank(values: Array, seconds: Array, variance: Array, nuisance: Array) -
         scores.append(np.log(max(rss, 1e-300)) + penalty)
         sigmas.append(np.sqrt(scale * rss / freedom))
     best = int(np.argmin(scores))
-    return NullBank(tuple(whitenings), freedom, values, best, float(sigmas[best]))
+    return NullBank(tuple(whitenings), freedom, values, best, float(sigmas[best]), -0.5 * freedom * np.asarray(scores))
 
 
 def resample(bank: NullBank, orders: NDArray[np.int64], rng: np.random.Generator | None = None) -> Array:
