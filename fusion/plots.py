@@ -16,7 +16,7 @@ MARKERS = {"positive": ">", "negative": "<"}
 ARROWS = {"positive": "positive approach", "negative": "negative approach"}
 INK, MUTED, GRID, ACCENT = "#1f2a30", "#5c6b73", "#d9dfe2", "#8a1c4a"
 TIME_MAP = "cividis"
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "font.size": 9.5, "axes.titlesize": 10.0, "axes.titleweight": "bold", "axes.titlelocation": "left", "axes.labelsize": 9.5,
     "xtick.labelsize": 8.5, "ytick.labelsize": 8.5, "legend.fontsize": 8.5, "legend.frameon": False,
     "axes.edgecolor": MUTED, "axes.labelcolor": INK, "text.color": INK, "xtick.color": MUTED, "ytick.color": MUTED,
@@ -26,14 +26,14 @@ STYLE: dict[str, Any] = {
 }  # fmt: skip
 
 
-def new_axes(ax: Axes | None) -> Axes:
-    """Return `ax`, or the axes of a new figure in the house style."""
+def new_axes(ax: Axes | None, *, height: float = 3.4) -> Axes:
+    """Return `ax`, or the axes of a new figure in the house style, `height` inches high."""
     if ax is not None:
         return ax
     import matplotlib.pyplot as plt
 
     with plt.rc_context(STYLE):
-        return plt.subplots(figsize=(5.2, 3.4))[1]
+        return plt.subplots(figsize=(5.2, height))[1]
 
 
 def plot_deviations(
@@ -109,7 +109,7 @@ def plot_scatter(comparison: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     ax = new_axes(ax)
     for direction in comparison["direction"].values:
         row = comparison.sel(direction=direction)
-        style = {"color": COLOURS[direction], "marker": MARKERS[direction]}
+        style: dict[str, Any] = {"color": COLOURS[direction], "marker": MARKERS[direction]}
         ax.plot(row["link"], row["differenced"], label=f"differences, {ARROWS[direction]}", **style)
         ax.plot(
             row["link"],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -13,6 +13,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BEFORE = "#9aa7ad"
+LEVEL = 0.05
+#: Parts of the drift as the correlation names them, in plain words.
+CHANNELS = {
+    "common": "drift common to all positions",
+    "proportional": "drift that grows with position",
+    "reversal": "drift of the reversal",
+    "joint": "common and growing drift together",
+}
 
 
 def plot_profile(drift: xr.Dataset, position: xr.DataArray, *, ax: Axes | None = None) -> Axes:
@@ -77,26 +85,29 @@ def plot_position_scatter(drift: xr.Dataset, flagged: set[int], *, ax: Axes | No
 
 
 def plot_cells(maps: xr.Dataset, name: str, channel: str, *, label: str, ax: Axes | None = None) -> Axes:
-    """Draw a map over the plan cells of one channel, cells with a family-wise p below 0.05 outlined."""
-    ax = new_axes(ax)
+    """Draw a map over the plan cells of one channel; cells with a family-wise p up to 0.05 are outlined.
+
+    A sensitivity is shown in full colour, with its scale, in those cells; elsewhere it is mostly noise and pale.
+    """
+    ax = new_axes(ax, height=2.55)
     chosen = maps.sel(channel=channel)
-    values = chosen[name].values
+    values, p = chosen[name].values, chosen["p_value"].fillna(1.0).values
     x, y = chosen["x"].values, chosen["y"].values
     half = float(np.median(np.diff(x))) / 2
     extent = (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half)
-    limit = float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else 1.0
-    colours = (
-        {"cmap": "viridis_r", "vmin": 0.0, "vmax": 1.0}
-        if name == "p_value"
-        else {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
-    )
+    found = p <= LEVEL
+    if name == "p_value":
+        colours: dict[str, Any] = {"cmap": "viridis_r", "vmin": 0.0, "vmax": 1.0}
+    else:
+        limit = float(np.nanmax(np.abs(values[found]))) if found.any() else float(np.nanpercentile(np.abs(values), 90))
+        colours = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
+    if found.any() and name != "p_value":
+        colours["alpha"] = np.where(found, 1.0, 0.25)
     picture = ax.imshow(values, origin="lower", extent=extent, interpolation="nearest", **colours)
     ax.figure.colorbar(picture, ax=ax, label=label, orientation="horizontal", aspect=40).outline.set_visible(False)
-    if (chosen["p_value"] <= 0.05).any():
-        ax.contour(
-            x, y, (chosen["p_value"].fillna(1) <= 0.05).astype(float), levels=[0.5], colors=[INK], linewidths=1.2
-        )
-    ax.set(xlabel="x / mm", ylabel="y / mm", title=f"drift that is {channel}")
+    if found.any():
+        ax.contour(x, y, found.astype(float), levels=[0.5], colors=[INK], linewidths=1.2)
+    ax.set(xlabel="x / mm", ylabel="y / mm", title=CHANNELS.get(channel, channel))
     ax.grid(visible=False)
     return ax
 
@@ -162,19 +173,15 @@ def plot_residual_direction(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axe
 
 
 def plot_contributions(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot what each effect of the final model contributes at the far end of the axis over time, with its 95 % band if known."""
+    """Plot what each effect of the final model contributes over time at the far end of the axis, positive approach."""
     ax = new_axes(ax)
     far = int(deviations["target"][int(np.argmax(np.abs(deviations["position"].values)))])
-    hours = hours_since_start(deviations).sel(target=far).mean("direction")
-    for at, effect in enumerate(loop["effect"].values):
-        line = loop["contribution"].sel(effect=effect, target=far).mean("direction")
-        ax.plot(
-            hours,
-            line,
-            linestyle=("-", "--", "-.", ":")[at % 4],
-            label=str(effect).replace("_", " "),
-            color=(INK, ACCENT, COLOURS["positive"], COLOURS["negative"])[at % 4],
-        )
+    at: dict[str, Any] = {"target": far, "direction": "positive"}
+    hours = hours_since_start(deviations).sel(at)
+    colours = (INK, ACCENT, COLOURS["positive"], COLOURS["negative"])
+    for place, effect in enumerate(loop["effect"].values):
+        style: dict[str, Any] = {"linestyle": ("-", "--", "-.", ":")[place % 4], "color": colours[place % 4]}
+        ax.plot(hours, loop["contribution"].sel(effect=effect, **at), label=str(effect).replace("_", " "), **style)
     ax.set(xlabel="time since first reading / h", ylabel=f"contribution at position {far} / µm")
     ax.legend()
     return ax

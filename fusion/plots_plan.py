@@ -15,17 +15,30 @@ if TYPE_CHECKING:
 HEAT_MAP = "inferno"
 
 
+def _on_plan(fields: xr.Dataset, shape: tuple[int, int]) -> np.ndarray:
+    """Return which pixels of a frame show the plan, by the homography (the lens distortion does not matter for a colour scale)."""
+    row, column = np.indices(shape)
+    x, y, scale = np.einsum("ij,jrc->irc", fields["homography"].values, np.stack([column, row, np.ones(shape)]))
+    half = float(np.median(np.diff(fields["x"]))) / 2
+    (left, right), (bottom, top) = (
+        (fields[name].values[0] - half, fields[name].values[-1] + half) for name in ("x", "y")
+    )
+    return (x / scale > left) & (x / scale < right) & (y / scale > bottom) & (y / scale < top)
+
+
 def plot_registration(fields: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Draw the reference frame with every located fiducial; the arrow is its leave-one-out error, 200 times enlarged."""
+    """Draw the reference frame, in sensor pixels, with every located fiducial."""
     ax = new_axes(ax)
     frame = fields["reference_frame"].values
-    low, high = np.nanpercentile(frame, [1, 99])
+    seen = _on_plan(fields, frame.shape)
+    low, high = np.nanpercentile(frame[seen], [1, 99])
     picture = ax.imshow(frame, cmap=HEAT_MAP, vmin=low, vmax=high, interpolation="nearest")
     ax.figure.colorbar(picture, ax=ax, label="temperature / °C", shrink=0.8, aspect=30).outline.set_visible(False)
     column, row = fields["fiducial_column"].values, fields["fiducial_row"].values
     ax.plot(column, row, "o", markersize=9, markerfacecolor="none", markeredgecolor="#7fe3ff", markeredgewidth=1.1)
+    label = {"boxstyle": "round,pad=0.15", "facecolor": INK, "edgecolor": "none", "alpha": 0.75}
     for name, x, y in zip(fields["fiducial"].values, column, row, strict=True):
-        ax.annotate(str(name), (x, y), (5, 5), textcoords="offset points", color="#7fe3ff", fontsize=7.5)
+        ax.annotate(str(name), (x, y), (7, 4), textcoords="offset points", color="white", fontsize=7, bbox=label)
     ax.set(xlabel="column / px", ylabel="row / px")
     ax.grid(visible=False)
     return ax
@@ -33,7 +46,7 @@ def plot_registration(fields: xr.Dataset, *, ax: Axes | None = None) -> Axes:
 
 def plot_rise(fields: xr.Dataset, cycle: int, *, ax: Axes | None = None) -> Axes:
     """Draw the temperature rise of one cycle on the plan, in mm."""
-    ax = new_axes(ax)
+    ax = new_axes(ax, height=2.2)
     rise = fields["temperature_rise"].sel(cycle=cycle)
     half = float(np.median(np.diff(fields["x"]))) / 2
     x, y = fields["x"].values, fields["y"].values

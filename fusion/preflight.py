@@ -70,7 +70,7 @@ def _covered(readings: NDArray[np.datetime64], frames: NDArray[np.datetime64], s
 def _likely_zone_shift(readings: NDArray[np.datetime64], frames: NDArray[np.datetime64]) -> float | None:
     """Return the shift in s by whole quarter hours within a day that makes frames and readings meet best, if nearly all do."""
     shifts = np.arange(-_DAY_S, _DAY_S + 1, _QUARTER_HOUR_S)
-    shares = np.array([_covered(readings, frames, shift) for shift in shifts])
+    shares = np.array([_covered(readings, frames, float(shift)) for shift in shifts])
     best = np.flatnonzero(shares == shares.max())
     nearest = best[np.argmin(np.abs(shifts[best]))]
     return float(shifts[nearest]) if shares[nearest] >= _COVERED_SHIFTED and shifts[nearest] != 0 else None

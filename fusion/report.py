@@ -72,7 +72,8 @@ def draw_figures(results: Mapping[str, Any], datasets: Mapping[str, xr.Dataset])
     fused = datasets.get("fusion")
     if fused is not None and has(fused, "correlation"):
         maps = group(fused, "correlation")
-        channel = str(maps["p_value"].min(["y", "x"]).idxmin("channel").values)
+        smallest = maps["p_value"].min(["y", "x"]).fillna(1.0)
+        channel = str(maps["channel"].values[int(np.argmin(smallest.values))])
         charts["sensitivity"] = lambda: plots_fusion.plot_cells(
             maps, "sensitivity", channel, label="sensitivity / (µm/K)"
         )
@@ -113,10 +114,11 @@ def svg_text(draw: Callable[[], Axes], name: str) -> str:
     from matplotlib import pyplot as plt
 
     with mpl.rc_context({**plots.STYLE, "backend": "Agg"}):
-        figure = draw().figure
+        figure = draw().get_figure(root=True)
+        assert figure is not None
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-        plt.close(figure)  # type: ignore[arg-type]
+        plt.close(figure)
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r'\bid="([^"]+)"', rf'id="{name}-\1"', text)
@@ -168,7 +170,7 @@ def _layer(name: str, values: np.ndarray, unit: str) -> dict[str, Any]:
     palette = np.round(mpl.colormaps[plots_plan.HEAT_MAP](np.arange(256))[:, :3] * 255).astype(int)
     return {
         "name": name, "unit": unit, "offset": low + 30000 * step, "step": step,
-        "low": float(np.nanpercentile(values, 0.5)), "high": float(np.nanpercentile(values, 99.5)),
+        "low": float(np.nanpercentile(values, 0.1)), "high": float(np.nanpercentile(values, 99.9)),
         "palette": palette.tolist(), "values": base64.b64encode(stored.tobytes()).decode(),
     }  # fmt: skip
 

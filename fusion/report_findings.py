@@ -10,17 +10,13 @@ import xarray as xr
 
 from fusion import wording
 from fusion.groups import group, has
+from fusion.plots_fusion import CHANNELS
 from fusion.wording import duration, join, measured, number
 
 _CORRELATION = {
     "attributable": "Parts of the field go with the drift more closely than chance and common warm-up allow.",
     "not attributable": "No part of the field goes with the drift more closely than chance allows.",
     "not separable": "These data cannot tell: the whole session is one warm-up, in which every temperature rises like every drift.",
-}
-_NUISANCE = {
-    "kind": "its kind",
-    "common_rms_um": "common part, rms / µm",
-    "stretch_rms_um": "stretch at the far end, rms / µm",
 }
 
 
@@ -29,7 +25,10 @@ def describe_correlation(fused: xr.Dataset) -> dict[str, Any] | None:
     if not has(fused, "correlation"):
         return None
     maps = group(fused, "correlation")
-    rows = [(f"Drift that is {channel}", _channel(maps.sel(channel=channel))) for channel in maps["channel"].values]
+    rows = [
+        (CHANNELS.get(channel, channel).capitalize(), _channel(maps.sel(channel=channel)))
+        for channel in map(str, maps["channel"].values)
+    ]
     rate = float(maps["false_alarm_rate"])
     rows.append(("Chance of a false find", f"{rate:.2f}, measured on data simulated without any link"))
     rows.append(("Excitation", str(fused.attrs.get("correlation_excitation", ""))))
@@ -40,7 +39,7 @@ def describe_correlation(fused: xr.Dataset) -> dict[str, Any] | None:
 def _channel(maps: xr.Dataset) -> str:
     """Return the strongest cell of one channel, what would have been found, and the drift that nothing explains."""
     flat = maps.stack(cell=("y", "x"))
-    best = flat.isel(cell=int(flat["p_value"].fillna(np.inf).argmin()))
+    best = flat.isel(cell=int(np.argmin(flat["p_value"].fillna(np.inf).values)))
     return (
         f"smallest p {wording.p_value(float(best['p_value']))} at x {float(best['x']):.0f} mm, y {float(best['y']):.0f} mm: "
         f"{measured(float(best['sensitivity']), float(best['sensitivity_u']), 'µm/K')}, lag {duration(float(best['lag']))}; "
@@ -53,21 +52,30 @@ def describe_model(loop: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the coefficients of the declared effects, the size of the unexplained drift, and what was not tried."""
     rows = []
     for one in loop.get("declared_coefficients", []):
-        rows.append((wording.effect_name(one["effect"]), measured(one["value"], one["u"], one["unit"])))
+        rows.append((wording.effect_name(one["effect"]), measured(one["value"], one["u"], print_unit(one["unit"]))))
     for step in loop["steps"]:
         for one in step.get("coefficients", []):
-            rows.append((wording.effect_name(step["effect"]), measured(one["value"], one["u"], one["unit"])))
-    nuisance = {_NUISANCE.get(name, spaced(name)): value for name, value in loop.get("nuisance", {}).items()}
-    if nuisance:
-        rows.append(
-            ("drift that nobody explains", "; ".join(f"{name} {in_words(value)}" for name, value in nuisance.items()))
+            rows.append(
+                (wording.effect_name(step["effect"]), measured(one["value"], one["u"], print_unit(one["unit"])))
+            )
+    if "nuisance" in loop:
+        left = loop["nuisance"]
+        text = (
+            f"{left['kind']}; rms {_small(left['common_rms_um'])} µm common to all positions, "
+            f"{_small(left['stretch_rms_um'])} µm of stretch at the far end"
         )
+        rows.append(("drift that nobody explains", text))
     if "rmse_persistence_um" in loop:
         rows.append(("error of repeating the last value", f"{number(loop['rmse_persistence_um'], 3)} µm"))
     for title, reasons in (("not tried", loop.get("not_tried", {})), ("blocked", loop.get("blocked", {}))):
         for name, reason in reasons.items():
             rows.append((f"{title}: {wording.effect_name(name)}", reason))
     return rows
+
+
+def _small(value: float) -> str:
+    """Return a size in um, values below a nanometre as such."""
+    return "below 0.001" if value < 1e-3 else number(value, 2)
 
 
 def describe_candidates(loop: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -100,14 +108,57 @@ def describe_candidates(loop: Mapping[str, Any]) -> dict[str, Any] | None:
     return {"columns": columns, "rows": rows} if rows else None
 
 
+def runner_up(found: Mapping[str, Any]) -> str:
+    """Return the second best effect of a step and how far behind it is."""
+    if not found:
+        return "none"
+    behind = number(found.get("behind_by"), 2)
+    return f"{wording.effect_name(found['effect'])}, behind by {behind} in log-likelihood"
+
+
+def print_unit(unit: str) -> str:
+    """Return a unit as it is printed."""
+    return unit.replace("um", "µm")
+
+
 def parameters(values: Mapping[str, Any]) -> str:
     """Return parameters as ``name value, name value``."""
     return ", ".join(f"{spaced(name)} {in_words(value)}" for name, value in values.items())
 
 
+_UNITS = {
+    "_um_per_K": " / (µm/K)",
+    "_um": " / µm",
+    "_nats": " / nats",
+    "_min": " / min",
+    "_mm": " / mm",
+    "_s": " / s",
+    "_K": " / K",
+}
+
+
 def spaced(name: str) -> str:
-    """Return a name of a key as words."""
+    """Return the name of a key as words, a unit at its end set off: ``"time_constant_min"`` -> ``"time constant / min"``."""
+    for ending, unit in _UNITS.items():
+        if name.endswith(ending):
+            return name.removesuffix(ending).replace("_", " ") + unit
     return name.replace("_", " ")
+
+
+def evidence(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the evidence of an anomaly as sentences for and against, what to check, and the numbers behind them."""
+    numbers = {name: value for name, value in found.items() if name not in {"for", "against", "check"}}
+    return {
+        "for": [readable(text) for text in found.get("for", [])],
+        "against": [readable(text) for text in found.get("against", [])],
+        "check": readable(found.get("check", "")),
+        "numbers": [(spaced(name), in_words(value)) for name, value in numbers.items()],
+    }
+
+
+def readable(text: str) -> str:
+    """Return a plain sentence with the signs of print: ± and µm, effect names without underscores."""
+    return text.replace("+-", "±").replace(" um", " µm").replace("_", " ")
 
 
 def in_words(value: Any) -> str:
@@ -122,4 +173,4 @@ def in_words(value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, float | np.floating):
         return number(float(value), 3)
-    return "–" if value is None else str(value)
+    return "–" if value is None else readable(str(value))

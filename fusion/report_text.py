@@ -15,9 +15,9 @@ from fusion.report_findings import (
     describe_candidates,
     describe_correlation,
     describe_model,
-    in_words,
+    evidence,
     parameters,
-    spaced,
+    runner_up,
 )
 from fusion.wording import duration, join, measured, moment, number
 
@@ -85,14 +85,12 @@ def describe(
         "positions": _position_rows(deviations),
         "neighbours_text": _neighbours_text(results),
         "anomaly_advice": [wording.CAUSES[item["cause"]][1] for item in anomalies],
-        "evidence": [
-            [(spaced(name), in_words(value)) for name, value in item["evidence"].items()] for item in anomalies
-        ],
+        "evidence": [evidence(item["evidence"]) for item in anomalies],
         "correlation": correlation,
         "model": describe_model(loop) if loop else [],
         "loop_numbers": wording.verdict_numbers(loop) if loop else "",
         "parameters": [parameters(step["parameters"]) for step in loop["steps"]] if loop else [],
-        "runners_up": [parameters(step["runner_up"]) for step in loop["steps"]] if loop else [],
+        "runners_up": [runner_up(step["runner_up"]) for step in loop["steps"]] if loop else [],
         "candidates": describe_candidates(loop) if loop else None,
         "uncertainty": _uncertainty(results, fields),
         "glossary": GLOSSARY,

@@ -145,7 +145,7 @@ def frames_notices(rejected: list[dict[str, Any]]) -> list[Notice]:
     return [
         Notice(
             "frames_rejected",
-            f"{_count(len(rejected), 'frame')} left out: {_listed(named)}.",
+            f"{counted(len(rejected), 'frame')} left out: {listed(named)}.",
             "Copy damaged files again from the camera; a gap in the frames only widens the interpolation between its neighbours.",
         )
     ]
@@ -166,7 +166,7 @@ def left_out_notices(dataset: xr.Dataset, code: str) -> list[Notice]:
     return [
         Notice(
             code,
-            f"{_count(len(lines), 'line')} of {lines[0]['path']} left out: {_listed(named)}.",
+            f"{counted(len(lines), 'line')} of {lines[0]['path']} left out: {listed(named)}.",
             f"Correct these lines in {lines[0]['path']} and run again; the estimates allow for the gaps.",
         )
     ]
@@ -177,16 +177,18 @@ def _missing_notice(deviations: xr.Dataset, missing: int) -> Notice:
     cycles = [str(cycle) for cycle in deviations["cycle"].values[gaps.any(axis=(1, 2))]]
     return Notice(
         "readings_missing",
-        f"{_count(missing, 'reading')} of {gaps.size} missing, in {_count(len(cycles), 'cycle')}: {_listed(cycles)}.",
+        f"{counted(missing, 'reading')} of {gaps.size} missing, in {counted(len(cycles), 'cycle')}: {listed(cycles)}.",
         "Nothing has to be done: the joint estimate allows for gaps; conventional values are taken from the readings that are there.",
     )
 
 
-def _count(number: int, noun: str) -> str:
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun, in the plural where it has to be."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def _listed(names: Iterable[str]) -> str:
+def listed(names: Iterable[str]) -> str:
+    """Return the first few names, and how many more there are."""
     names = list(names)
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return "; ".join(names[:_NAMED]) + more

@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from thermography.exr import write_maps
-from thermography.hotspots import Hotspot, detect_hotspots
 
 from fusion.alignment import align, camera_on_laser_clock, cycle_bounds
 from fusion.contracts import check
@@ -24,12 +22,14 @@ from fusion.products import write_atomically
 from fusion.progress import Report, step_of
 from fusion.readings import Readings, read_fused
 from fusion.results import Notice
-from fusion.sources import Source
+from fusion.sources import Source, counted, listed
 from interferometry import iso230, neighbours
 from interferometry.anomalies import Anomaly, detect_anomalies
 from interferometry.drift import estimate_drift, flag_outliers
 from thermography.contract import FIELDS
+from thermography.exr import write_maps
 from thermography.fields import reduce_frames
+from thermography.hotspots import Hotspot, detect_hotspots
 from thermography.overrides import Overrides
 from thermography.radiometry import calibrate
 from thermography.registration import Registration, register
@@ -205,7 +205,6 @@ def fuse(source: Source, fields: xr.Dataset, deviations: xr.Dataset, *, report: 
     share = step_of(report, "correlation")
     share(0, 100)
     maps = correlate(fused, fields["frame_temperature"], progress=lambda part: share(round(100 * part), 100))
-    share(100, 100)
     report("anomalies", 0, 1)
     anomalies = detect_anomalies(group(deviations, "drift"), deviations)
     diagnoses = diagnose(anomalies, fused)
@@ -219,7 +218,11 @@ def fuse(source: Source, fields: xr.Dataset, deviations: xr.Dataset, *, report: 
     )
     dataset = joined(fused, correlation=maps, loop=loop_variables(fused, readings, found))
     dataset.attrs.update({f"correlation_{name}": value for name, value in maps.attrs.items()})
-    parts = {"hotspots": hotspot_part(fields, maps), "anomalies": [anomaly_part(*pair) for pair in zip(anomalies, diagnoses, strict=True)], "loop": found.as_json()}
+    parts = {
+        "hotspots": hotspot_part(fields, maps),
+        "anomalies": [anomaly_part(*pair) for pair in zip(anomalies, diagnoses, strict=True)],
+        "loop": found.as_json(),
+    }
     notices = [*outside_notices(fused), *(Notice("loop", text, "") for text in found.warnings)]
     return Outcome(dataset, parts, tuple(notices))
 
@@ -254,11 +257,11 @@ def outside_notices(fused: xr.Dataset) -> list[Notice]:
     outside = (fused["deviation"].notnull() & ~fused["inside_frames"]).values
     if not outside.any():
         return []
-    cycles = fused["cycle"].values[outside.any(axis=(1, 2))]
+    cycles = [str(cycle) for cycle in fused["cycle"].values[outside.any(axis=(1, 2))]]
     return [
         Notice(
             "readings_outside_frames",
-            f"{int(outside.sum())} readings lie outside the frames' time (cycles {cycles.min()} to {cycles.max()}); "
+            f"{int(outside.sum())} readings lie outside the frames' time, in {counted(len(cycles), 'cycle')} ({listed(cycles)}); "
             "they are evaluated, but take no part in what joins drift and field.",
             "Start the camera before the first cycle and stop it after the last one.",
         )
@@ -310,7 +313,7 @@ def hotspot_part(fields: xr.Dataset, maps: xr.Dataset) -> list[dict[str, Any]]:
 def _hotspot(spot: Hotspot, maps: xr.Dataset) -> dict[str, Any]:
     here = maps.sel(x=spot.x_mm, y=spot.y_mm, method="nearest")
     p = here["p_value"].fillna(1.0)
-    at = int(p.argmin("channel"))
+    at = int(np.argmin(p.values))
     return {
         "x_mm": spot.x_mm,
         "y_mm": spot.y_mm,

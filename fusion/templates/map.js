@@ -37,16 +37,18 @@ function drawMap(root) {
     canvas.height = Math.round(canvas.clientWidth * ratio * (data.y1 - data.y0) / (data.x1 - data.x0));
     context.imageSmoothingEnabled = false;
     context.drawImage(small, 0, 0, canvas.width, canvas.height);
-    context.lineWidth = 1.5 * ratio; context.font = `${11 * ratio}px sans-serif`; context.textAlign = "center";
-    if (data.line.length) {
-      context.strokeStyle = context.fillStyle = "#7fe3ff"; context.beginPath();
+    context.font = `600 ${12 * ratio}px sans-serif`; context.textAlign = "center"; context.lineJoin = "round";
+    for (const [colour, extra] of [["#1f2a30", 2], ["#ffffff", 0]]) {  // dark under light reads on every colour
+      context.strokeStyle = context.fillStyle = colour; context.lineWidth = (1.5 + extra) * ratio; context.beginPath();
       data.line.forEach(([x, y], i) => { const [u, v] = place(x, y); if (i) context.lineTo(u, v); else context.moveTo(u, v); });
       context.stroke();
       data.line.forEach(([x, y], i) => {
-        const [u, v] = place(x, y); context.beginPath(); context.arc(u, v, 2.5 * ratio, 0, 7); context.fill();
-        if (i === 0 || i === data.line.length - 1) context.fillText(String(i + 1), u, v - 6 * ratio);
+        const [u, v] = place(x, y); context.beginPath(); context.arc(u, v, (2.5 + extra / 2) * ratio, 0, 7); context.fill();
+        if (i && i < data.line.length - 1) return;
+        if (extra) context.strokeText(String(i + 1), u, v - 8 * ratio); else context.fillText(String(i + 1), u, v - 8 * ratio);
       });
     }
+    context.lineWidth = 1.5 * ratio;
     for (const spot of data.hotspots) {
       const [u, v] = place(spot.x_mm, spot.y_mm);
       context.strokeStyle = "#ffffff"; context.beginPath(); context.arc(u, v, 8 * ratio, 0, 7); context.stroke();
