@@ -219,7 +219,8 @@ def resolve_links(pair_s_um: np.ndarray) -> np.ndarray:
     """Resolve standard deviations of neighbour differences into those of positions.
 
     A position with excess scatter raises both of its links. The squares obey s_link^2 = s_i^2 + s_(i+1)^2, one equation
-    fewer than positions: of all non-negative solutions the one nearest to equal scatter is taken.
+    fewer than positions: of all non-negative solutions the one is taken in which fewest positions differ from the
+    usual one (absolute differences, by iterated reweighting).
 
     Parameters
     ----------
@@ -232,9 +233,13 @@ def resolve_links(pair_s_um: np.ndarray) -> np.ndarray:
     variance = np.asarray(pair_s_um, float) ** 2
     links = variance.size
     sums = np.eye(links, links + 1) + np.eye(links, links + 1, 1)
-    usual = np.full(links + 1, float(np.median(variance)) / 2)
-    weak = 0.3 * np.eye(links + 1)
-    solution, _ = optimize.nnls(np.vstack([sums, weak]), np.concatenate([variance, weak @ usual]))
+    usual = float(np.median(variance)) / 2
+    solution = np.full(links + 1, usual)
+    for _ in range(30):
+        weak = 0.3 * np.diag((np.maximum(np.abs(solution - usual) / usual, 0.02) / 0.02) ** -0.5)
+        solution, _ = optimize.nnls(
+            np.vstack([sums, weak]), np.concatenate([variance, weak @ np.full(links + 1, usual)])
+        )
     return np.sqrt(solution)
 
 
