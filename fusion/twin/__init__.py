@@ -8,11 +8,13 @@ from fusion.twin.datasets import deviations_of, fields_of
 from fusion.twin.instruments import simulate_campaign, truth_folder, write_campaign
 from fusion.twin.recipe import Recipe, RecipeError
 from fusion.twin.recipe_file import packaged_recipe, read_recipe
+from fusion.twin.record import RecordTruth, simulate_record
 from fusion.twin.simulate import Truth, driver_log, environment_log, simulate
 
 __all__ = [
     "Recipe",
     "RecipeError",
+    "RecordTruth",
     "Truth",
     "deviations_of",
     "driver_log",
@@ -22,6 +24,7 @@ __all__ = [
     "read_recipe",
     "simulate",
     "simulate_campaign",
+    "simulate_record",
     "truth_folder",
     "write_campaign",
 ]

@@ -14,6 +14,7 @@ import xarray as xr
 from fusion.twin.camera import KELVIN, SC660, Renderer, fiducial_points, make_view
 from fusion.twin.recipe import RecipeError
 from fusion.twin.recipe_file import read_recipe
+from fusion.twin.record import simulate_record, write_record
 from fusion.twin.simulate import Truth, driver_log, environment_log, simulate, spread
 from fusion.twin.streams import stream
 from interferometry.writers import write_deviations_csv, write_environment_csv, write_rtl
@@ -57,9 +58,13 @@ def simulate_campaign(recipe_path: Path, out: Path, *, progress: Progress | None
     RecipeError
         The recipe is wrong, or a folder is in the way.
     """
-    recipe = read_recipe(Path(recipe_path))
-    _check_free(Path(out))
-    return write_campaign(simulate(recipe), Path(out), progress=progress)
+    recipe, out = read_recipe(Path(recipe_path)), Path(out)
+    if recipe.record is None:
+        _check_free(out)
+        return write_campaign(simulate(recipe), out, progress=progress)
+    truth = simulate_record(recipe)
+    _make_folders(out)
+    return write_record(truth, out, truth_folder(out))
 
 
 def truth_folder(out: Path) -> Path:
@@ -91,9 +96,7 @@ def write_campaign(truth: Truth, out: Path, *, progress: Progress | None = None)
         `out` or the truth's folder holds something already.
     """
     out = Path(out)
-    _check_free(out)
-    out.mkdir(parents=True, exist_ok=True)
-    truth_folder(out).mkdir(parents=True, exist_ok=True)
+    _make_folders(out)
     _write_laser(truth, out)
     write_environment_csv(out / "environment.csv", environment_log(truth))
     _write_drivers(truth, out / "drivers.csv")
@@ -109,8 +112,8 @@ def campaign_text(truth: Truth) -> str:
     recipe = truth.recipe
     camera, plan = recipe.camera, recipe.plan
     clock = f'clock_offset = "{camera.clock_offset_s:g} s"\n' if camera.state_clock_offset else ""
-    dead_path = 'dead_path = "0 mm"\n' if recipe.laser.file == "csv" else ""
-    environment = 'environment = "environment.csv"\n'
+    # a .rtl holds no times of readings: they are rebuilt from what the operator set
+    motion = f'feed = "{recipe.test.feed_mm_per_min:g} mm/min"\ndwell = "{recipe.test.dwell_s:g} s"\n'
     return f"""[campaign]
 title = {json.dumps(recipe.campaign.title)}
 axis = {json.dumps(recipe.campaign.axis)}
@@ -135,7 +138,9 @@ direction = [{plan.direction[0]:g}, {plan.direction[1]:g}]
 
 [interferometry]
 deviations = "laser.{recipe.laser.file}"
-{environment}{dead_path}expansion_coefficient = "{recipe.laser.stated_expansion_ppm_per_K:g} ppm/K"
+{motion if recipe.laser.file == "rtl" else ""}environment = "environment.csv"
+dead_path = "0 mm"
+expansion_coefficient = "{recipe.laser.stated_expansion_ppm_per_K:g} ppm/K"
 
 [drivers]
 file = "drivers.csv"
@@ -143,6 +148,12 @@ file = "drivers.csv"
 [model]
 declared = ["axis_expansion", "table_offset"]
 """
+
+
+def _make_folders(out: Path) -> None:
+    _check_free(out)
+    out.mkdir(parents=True, exist_ok=True)
+    truth_folder(out).mkdir(parents=True, exist_ok=True)
 
 
 def _check_free(out: Path) -> None:

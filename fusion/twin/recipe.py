@@ -190,6 +190,24 @@ class AnomalyRecipe:
 
 
 @dataclass(frozen=True)
+class Record:
+    """A record instead of a positioning test: sensors and channels over hours, under a spindle speed that changes at random."""
+
+    hours: float = 24.0
+    step_s: float = 60.0
+    sensors: int = 10
+    channels: int = 3
+    top_speed_rpm: float = 8000.0
+    mean_hold_min: float = 90.0
+    rest_share: float = 0.25
+    room_swing_K: float = 1.0
+    sensitivity_um_per_K: float = 1.5
+    noise_K: float = 0.03
+    noise_um: float = 0.3
+    walk_um_per_sqrt_h: float = 0.2
+
+
+@dataclass(frozen=True)
 class Recipe:
     """Everything the twin needs for one campaign."""
 
@@ -210,8 +228,11 @@ class Recipe:
     camera: Camera = field(default_factory=Camera)
     effect: tuple[EffectRecipe, ...] = ()
     anomaly: tuple[AnomalyRecipe, ...] = ()
+    record: Record | None = None
 
     def vary(self, **tables: Any) -> Recipe:
         """Return a copy with some values changed: ``recipe.vary(campaign={"seed": 7}, effect=())``."""
-        changes = {k: replace(getattr(self, k), **v) if isinstance(v, dict) else v for k, v in tables.items()}
+        changes: dict[str, Any] = {
+            k: replace(getattr(self, k) or Record(), **v) if isinstance(v, dict) else v for k, v in tables.items()
+        }
         return replace(self, **changes)

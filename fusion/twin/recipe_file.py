@@ -13,8 +13,10 @@ from typing import Any
 
 from fusion.twin.effects import EFFECTS
 from fusion.twin.local import ANOMALIES
-from fusion.twin.recipe import EffectRecipe, Recipe, RecipeError
+from fusion.twin.recipe import EffectRecipe, Recipe, RecipeError, Record
 
+#: Directions and angles that a record can hold.
+CHANNELS = 6
 CHOICES = {
     "duty.kind": ("random", "constant", "switched"),
     "drift.walk": ("none", "random_walk", "integrated", "ou"),
@@ -99,12 +101,24 @@ def check_recipe(recipe: Recipe) -> Recipe:
     targets = len(recipe.test.positions_mm) or recipe.test.targets
     if targets < 2:
         raise RecipeError(f"test.targets = {targets}; a positioning test needs at least 2")
+    _check_record(recipe.record)
     for number, anomaly in enumerate(recipe.anomaly, 1):
         if not 1 <= anomaly.target <= targets:
             raise RecipeError(f"anomaly {number}: target = {anomaly.target}; the test has targets 1 to {targets}")
     for number, effect in enumerate(recipe.effect, 1):
         _check_effect(effect, number)
     return recipe
+
+
+def _check_record(record: Record | None) -> None:
+    """Refuse a record that no machine can leave."""
+    if record is None:
+        return
+    for name in ("hours", "step_s", "sensors", "channels", "mean_hold_min", "top_speed_rpm"):
+        if not getattr(record, name) > 0:
+            raise RecipeError(f"record.{name} = {getattr(record, name)}; write a number above 0")
+    if record.channels > CHANNELS:
+        raise RecipeError(f"record.channels = {record.channels}; there are at most {CHANNELS}")
 
 
 def _check_effect(effect: EffectRecipe, number: int) -> None:
@@ -156,6 +170,8 @@ def _build(cls: type, table: dict[str, Any], place: str) -> Any:
 
 def _convert(value: Any, kind: Any, place: str) -> Any:
     """Return a TOML value as the kind that the recipe's annotation asks for."""
+    if isinstance(kind, types.UnionType):
+        kind = next(one for one in typing.get_args(kind) if one is not types.NoneType)
     if typing.get_origin(kind) is tuple:
         if not isinstance(value, list):
             raise RecipeError(f"{place} = {value!r}; write a list")
@@ -170,16 +186,12 @@ def _convert(value: Any, kind: Any, place: str) -> Any:
         return _build(typing.cast(type, kind), value, place if place.endswith(".") else place + ".")
     if typing.get_origin(kind) is dict:
         return value
-    kinds = (
-        [k for k in typing.get_args(kind) if k is not types.NoneType] if isinstance(kind, types.UnionType) else [kind]
-    )
-    wanted = kinds[0]
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if wanted is float and number and math.isfinite(value):
+    if kind is float and number and math.isfinite(value):
         return float(value)
-    if type(value) is wanted and wanted is not float:
+    if type(value) is kind and kind is not float:
         return value
-    raise RecipeError(f"{place} = {value!r}; write a {'finite number' if wanted is float else wanted.__name__}")
+    raise RecipeError(f"{place} = {value!r}; write a {'finite number' if kind is float else kind.__name__}")
 
 
 def _suggest(key: str, known: typing.Iterable[str]) -> str:

@@ -79,6 +79,8 @@ def simulate(recipe: Recipe) -> Truth:
         The recipe asks for something that no test can be, such as an effect that moves no reading.
     """
     seed = check_recipe(recipe).campaign.seed
+    if recipe.record is not None:
+        raise RecipeError("this recipe asks for a [record]; use simulate_record, or remove the table")
     schedule = make_schedule(recipe.test, seed)
     grid_s = np.arange(-60.0 * recipe.table.preheat_min, schedule.duration_s + 10 * GRID_STEP_S, GRID_STEP_S)
     duty = duty_levels(recipe.duty, grid_s, seed)
