@@ -9,15 +9,16 @@ A user's own effect is an :class:`Effect` under the entry-point group ``thermofu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 
 import numpy as np
-from interferometry.compensation import air_index
 from numpy.typing import NDArray
 
+from fusion.episodes import cycle_starts, event_instants, instants_near, jumps, sensor_jumps, stuck_sensors
 from fusion.readings import Readings, Series
+from interferometry.compensation import air_index
 
 Array = NDArray[np.float64]
 Parameters = dict[str, float | str]
@@ -29,12 +30,6 @@ LAGS_MIN = (5.0, 7.5, 11.0, 17.0, 25.0, 38.0, 57.0, 86.0, 130.0, 195.0)
 _STATE_LAGS_MIN = (10.0, 20.0, 40.0, 80.0, 160.0)
 WARM_UPS_MIN = (15.0, 30.0, 60.0, 120.0)
 LASER_WARM_UPS_MIN = (3.0, 6.0, 12.0, 24.0)
-#: Instants per cycle at which an event is tried: a knock may come at any target, and is dated to a quarter of a cycle.
-_EVENTS_PER_CYCLE = 4
-#: An event needs this many cycles on either side, or it cannot be told from an outlier.
-_EVENT_MARGIN_CYCLES = 2
-#: A jump in a log or in the field counts as one where it exceeds its neighbours' changes this many times (robust sigma).
-_JUMP_SIGMAS = 8.0
 
 
 @dataclass(frozen=True)
@@ -56,7 +51,8 @@ class Effect:
     name : as in results.json
     physics : one paragraph for the report
     source : where the signature comes from
-    members : from the readings and the coefficients of the current model to the members that can be tried
+    members : from the readings, the coefficients of the current model and, for a closer look, a member near which to search, to the
+        members that can be tried
     needs : why it cannot be tried with these readings, or None
     excited_by : ``"field"`` or ``"driver"`` where the effect is only told apart by switching of that kind, else ``""``
     """
@@ -64,7 +60,7 @@ class Effect:
     name: str
     physics: str
     source: str
-    members: Callable[[Readings, Mapping[str, float]], Iterator[Member]]
+    members: Callable[[Readings, Mapping[str, float], Member | None], Iterator[Member]]
     needs: Callable[[Readings], str | None] = field(default=lambda readings: None)
     excited_by: str = ""
 
@@ -83,8 +79,8 @@ def table_offset_column(readings: Readings) -> Array:
     return readings.at(readings.series["mean_rise"])
 
 
-def _declared(name: str) -> Callable[[Readings, Mapping[str, float]], Iterator[Member]]:
-    def members(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
+def _declared(name: str) -> Callable[[Readings, Mapping[str, float], Member | None], Iterator[Member]]:
+    def members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
         if name == "axis_expansion":
             yield Member(_column(axis_expansion_column(readings)), {}, ("ppm/K",))
         else:
@@ -119,24 +115,34 @@ def warm_up(readings: Readings, minutes: float) -> Array:
     return 1.0 - np.exp(-readings.seconds / (60.0 * minutes))
 
 
-def _states(readings: Readings) -> Iterator[tuple[Array, Parameters]]:
+def _near(near: Member | None, parameter: str, grid: Iterable[float], *, ratio: float) -> tuple[float, ...]:
+    """The grid of a parameter, or a finer one within a factor of what was found."""
+    if near is None:
+        return tuple(grid)
+    found = float(near.parameters[parameter])
+    return (0.0,) if found == 0.0 else tuple(float(found * factor) for factor in np.geomspace(1 / ratio, ratio, 11))
+
+
+def _states(readings: Readings, near: Member | None) -> Iterator[tuple[Array, Parameters]]:
     """Thermal states that a part of the machine may follow: lagged table, lagged drivers, a plain warm-up."""
     if "mean_rise" in readings.series:
-        for minutes in (0.0, *_STATE_LAGS_MIN):
+        for minutes in _near(near, "time_constant_min", (0.0, *_STATE_LAGS_MIN), ratio=2.0):
             lagged = readings.series["mean_rise"].lagged(60.0 * minutes)
             yield readings.at(lagged), {"follows": "mean_rise", "time_constant_min": minutes}
     for name in readings.drivers:
-        for minutes in (5.0, *_STATE_LAGS_MIN):
+        for minutes in _near(near, "time_constant_min", (5.0, *_STATE_LAGS_MIN), ratio=2.0):
             lagged = readings.series[name].lagged(60.0 * minutes, at_rest=0.0)
             yield readings.at(lagged), {"follows": name, "time_constant_min": minutes}
-    for minutes in WARM_UPS_MIN:
+    for minutes in _near(near, "time_constant_min", WARM_UPS_MIN, ratio=2.0):
         yield warm_up(readings, minutes), {"follows": "warm_up", "time_constant_min": minutes}
 
 
-def _thermal_lag(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
+def _thermal_lag(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
     # Between two frames the field is a straight line; a shorter lag is not in the data.
     frames_min = float(np.median(np.diff(readings.series["mean_rise"].seconds))) / 60.0
-    for minutes in (minutes for minutes in LAGS_MIN if minutes >= 2.0 * frames_min):
+    for minutes in _near(near, "time_constant_min", LAGS_MIN, ratio=1.5):
+        if minutes < 2.0 * frames_min:
+            continue
         axis = readings.at(readings.series["axis_integral"].lagged(60.0 * minutes)) * 1e-3
         offset = readings.at(readings.series["mean_rise"].lagged(60.0 * minutes))
         yield Member(_column(offset), {"time_constant_min": minutes, "shape": "flat"}, ("um/K",))
@@ -145,10 +151,10 @@ def _thermal_lag(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]
         yield Member(_column(offset, axis), both, ("um/K", "ppm/K"))
 
 
-def _unseen_heat_source(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
+def _unseen_heat_source(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
     for name in readings.drivers:
         unit = readings.series[name].units
-        for minutes in LAGS_MIN:
+        for minutes in _near(near, "time_constant_min", LAGS_MIN, ratio=1.5):
             state = readings.at(readings.series[name].lagged(60.0 * minutes, at_rest=0.0))
             found: Parameters = {"follows": name, "time_constant_min": minutes}
             per = (f"um/({unit})",)
@@ -164,26 +170,26 @@ def refractivity_change_ppm(readings: Readings) -> Array:
     return np.asarray((index - index[0]) * 1e6, float)
 
 
-def _dead_path(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
+def _dead_path(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
     yield Member(_column(refractivity_change_ppm(readings) * 1e-3), {}, ("mm",))
 
 
-def _air_index(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
+def _air_index(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
     yield Member(_column(refractivity_change_ppm(readings) * 1e-3 * readings.position_mm), {}, ("1",))
 
 
-def _material_compensation(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
+def _material_compensation(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
     material = readings.at(readings.series["material_temperature"])
     yield Member(_column((material - material[0]) * readings.position_mm * 1e-3), {}, ("ppm/K",))
 
 
-def _angular_growth(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
-    for state, found in _states(readings):
+def _angular_growth(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+    for state, found in _states(readings, near):
         yield Member(_column(state * readings.share**2), found, (_state_unit(readings, found),))
 
 
-def _reversal_drift(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
-    for state, found in _states(readings):
+def _reversal_drift(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+    for state, found in _states(readings, near):
         yield Member(_column(state * 0.5 * readings.sign), found, (_state_unit(readings, found),))
 
 
@@ -196,25 +202,11 @@ def _needs_both_directions(readings: Readings) -> str | None:
     return None if np.unique(readings.sign).size == 2 else "only one direction of approach was measured"
 
 
-def cycle_starts(readings: Readings) -> Array:
-    """Time of the first reading of every cycle, s."""
-    numbers = np.unique(readings.cycle)
-    return np.array([readings.seconds[readings.cycle == number].min() for number in numbers])
-
-
-def event_instants(readings: Readings) -> Array:
-    """Instants at which an event is tried: quarters of every cycle that has enough cycles on both sides."""
-    starts = cycle_starts(readings)
-    margin = _EVENT_MARGIN_CYCLES
-    if starts.size <= 2 * margin + 1:
-        return np.empty(0)
-    inner = starts[margin : starts.size - margin + 1]
-    parts = np.arange(_EVENTS_PER_CYCLE) / _EVENTS_PER_CYCLE
-    return (inner[:-1, None] + np.diff(inner)[:, None] * parts).ravel()
-
-
-def _step_event(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
-    for instant in event_instants(readings):
+def _step_event(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+    instants = (
+        event_instants(readings) if near is None or near.event_s is None else instants_near(readings, near.event_s)
+    )
+    for instant in instants:
         yield Member(_column((readings.seconds >= instant).astype(float)), {"time_s": float(instant)}, ("um",), instant)
 
 
@@ -230,8 +222,9 @@ def periods_min(readings: Readings) -> Array:
     return np.asarray(1.0 / frequencies[np.abs(frequencies - order * cycle) > 4.0 / span])
 
 
-def _periodic_disturbance(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
-    for period in periods_min(readings):
+def _periodic_disturbance(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+    periods = periods_min(readings) if near is None else _close_periods(readings, float(near.parameters["period_min"]))
+    for period in periods:
         phase = 2 * np.pi * readings.seconds / (60.0 * period)
         waves = _column(np.cos(phase), np.sin(phase))
         yield Member(waves, {"period_min": float(period), "shape": "flat"}, ("um", "um"))
@@ -257,14 +250,25 @@ def aliased_lead_mm(readings: Readings, frequency: float) -> str:
     return ", ".join(f"{lead:.3g}" for lead in sorted(leads, reverse=True)) + " mm"
 
 
-def _pitch_error(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
+def _close_periods(readings: Readings, found_min: float) -> Array:
+    """Periods around one that was found, as close as the record can tell apart."""
+    span = float(readings.seconds[-1] - readings.seconds[0]) / 60.0
+    return np.asarray(1.0 / (1.0 / found_min + np.linspace(-0.5, 0.5, 21) / span))
+
+
+def _pitch_error(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
     slow = {0.0, 40.0, 60.0}
-    states = [(state, found) for state, found in _states(readings) if found["time_constant_min"] in slow]
-    for frequency in spatial_frequencies(readings):
+    states = [pair for pair in _states(readings, near) if near is not None or pair[1]["time_constant_min"] in slow]
+    frequencies = spatial_frequencies(readings)
+    if near is not None:
+        frequencies = 1.0 / float(near.parameters["period_mm"]) + np.linspace(-0.25, 0.25, 5) / np.ptp(
+            readings.positions_mm
+        )
+    for frequency in frequencies:
         phase = 2 * np.pi * frequency * readings.position_mm
         waves = _column(np.cos(phase), np.sin(phase))
         for state, found in states:
-            parameters = {
+            parameters: Parameters = {
                 **found,
                 "period_mm": float(1 / frequency),
                 "possible_leads": aliased_lead_mm(readings, frequency),
@@ -272,8 +276,8 @@ def _pitch_error(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]
             yield Member(waves * state[:, None], parameters, (_state_unit(readings, found),) * 2)
 
 
-def _laser_warm_up(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
-    for minutes in LASER_WARM_UPS_MIN:
+def _laser_warm_up(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+    for minutes in _near(near, "time_constant_min", LASER_WARM_UPS_MIN, ratio=2.0):
         settling = 1.0 - warm_up(readings, minutes)
         linear = settling * readings.position_mm * 1e-3
         yield Member(_column(linear), {"time_constant_min": minutes, "shape": "linear"}, ("ppm",))
@@ -281,25 +285,7 @@ def _laser_warm_up(readings: Readings, _: Mapping[str, float]) -> Iterator[Membe
         yield Member(_column(linear, settling), both, ("ppm", "um"))
 
 
-def jumps(series: Series) -> list[tuple[float, float, float]]:
-    """Isolated jumps of a series: time before and after (s) and size, where one change stands far out of its neighbours.
-
-    A change is compared with the median of the six around it, in units of the series' own robust scatter of that difference.
-    """
-    values = series.values if series.values.ndim == 1 else series.values.mean(axis=1)
-    changes = np.diff(values)
-    if changes.size < 9:
-        return []
-    excess = np.empty_like(changes)
-    for k in range(changes.size):
-        low, high = max(0, k - 3), min(changes.size, k + 4)
-        excess[k] = changes[k] - np.median(np.delete(changes[low:high], k - low))
-    scatter = 1.4826 * np.median(np.abs(excess - np.median(excess)))
-    found = np.flatnonzero(np.abs(excess) > _JUMP_SIGMAS * max(scatter, 1e-9))
-    return [(float(series.seconds[k]), float(series.seconds[k + 1]), float(excess[k])) for k in found]
-
-
-def _camera_offset(readings: Readings, coefficients: Mapping[str, float]) -> Iterator[Member]:
+def _camera_offset(readings: Readings, coefficients: Mapping[str, float], near: Member | None) -> Iterator[Member]:
     weight = _field_weight(readings, coefficients)
     for before, after, size in jumps(readings.series["mean_rise"]):
         seen = np.clip((readings.seconds - before) / (after - before), 0.0, 1.0)
@@ -319,7 +305,7 @@ def _needs_jump(readings: Readings) -> str | None:
     return None if jumps(readings.series["mean_rise"]) else "no frame jumps against its neighbours"
 
 
-def _reflected_source(readings: Readings, coefficients: Mapping[str, float]) -> Iterator[Member]:
+def _reflected_source(readings: Readings, coefficients: Mapping[str, float], near: Member | None) -> Iterator[Member]:
     patterns = readings.series["pattern_mean_rise"]
     lines = readings.series["pattern_axis_integral"]
     count = patterns.values.shape[1]
@@ -339,7 +325,7 @@ def _needs_patterns(readings: Readings) -> str | None:
     return None
 
 
-def _sensor_fault(readings: Readings, _: Mapping[str, float]) -> Iterator[Member]:
+def _sensor_fault(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
     for name, before, after, size in sensor_jumps(readings):
         late = (readings.seconds >= 0.5 * (before + after)).astype(float)
         jumped: Parameters = {"sensor": name, "time_s": after, "jump": size}
@@ -348,30 +334,6 @@ def _sensor_fault(readings: Readings, _: Mapping[str, float]) -> Iterator[Member
         since = np.clip(readings.seconds - start, 0.0, None) / 3600.0
         stuck: Parameters = {"sensor": name, "time_s": start, "jump": 0.0}
         yield Member(_column(since * readings.position_mm * 1e-3), stuck, ("ppm/h",), event_s=start)
-
-
-def sensor_jumps(readings: Readings) -> list[tuple[str, float, float, float]]:
-    """Isolated jumps in the environment log: sensor, time before and after (s), size in the sensor's unit."""
-    logged = ("air_temperature", "air_pressure", "relative_humidity", "material_temperature")
-    present = [name for name in logged if name in readings.series]
-    return [(name, *jump) for name in present for jump in jumps(readings.series[name])]
-
-
-def stuck_sensors(readings: Readings) -> list[tuple[str, float]]:
-    """Sensors that stop to move until the end of the log, and since when (s): a run of equal values ten times the usual one."""
-    found = []
-    for name in ("air_temperature", "air_pressure", "material_temperature"):
-        if name not in readings.series:
-            continue
-        series = readings.series[name]
-        moved = np.flatnonzero(np.diff(series.values) != 0.0)
-        if moved.size < 10:
-            continue
-        last = int(moved[-1]) + 1
-        usual = float(np.quantile(np.diff(moved), 0.95))
-        if series.values.size - last > 10 * usual:
-            found.append((name, float(series.seconds[last])))
-    return found
 
 
 def _needs_sensor_episode(readings: Readings) -> str | None:

@@ -15,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.effects import Member
-from interferometry.statespace import Array, DriftFit, DriftSystem
+from interferometry.statespace import Array, DriftFit, DriftSystem, fit_fixed_effects
 
 #: log10 factors on the two drift variances: as estimated, or less drift in one or both, down to hardly any.
 _GRID = ((0.0, 0.0), (-1.0, 0.0), (-2.5, 0.0), (0.0, -1.0), (0.0, -2.5), (-1.0, -1.0), (-2.5, -2.5), (0.5, 0.5))
 #: A candidate of which the model explains all but this share adds nothing that these data can show.
 _SEPARABLE_SHARE = 1e-4
-_DRAWS = 200
+DRAWS = 200
+#: log10 factors on a drift variance among which the plausible ones are drawn.
+_PLAUSIBLE = np.array([-2.0, -1.0, -0.5, 0.0, 0.5, 1.0])
 #: Effects with a larger p-value are not confirmed on unused readings, because they will not enter anyway.
 _WORTH_CONFIRMING = 0.1
 
@@ -112,11 +114,17 @@ class Judge:
         corrected = [replace(score, family_wise_p=1.0 - (1.0 - score.p_value) ** tried) for score in scores]
         return sorted(corrected, key=lambda score: -score.excess)
 
+    def strongest(self, members: Sequence[Member]) -> int:
+        """Place of the member with the largest gain."""
+        columns = np.concatenate([member.columns for member in members], axis=1)
+        widths = np.array([member.columns.shape[1] for member in members])
+        gains, _, separable = self._gains(columns, widths)
+        return int(np.argmax(np.where(separable, gains[:, 0], -np.inf)))
+
     def _systems(self) -> list[DriftSystem]:
         system = self.fit.system
-        components = system.loadings.shape[1]
-        factors = [np.resize(10.0 ** np.asarray(pair), components) for pair in _GRID]
-        return [replace(system, ratios=system.ratios * factor) for factor in factors]
+        centre = np.maximum(system.ratios, _least_ratio(system))
+        return [replace(system, ratios=centre * np.resize(10.0 ** np.asarray(pair), centre.size)) for pair in _GRID]
 
     def _gains(self, columns: Array, widths: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
         """Log-likelihood gain of every member for the response and every draw (members, 1 + draws)."""
@@ -142,7 +150,8 @@ class Judge:
             best_grid[better] = place
             best = np.maximum(best, likelihood)
             separable |= separate
-        return best - best_null[None, :], best_grid, separable
+        # A further coefficient must earn its keep (Akaike): the simpler of two members that fit alike is preferred.
+        return best - best_null[None, :] - (widths - 1.0)[:, None], best_grid, separable
 
     def _held_out(self, member: Member, place: int) -> tuple[float, float]:
         """Gain in squared whitened error on unused readings, coefficients frozen, and its chance where nothing is missing."""
@@ -150,10 +159,8 @@ class Judge:
         responses = np.column_stack([self.fit.response, self.draws])
         everything, _ = system.whiten(np.column_stack([responses, self.fit.design, member.columns]))
         y, x, c = np.split(everything, [responses.shape[1], responses.shape[1] + self.fit.design.shape[1]], axis=1)
-        if member.event_s is not None:
-            gain = _gain_across(_without(x, y), _without(x, c), self.halves)
-        else:
-            gain = self._gain_in_time(y, x, c)
+        across = member.event_s is not None
+        gain = _gain_across(_without(x, y), _without(x, c), self.halves) if across else self._gain_in_time(y, x, c)
         noise = _without(x, y[:, :1]).var()
         return float(gain[0] / (2.0 * noise)), float((1 + (gain[1:] >= gain[0]).sum()) / gain.size)
 
@@ -225,7 +232,32 @@ def tail_probability(value: float, null: Array) -> float:
     return float(0.1 * np.exp(-(value - threshold) / excess))
 
 
-def simulate_null(fit: DriftFit, rng: np.random.Generator, *, draws: int = _DRAWS) -> Array:
+def plausible_ratios(fit: DriftFit, rng: np.random.Generator, *, draws: int) -> Array:
+    """Drift variance ratios (draws, components) that the readings leave possible, drawn by their restricted likelihood.
+
+    A drift that was estimated as zero may well be there; simulating none would make every slow chance look like a find.
+    """
+    centre = np.maximum(fit.system.ratios, _least_ratio(fit.system))
+    components = centre.size
+    exponents = np.stack(np.meshgrid(*[_PLAUSIBLE] * components, indexing="ij"), axis=-1).reshape(-1, components)
+    candidates = centre * 10.0**exponents
+    likelihood = np.array(
+        [
+            fit_fixed_effects(replace(fit.system, ratios=ratios), fit.response, fit.design).log_likelihood
+            for ratios in candidates
+        ]
+    )
+    weight = np.exp(likelihood - likelihood.max())
+    return candidates[rng.choice(weight.size, size=draws, p=weight / weight.sum())]
+
+
+def _least_ratio(system: DriftSystem) -> float:
+    """Variance ratio of a drift that ends a quarter of one reading's noise away: less can hardly be told from none."""
+    span = float(system.seconds[-1] - system.seconds[0])
+    return 0.0625 / span if system.order == 1 else 3.0 * 0.0625 / span**3
+
+
+def simulate_null(fit: DriftFit, rng: np.random.Generator, *, draws: int = DRAWS) -> Array:
     """Responses (n, draws) in which only the model's drift and noise act; the noise is drawn from the fit's residuals.
 
     Fixed effects are left out, because every score is the same whatever they are.
@@ -234,8 +266,8 @@ def simulate_null(fit: DriftFit, rng: np.random.Generator, *, draws: int = _DRAW
     relative = noise / np.sqrt(np.maximum(share, 1e-12))
     drawn = rng.choice(relative, size=(noise.size, draws)) * np.sqrt(fit.system.variance)[:, None]
     steps = np.diff(fit.system.seconds, prepend=fit.system.seconds[0])
-    for ratio, loading in zip(fit.system.ratios, fit.system.loadings.T, strict=True):
-        scale = fit.sigma * np.sqrt(ratio)
+    ratios = plausible_ratios(fit, rng, draws=draws)
+    for ratio, loading in zip(ratios.T, fit.system.loadings.T, strict=True):
         shocks = rng.standard_normal((noise.size, draws)) * np.sqrt(steps)[:, None]
         if fit.system.order == 1:
             drift = np.cumsum(shocks, axis=0)
@@ -244,5 +276,5 @@ def simulate_null(fit: DriftFit, rng: np.random.Generator, *, draws: int = _DRAW
             before = np.vstack([np.zeros(draws), rate[:-1]])
             own = 0.5 * shocks + rng.standard_normal(shocks.shape) * np.sqrt(steps / 12.0)[:, None]
             drift = np.cumsum((before + own) * steps[:, None], axis=0)
-        drawn += scale * drift * loading[:, None]
+        drawn += fit.sigma * np.sqrt(ratio) * drift * loading[:, None]
     return drawn

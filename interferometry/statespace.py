@@ -32,6 +32,9 @@ _LOG_RATIO_LIMITS = (-14.0, 4.0)
 _OUTLIER_LIMIT = 3.0
 #: A whitened column of which less than this share is not explained by the others counts as dependent.
 _DEPENDENCE_TOLERANCE = 1e-10
+#: A drift is called smooth (integrated walk) only on this much more restricted log-likelihood: where both fit, the rougher one is
+#: the safer nuisance, because it claims less of what lies ahead.
+_SMOOTH_MARGIN = 2.0
 _ROBUST_ROUNDS = 2
 _ROBUST_PASSES = 3
 
@@ -487,11 +490,10 @@ def estimate(
 
     neutral = np.ones(loadings.shape[1])
     if order is None:
-        first = _maximise(system(1, neutral), response, with_trends, None)
-        second = _maximise(system(2, neutral), response, with_trends, None)
-        order, start = (
-            (1, first.system.ratios) if first.log_likelihood >= second.log_likelihood else (2, second.system.ratios)
-        )
+        walk = _maximise(system(1, neutral), response, with_trends, None)
+        smooth = _maximise(system(2, neutral), response, with_trends, None)
+        order = 2 if smooth.log_likelihood > walk.log_likelihood + _SMOOTH_MARGIN else 1
+        start = (walk if order == 1 else smooth).system.ratios
     columns = design if order == 1 else with_trends
     fit = _maximise(system(order, neutral), response, columns, start)
     if robust:

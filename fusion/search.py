@@ -1,0 +1,129 @@
+"""L4 - The search for an effect that a model lacks, on the readings that it may use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.effects import Effect, Member
+from fusion.episodes import cycle_starts
+from fusion.gates import blocked_reason
+from fusion.model import ModelFit, Term, fit_model
+from fusion.readings import Readings
+from fusion.scoring import DRAWS, FamilyScore, Judge, simulate_null
+
+#: Chance of adding an effect where nothing is missing, over the whole search.
+ENTRY_LEVEL = 0.05
+#: Chance that an effect which is not there passes its confirmation on unused readings; the search has been paid for already.
+CONFIRMATION_LEVEL = 0.2
+_BLOCKS = 10
+_MAY_REPEAT = frozenset({"step_event", "camera_offset", "sensor_fault", "periodic_disturbance"})
+
+
+class SearchError(ValueError):
+    """An effect does not keep its promises; the message names it."""
+
+
+class Search:
+    """The search on the readings that are not sealed."""
+
+    def __init__(
+        self,
+        readings: Readings,
+        used: NDArray[np.bool_],
+        effects: Mapping[str, Effect],
+        rng: np.random.Generator,
+    ) -> None:
+        self.readings, self.used, self.effects, self.rng = readings, used, effects, rng
+        self.not_tried = {
+            name: reason for name, effect in effects.items() if (reason := effect.needs(readings)) is not None
+        }
+        self.blocked: dict[str, str] = {}
+
+    def fit(self, terms: Sequence[Term], like: ModelFit | None = None) -> ModelFit:
+        """Fit terms to the readings that are not sealed."""
+        return fit_model(self.readings, terms, used=self.used, like=like.fit if like else None)
+
+    def _families(self, model: ModelFit) -> dict[str, list[Member]]:
+        present = {term.effect for term in model.terms}
+        families = {}
+        for name, effect in self.effects.items():
+            if name in self.not_tried:
+                continue
+            if name in present and name not in _MAY_REPEAT:
+                continue
+            families[name] = list(effect.members(self.readings, model.coefficients(), None))
+        return families
+
+    def scores(self, model: ModelFit) -> list[FamilyScore]:
+        """Score the whole library against the model, on the readings the model was fitted to."""
+        families = {
+            name: [
+                _on(member, model.used) for member in members if member.event_s is None or self._inside(member, model)
+            ]
+            for name, members in self._families(model).items()
+        }
+        return self._judge(model).score({name: members for name, members in families.items() if members})
+
+    def _inside(self, member: Member, model: ModelFit) -> bool:
+        starts = cycle_starts(self.readings.subset(model.used))
+        return member.event_s is not None and starts[2] <= member.event_s <= starts[-2]
+
+    def _judge(self, model: ModelFit, *, draws: int = DRAWS) -> Judge:
+        part = self.readings.subset(model.used)
+        numbers = np.unique(part.cycle)
+        blocks = np.searchsorted(numbers, part.cycle) * _BLOCKS // numbers.size
+        return Judge(model.fit, simulate_null(model.fit, self.rng, draws=draws), blocks, part.target_index % 2 == 0)
+
+    def choose(
+        self, scores: Sequence[FamilyScore], model: ModelFit, *, level: float = ENTRY_LEVEL
+    ) -> FamilyScore | None:
+        """Best effect that is significant, confirmed and not blocked, its parameters refined."""
+        for score in scores:
+            if score.member is None or score.family_wise_p > level or score.held_out_p > CONFIRMATION_LEVEL:
+                continue
+            if self.blocked.get(score.name, "").startswith("withdrawn"):
+                continue
+            part = self.readings.subset(model.used)
+            reason = blocked_reason(self.effects[score.name], score.member, part, model, scores)
+            if reason is not None:
+                self.blocked[score.name] = reason
+                continue
+            return self._refined(score, model)
+        return None
+
+    def _refined(self, score: FamilyScore, model: ModelFit) -> FamilyScore:
+        """The best member in the neighbourhood of the one that was found, with its columns for all readings."""
+        found = member_of(score)
+        near = [
+            member
+            for member in self.effects[score.name].members(self.readings, model.coefficients(), found)
+            if _same_kind(member, found) and (member.event_s is None or self._inside(member, model))
+        ]
+        if not near:
+            raise SearchError(
+                f"effect {score.name!r} offers no member near one it offered before: {dict(found.parameters)}"
+            )
+        best = self._judge(model, draws=0).strongest([_on(member, model.used) for member in near])
+        return FamilyScore(**{**vars(score), "member": near[best]})
+
+
+def _same_kind(member: Member, found: Member) -> bool:
+    """Alike in what is a word (shape, driver); numbers may differ."""
+    words = {
+        name: value for name, value in found.parameters.items() if isinstance(value, str) and name != "possible_leads"
+    }
+    return all(member.parameters.get(name) == value for name, value in words.items())
+
+
+def _on(member: Member, used: NDArray[np.bool_]) -> Member:
+    return Member(member.columns[used], member.parameters, member.units, member.event_s)
+
+
+def member_of(score: FamilyScore) -> Member:
+    """Best member of a scored effect."""
+    if score.member is None:
+        raise SearchError(f"effect {score.name!r} has no member that can be told from the model")
+    return score.member

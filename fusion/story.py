@@ -1,0 +1,193 @@
+"""L4 - What the closed loop has to tell: the steps it took, their errors and uncertainties, and the verdict, as results.json says it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.adequacy import Remainder
+from fusion.model import ModelFit, Term
+from fusion.readings import Readings
+from fusion.scoring import FamilyScore
+from interferometry.statespace import Array
+
+#: Effects whose log-likelihoods differ by less than this (odds of 20 to 1) are reported as a tie.
+TIE_GAIN = 3.0
+#: An effect that is not even significant alone is no rival.
+_RIVAL_LEVEL = 0.05
+
+
+@dataclass(frozen=True)
+class Step:
+    """An effect that was added.
+
+    Attributes
+    ----------
+    effect, parameters, coefficients : what was added; coefficients by unit as (value, standard uncertainty), from all cycles
+    p_value : chance that the search adds any effect where nothing is missing
+    held_out_p : chance of its gain on unused readings where it is not there
+    rmse_before_um, rmse_after_um : open-loop error on the sealed cycles without and with it
+    rms_um : size of its contribution, root mean square after the static profile is removed
+    tied : effects that these data cannot tell from it
+    runner_up : the next best effect, its gain and how far behind it is in log-likelihood
+    confirmed : how it was confirmed
+    """
+
+    effect: str
+    parameters: Mapping[str, float | str]
+    coefficients: list[dict[str, float | str]]
+    p_value: float
+    held_out_p: float
+    rmse_before_um: float
+    rmse_after_um: float
+    rms_um: float
+    tied: list[str]
+    runner_up: dict[str, float | str]
+    confirmed: str
+
+
+@dataclass(frozen=True)
+class LoopResult:
+    """Everything the loop found; see DESIGN of results.json for the meaning of the verdicts."""
+
+    declared: list[str]
+    declared_coefficients: list[dict[str, float | str]]
+    held_out: str
+    noise_floor_um: float
+    rmse_persistence_um: float
+    rmse_declared_um: float
+    rmse_final_um: float
+    steps: list[Step]
+    verdict: str
+    remainder: Remainder
+    rounds: list[list[FamilyScore]]
+    not_tried: dict[str, str]
+    blocked: dict[str, str]
+    nuisance: dict[str, float | str]
+    before: ModelFit
+    after: ModelFit
+    sealed: NDArray[np.bool_]
+
+    def as_json(self) -> dict[str, object]:
+        """The ``loop`` part of results.json."""
+        return {
+            "declared": self.declared,
+            "declared_coefficients": self.declared_coefficients,
+            "held_out": self.held_out,
+            "noise_floor_um": self.noise_floor_um,
+            "rmse_persistence_um": self.rmse_persistence_um,
+            "rmse_declared_um": self.rmse_declared_um,
+            "rmse_final_um": self.rmse_final_um,
+            "steps": [_step_json(step) for step in self.steps],
+            "verdict": self.verdict,
+            "unexplained": {
+                "shape": self.remainder.shape,
+                "rms_um": self.remainder.rms_um,
+                "p_value": self.remainder.p_value,
+                "nearest": self.rounds[-1][0].name if self.remainder.shape and self.rounds and self.rounds[-1] else "",
+            },
+            "nuisance": self.nuisance,
+            "search": [[_score_json(score) for score in scores] for scores in self.rounds],
+            "not_tried": self.not_tried,
+            "blocked": self.blocked,
+        }
+
+
+def _step_json(step: Step) -> dict[str, object]:
+    return {**vars(step), "parameters": dict(step.parameters)}
+
+
+def _score_json(score: FamilyScore) -> dict[str, object]:
+    return {
+        "effect": score.name,
+        "parameters": dict(score.member.parameters) if score.member else {},
+        "gain": score.gain,
+        "excess_gain": score.excess,
+        "p_value": score.p_value,
+        "family_wise_p": score.family_wise_p,
+        "held_out_gain": score.held_out_gain,
+        "held_out_p": score.held_out_p,
+        "share_not_separable": score.collinear,
+    }
+
+
+def coefficients_of(model: ModelFit, term: Term) -> list[dict[str, float | str]]:
+    """Coefficients of a term with their standard uncertainty and unit."""
+    place = model.place(term)
+    values, u = model.fit.coefficients[place], model.fit.coefficients_u[place]
+    return [
+        {"value": float(value), "u": float(spread), "unit": unit}
+        for value, spread, unit in zip(values, u, term.member.units, strict=True)
+    ]
+
+
+def _size(model: ModelFit, term: Term) -> float:
+    """Root mean square of a term's contribution after its mean at every site is removed, um."""
+    series = model.series(term)[0]
+    site = model.readings.target_index * 2 + (model.readings.sign < 0)
+    total = np.bincount(site, series, minlength=site.max() + 1)
+    number = np.maximum(np.bincount(site, minlength=site.max() + 1), 1)
+    return float(np.sqrt(np.mean((series - (total / number)[site]) ** 2)))
+
+
+def make_step(
+    model: ModelFit, term: Term, score: FamilyScore, scores: list[FamilyScore], before: float, after: float
+) -> Step:
+    """Describe an added effect: the score that let it in, all scores of its round, the error on the sealed cycles before and after."""
+    others = [other for other in scores if other.name != score.name and other.member is not None]
+    tied = [other.name for other in others if other.p_value < _RIVAL_LEVEL and score.excess - other.excess < TIE_GAIN]
+    runner_up: dict[str, float | str] = {}
+    if others:
+        runner_up = {
+            "effect": others[0].name,
+            "behind_by": score.excess - others[0].excess,
+            "p_value": others[0].family_wise_p,
+        }
+    way = "on the other half of the targets" if term.member.event_s is not None else "on later blocks of cycles"
+    return Step(
+        effect=term.effect,
+        parameters=term.member.parameters,
+        coefficients=coefficients_of(model, term),
+        p_value=score.family_wise_p,
+        held_out_p=score.held_out_p,
+        rmse_before_um=before,
+        rmse_after_um=after,
+        rms_um=_size(model, term),
+        tied=tied,
+        runner_up=runner_up,
+        confirmed=f"{way}, coefficients frozen",
+    )
+
+
+def rmse(errors: Array) -> float:
+    """Root mean square of errors, those of sites that a fit has never seen left out, um."""
+    return float(np.sqrt(np.nanmean(errors**2)))
+
+
+def persistence(readings: Readings, used: NDArray[np.bool_]) -> float:
+    """Error of predicting every sealed reading by its site's last reading before the seal, um."""
+    site = readings.target_index * 2 + (readings.sign < 0)
+    errors = []
+    for number in np.unique(site):
+        before = np.flatnonzero((site == number) & used)
+        after = np.flatnonzero((site == number) & ~used)
+        if before.size and after.size:
+            errors.append(readings.response[after] - readings.response[before[-1]])
+    return rmse(np.concatenate(errors))
+
+
+def nuisance_size(model: ModelFit) -> dict[str, float | str]:
+    """Size of the drift that nobody explains: common part in um, stretch in um at the end of the travel."""
+    drift, _ = model.fit.drift()
+    kind = "random walk" if model.fit.system.order == 1 else "integrated random walk"
+    rate = model.fit.drift_rate
+    return {
+        "kind": kind,
+        "common_rms_um": float(np.std(drift[:, 0])),
+        "stretch_rms_um": float(np.std(drift[:, 1])),
+        "common_um_per_sqrt_h" if model.fit.system.order == 1 else "common_um_in_1_h": float(rate[0]),
+        "stretch_um_per_sqrt_h" if model.fit.system.order == 1 else "stretch_um_in_1_h": float(rate[1]),
+    }
