@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import struct
+from typing import cast
 
+import cv2
 import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
@@ -62,20 +64,28 @@ def read_counts(source: FffSource, samples: Samples) -> NDArray[np.uint16]:
     # Rounded up to 8 bytes by the writers; the padding after the last frame's stream may be missing.
     data = source.read(samples.offset, min(samples.length, 2 * MAX_PIXELS))
     _check_stream(source, samples, data)
-    try:
-        decode = imagecodecs.png_decode if samples.encoding == "png" else imagecodecs.jpegls_decode
-        counts = decode(data)
-    except Exception as error:
+    decoded = _decode_png(data) if samples.encoding == "png" else _decode_jpegls(data)
+    if decoded is None:
+        raise source.error(samples.offset, f"a {samples.encoding} stream that decodes", "damaged data")
+    if decoded.shape != samples.shape or decoded.dtype != np.uint16:
         raise source.error(
-            samples.offset, f"a {samples.encoding} stream that decodes", str(error) or "garbage"
-        ) from error
-    if counts.shape != samples.shape or counts.dtype != np.uint16:
-        raise source.error(
-            samples.offset, f"{columns} x {rows} samples of 16 bit", f"shape {counts.shape} of {counts.dtype}"
+            samples.offset, f"{columns} x {rows} samples of 16 bit", f"shape {decoded.shape} of {decoded.dtype}"
         )
     if samples.encoding == "png" and samples.little_endian:
-        return counts.byteswap()
-    return counts
+        return decoded.byteswap()
+    return decoded
+
+
+def _decode_png(data: bytes) -> NDArray[np.uint16] | None:
+    # imagecodecs (2026.3) loses a reference to None with every damaged PNG, and some ten thousand of them end the interpreter.
+    return cast("NDArray[np.uint16] | None", cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))
+
+
+def _decode_jpegls(data: bytes) -> NDArray[np.uint16] | None:
+    try:
+        return cast("NDArray[np.uint16]", imagecodecs.jpegls_decode(data))
+    except imagecodecs.JpeglsError:
+        return None
 
 
 def _check_stream(source: FffSource, samples: Samples, data: bytes) -> None:

@@ -235,7 +235,7 @@ def _raw_record(counts: NDArray[np.uint16], encoding: Encoding) -> bytes:
         samples = native.astype("<u2", copy=False).tobytes()
     elif encoding == "png":
         # The cameras store the samples in the byte order of the record, which a PNG decoder then takes for big-endian.
-        samples = bytes(imagecodecs.png_encode(native.byteswap(), level=1))
+        samples = cv2.imencode(".png", native.byteswap(), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
     elif encoding == "jpegls":
         samples = _without_spiff(bytes(imagecodecs.jpegls_encode(native)))
         samples += bytes(-len(samples) % 8)

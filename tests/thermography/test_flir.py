@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -356,6 +357,22 @@ def test_bombs_and_garbage_streams_are_refused(
     path.write_bytes(data[:start] + data[start:].replace(old, new))
     with pytest.raises(FlirFormatError, match=message):
         read_frame(path)
+
+
+def test_thousands_of_damaged_pictures_leave_the_interpreter_alone(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    sequence(path, "png", frames=1)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"IDAT") + 10
+    data[at : at + 4] = b"abcd"
+    path.write_bytes(data)
+    (frame,), _ = index_frames([path])
+    before = sys.getrefcount(None)
+    for _ in range(2000):
+        with pytest.raises(FlirFormatError, match="expected a png stream that decodes, found damaged data"):
+            frame.read_counts()
+    # A decoder that loses references to None kills Python 3.11 after some ten thousand damaged frames.
+    assert abs(sys.getrefcount(None) - before) < 200
 
 
 def test_segments_must_be_complete_and_single(tmp_path: Path) -> None:
