@@ -4,6 +4,7 @@
 `simulate_campaign` does both from a RECIPE.toml.
 """
 
+from fusion.twin.camera import make_view
 from fusion.twin.datasets import deviations_of, fields_of
 from fusion.twin.instruments import simulate_campaign, truth_folder, write_campaign
 from fusion.twin.recipe import Recipe, RecipeError
@@ -20,6 +21,7 @@ __all__ = [
     "driver_log",
     "environment_log",
     "fields_of",
+    "make_view",
     "packaged_recipe",
     "read_recipe",
     "simulate",

@@ -36,6 +36,8 @@ SC660 = {
     "atmosphere_x": 1.9,
 }
 SUBSAMPLES = 8
+#: A bad pixel shows one value between these for ever.
+BAD_COUNTS = (12000, 30000)
 FIELD_STEP_MM = 1.0
 SURROUND_EMISSIVITY = 0.95
 
@@ -148,6 +150,9 @@ class Renderer:
         self.slope = float(counts_of(25.5) - counts_of(24.5))
         pattern = stream(truth.recipe.campaign.seed, "fixed pattern").standard_normal(shape)
         self.pattern = (self.camera.fixed_pattern_K * self.slope * pattern).astype(np.float32)
+        bad = stream(truth.recipe.campaign.seed, "bad pixels")
+        self.bad_places = bad.choice(pattern.size, self.camera.bad_pixels, replace=False)
+        self.bad_values = bad.integers(*BAD_COUNTS, self.camera.bad_pixels, dtype=np.uint16)
         self.transmission = air_transmission(
             self.camera.distance_mm * 1e-3, self.camera.atmospheric_temperature_degC, self.camera.relative_humidity
         )
@@ -174,7 +179,9 @@ class Renderer:
             counts = np.asarray(cv2.GaussianBlur(counts, (0, 0), self.camera.blur_px), np.float32)
         noise = self.noise.standard_normal(counts.shape, dtype=np.float32) * np.float32(self.camera.netd_K * self.slope)
         counts += noise + self.pattern + np.float32(float(frame["camera_offset_K"]) * self.slope)
-        return np.asarray(np.clip(np.rint(counts), 0, 65535), dtype=np.uint16)
+        digital = np.asarray(np.clip(np.rint(counts), 0, 65535), dtype=np.uint16)
+        digital.ravel()[self.bad_places] = self.bad_values
+        return digital
 
     def _radiance(self, surface: Image, scene: Scene, frame: xr.Dataset) -> Image:
         """Return noiseless counts: table, discs and surround each send what they emit and mirror, through the air."""

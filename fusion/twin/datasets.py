@@ -32,7 +32,7 @@ def deviations_of(truth: Truth) -> xr.Dataset:
 
 
 def fields_of(truth: Truth, *, cell_size_mm: float = 5.0, noise_K: float | None = None) -> xr.Dataset:
-    """Return the table's temperature per cycle on the plan grid, as a still camera with one frame per cycle would give it.
+    """Return the table's temperature per cycle on the plan grid, as the frames of a still table would give it.
 
     Parameters
     ----------
@@ -67,17 +67,21 @@ def fields_of(truth: Truth, *, cell_size_mm: float = 5.0, noise_K: float | None 
     pixels = _pixels_per_cell(truth, cell_size_mm)
     sigma = camera.netd_K / np.sqrt(pixels) if noise_K is None else noise_K
     seen += sigma * stream(truth.recipe.campaign.seed, "cell noise").standard_normal(seen.shape)
+    cycles, burst = truth.schedule.cycles, camera.frames_per_cycle
+    by_cycle = seen.reshape(cycles, burst, *seen.shape[1:])
+    mean = by_cycle.mean(axis=1)
     dims = ("cycle", "y", "x")
-    level = np.full(seen.shape, sigma)
+    level = np.full(mean.shape, sigma / np.sqrt(burst))
+    middle_s = truth.session.frame_s.reshape(cycles, burst).mean(axis=1)
     return xr.Dataset(
         {
-            "temperature": (dims, seen, {"units": "degC", "units_metadata": "temperature: on_scale"}),
+            "temperature": (dims, mean, {"units": "degC", "units_metadata": "temperature: on_scale"}),
             "temperature_u": (dims, level, KELVIN_RISE),
-            "temperature_rise": (dims, seen - seen[0], KELVIN_RISE),
+            "temperature_rise": (dims, mean - mean[0], KELVIN_RISE),
             "temperature_rise_u": (dims, np.sqrt(2.0) * level, KELVIN_RISE),
-            "temperature_spread": (dims, np.zeros(seen.shape), KELVIN_RISE),
-            "count": (dims, np.ones(seen.shape, dtype=np.int32), {"units": "1"}),
-            "cycle_time": ("cycle", truth.clock(truth.session.frame_s).astype("datetime64[ns]")),
+            "temperature_spread": (dims, by_cycle.std(axis=1), KELVIN_RISE),
+            "count": (dims, np.full(mean.shape, burst, dtype=np.int32), {"units": "1"}),
+            "cycle_time": ("cycle", truth.clock(middle_s).astype("datetime64[ns]")),
             "frame_temperature": (
                 ("time", "y", "x"),
                 seen,

@@ -22,8 +22,6 @@ from thermography.flir import CalibratedRange, CameraIdentity, CameraParameters,
 
 Progress = Callable[[int, int, str], None]
 TRUTH_CELL_MM = 2.5
-CAMERA_WARM_UP_K = 6.0
-CAMERA_WARM_UP_S = 1500.0
 IDENTITY = CameraIdentity(
     model="FLIR SC660", part="TWIN", serial="0", software="1.0", lens_model="FOL38", field_of_view_deg=23.9
 )
@@ -276,8 +274,7 @@ def _frames(truth: Truth, progress: Progress | None) -> Iterator[Frame]:
         **SC660,
     )
     times = truth.clock(truth.session.frame_s + camera.clock_offset_s)
-    housing = truth.session.at_frames(truth.session.air_degC) + KELVIN
-    housing += CAMERA_WARM_UP_K * (1.0 - np.exp(-truth.session.frame_s / CAMERA_WARM_UP_S))
+    housing = truth.frames["housing"].values + KELVIN
     for number, time in enumerate(times):
         yield Frame(
             counts=renderer.render(number),

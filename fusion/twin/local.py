@@ -1,4 +1,4 @@
-"""around - What can be wrong with a single target: extra scatter, its own heat, stick-slip, a step."""
+"""around - What can be wrong with a single target: extra scatter, its own heat, stick-slip, a step, a slow wander."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.twin.session import Session
+from fusion.twin.streams import first_order
 
 Floats = NDArray[np.floating[Any]]
 Anomaly = Callable[[Session, Floats, np.random.Generator, int], Floats]
@@ -35,9 +36,16 @@ def step(session: Session, local_rise_K: Floats, rng: np.random.Generator, at_cy
     return (session.cycle >= (at_cycle or session.cycles // 2 + 1)).astype(float)
 
 
+def wander(session: Session, local_rise_K: Floats, rng: np.random.Generator, at_cycle: int) -> Floats:
+    """The place moves slowly by itself, with a memory of 40 minutes; no cause that a campaign could show."""
+    step_s = session.grid_s[1] - session.grid_s[0]
+    return session.at_readings(first_order(rng.standard_normal(session.grid_s.size), step_s, 2400.0))
+
+
 ANOMALIES: dict[str, Anomaly] = {
     "structural": structural,
     "local_temperature": local_temperature,
     "stick_slip": stick_slip,
     "step": step,
+    "wander": wander,
 }

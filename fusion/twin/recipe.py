@@ -137,10 +137,17 @@ class Laser:
 
 @dataclass(frozen=True)
 class Camera:
-    """Pose, lens, detector and clock of the camera, and which frames it takes (SC660 constants throughout)."""
+    """Pose, lens, detector and clock of the camera, and which frames it takes (SC660 constants throughout).
+
+    Table "still": `frames_per_cycle` frames, `burst_interval_s` apart, `frame_after_s` after a cycle's last reading, at axis
+    position 0. Table "moving": a frame every `frame_interval_s` through the whole test. `drift_K_per_K`: by how much all
+    pixels read high per K that the camera's housing warms. `state_clock_offset`: whether the campaign file tells the offset.
+    """
 
     table: str = "still"
     frame_after_s: float = 30.0
+    frames_per_cycle: int = 1
+    burst_interval_s: float = 0.2
     frame_interval_s: float = 10.0
     file: str = "jpg"
     columns: int = 640
@@ -162,6 +169,8 @@ class Camera:
     fixed_pattern_K: float = 0.0
     ffc_step_K: float = 0.0
     ffc_interval_min: float = 15.0
+    drift_K_per_K: float = 0.0
+    bad_pixels: int = 0
     knock_cycle: int = 0
     knock_px: tuple[float, ...] = (3.0, 0.0)
     clock_offset_s: float = 0.0
@@ -180,7 +189,7 @@ class EffectRecipe:
 
 @dataclass(frozen=True)
 class AnomalyRecipe:
-    """One target that misbehaves: cause (structural, local_temperature, stick_slip, step), direction and rms in um."""
+    """One target that misbehaves: cause (structural, local_temperature, stick_slip, step, wander), direction and rms in um."""
 
     target: int
     kind: str = "structural"

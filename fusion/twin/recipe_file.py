@@ -43,7 +43,19 @@ POSITIVE = (
     ),
     ("duty", ("mean_hold_min",)),
     ("profile", ("lead_mm",)),
-    ("camera", ("focal_px", "distance_mm", "columns", "rows", "frame_interval_s", "ffc_interval_min")),
+    (
+        "camera",
+        (
+            "focal_px",
+            "distance_mm",
+            "columns",
+            "rows",
+            "frame_interval_s",
+            "frames_per_cycle",
+            "burst_interval_s",
+            "ffc_interval_min",
+        ),
+    ),
 )
 
 

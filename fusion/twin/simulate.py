@@ -25,6 +25,8 @@ from fusion.twin.streams import first_order, random_levels, stream
 
 Floats = NDArray[np.floating[Any]]
 GRID_STEP_S = 10.0
+CAMERA_WARM_UP_K = 6.0
+CAMERA_WARM_UP_S = 1500.0
 PROBE_AT_MM = (640.0, 30.0)
 
 
@@ -100,7 +102,11 @@ def simulate(recipe: Recipe) -> Truth:
         "nuisance": nuisance(recipe.drift, session, seed),
         "noise": laser_noise(recipe.laser, session, seed),
     }
-    camera = {"camera_offset_K": _ffc_steps(recipe, session), "reflected_K": np.zeros(session.frame_s.size)}
+    housing = session.at_frames(session.air_degC) + CAMERA_WARM_UP_K * (
+        1.0 - np.exp(-session.frame_s / CAMERA_WARM_UP_S)
+    )
+    own_drift = recipe.camera.drift_K_per_K * (housing - np.interp(0.0, grid_s, session.air_degC))
+    camera = {"camera_offset_K": _ffc_steps(recipe, session) + own_drift, "reflected_K": np.zeros(session.frame_s.size)}
     for effect in recipe.effect:
         seen = EFFECTS[effect.name].unit == "K"
         value = _scale_camera(effect, recipe, session) if seen else _scale(effect, recipe, session)
@@ -116,6 +122,7 @@ def simulate(recipe: Recipe) -> Truth:
         {name: ("frame", value, {"units": "K"}) for name, value in camera.items()}
         | {
             "time_s": ("frame", session.frame_s, {"units": "s", "long_name": "true time since the start of the test"}),
+            "housing": ("frame", housing, {"units": "degC", "long_name": "temperature of the camera's housing"}),
             "table_position": ("frame", schedule.table_position(session.frame_s), {"units": "mm"}),
             "knocked": ("frame", _knocked(recipe, session).astype(np.int8)),
         }
@@ -194,11 +201,17 @@ def _session(recipe: Recipe, schedule: Schedule, grid_s: Floats, duty: Floats, a
     """Collect what effects may look at."""
     camera = recipe.camera
     if camera.table == "still":
-        frame_s = np.arange(schedule.cycles) * schedule.period_s + schedule.last_reading_s + camera.frame_after_s
-        if schedule.last_reading_s + camera.frame_after_s >= schedule.period_s:
+        burst = (
+            schedule.last_reading_s
+            + camera.frame_after_s
+            + np.arange(camera.frames_per_cycle) * camera.burst_interval_s
+        )
+        if burst[-1] >= schedule.period_s:
             raise RecipeError(
-                f"camera.frame_after_s = {camera.frame_after_s} is after the cycle's end; lower it or raise test.period_s"
+                f"camera: the last frame of a cycle is due {burst[-1]:.1f} s after its start, past its end at {schedule.period_s:.1f} s; "
+                "lower frame_after_s or frames_per_cycle, or raise test.period_s"
             )
+        frame_s = (np.arange(schedule.cycles)[:, None] * schedule.period_s + burst).ravel()
     else:
         frame_s = np.arange(0.5 * camera.frame_interval_s, schedule.duration_s, camera.frame_interval_s)
     probe = plate.points(np.array([PROBE_AT_MM[0]]), np.array([PROBE_AT_MM[1]]))[:, 0]

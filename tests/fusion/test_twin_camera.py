@@ -180,3 +180,26 @@ def test_flat_field_corrections_step_the_zero_at_their_interval():
     # 8.4 min are two cycles
     assert np.all(offset[::2] == offset[1::2])
     assert np.unique(offset).size == 6
+
+
+def test_camera_reads_high_as_its_housing_warms():
+    truth = simulate(BASE.vary(camera={"drift_K_per_K": 0.02}))
+    warmed = truth.frames["housing"].values - np.interp(0.0, truth.session.grid_s, truth.session.air_degC)
+    assert warmed[-1] > 4.0
+    np.testing.assert_allclose(truth.frames["camera_offset_K"].values, 0.02 * warmed, atol=1e-12)
+
+
+def test_bad_pixels_stay_where_and_as_they_are():
+    renderer = Renderer(twin(bad_pixels=25))
+    sound = Renderer(twin())
+    first, last = renderer.render(0), renderer.render(11)
+    bad = np.flatnonzero(first.ravel() != sound.render(0).ravel())
+    assert 23 <= bad.size <= 25
+    assert np.array_equal(first.ravel()[bad], last.ravel()[bad])
+
+
+def test_burst_of_frames_is_taken_while_the_table_rests():
+    truth = twin(frames_per_cycle=8, burst_interval_s=0.5)
+    assert truth.frames.sizes["frame"] == 12 * 8
+    assert float(abs(truth.frames["table_position"]).max()) == 0.0
+    np.testing.assert_allclose(np.diff(truth.session.frame_s)[:7], 0.5)

@@ -10,8 +10,17 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.twin import RecipeError, deviations_of, fields_of, simulate, simulate_campaign, truth_folder, write_campaign
-from fusion.twin.recipe import AnomalyRecipe, EffectRecipe, Recipe
+from fusion.twin import (
+    RecipeError,
+    deviations_of,
+    fields_of,
+    read_recipe,
+    simulate,
+    simulate_campaign,
+    truth_folder,
+    write_campaign,
+)
+from fusion.twin.recipe import EffectRecipe, Recipe
 from interferometry.contract import DEVIATIONS
 from interferometry.readers import read_deviations, read_environment
 from thermography.contract import FIELDS
@@ -187,6 +196,15 @@ def test_fields_without_files_are_cell_means_with_the_frames_noise():
     assert float(noise) == pytest.approx(0.0115, abs=0.0005)
 
 
+def test_burst_lowers_the_noise_of_a_cycle_and_shows_its_spread():
+    one, many = (simulate(Recipe().vary(test={"cycles": 4}, camera={"frames_per_cycle": n})) for n in (1, 16))
+    quiet = fields_of(many, noise_K=0.0)["temperature"]
+    left = [float((fields_of(truth)["temperature"] - quiet).std()) for truth in (one, many)]
+    # 22,680 values of noise; within three seconds the table itself moves by well under 1 mK
+    assert left[0] / left[1] == pytest.approx(4.0, rel=0.05)
+    assert float(fields_of(many)["temperature_spread"].mean()) == pytest.approx(0.0115 * np.sqrt(15 / 16), rel=0.05)
+
+
 def test_fields_without_files_show_what_the_camera_adds():
     effects = (EffectRecipe("camera_offset", amplitude_K=0.5, parameters={"at_cycle": 3}),)
     spot = (EffectRecipe("reflected_source", amplitude_K=40.0, parameters={"follows": "constant"}),)
@@ -207,10 +225,9 @@ def test_fields_of_a_moving_table_need_frames():
         fields_of(simulate(Recipe().vary(test={"cycles": 2}, camera={"table": "moving"})))
 
 
-def test_local_heat_is_part_of_the_truth_on_the_plan(tmp_path):
-    recipe = Recipe().vary(test={"cycles": 12}, anomaly=(AnomalyRecipe(9, "local_temperature"),))
-    truth = simulate(recipe)
-    write_campaign(truth, tmp_path / "out")
-    with xr.open_dataset(tmp_path / "out-truth" / "truth.nc", engine="h5netcdf") as stored:
-        expected = truth.temperature(truth.session.frame_s, stored["x"].values, stored["y"].values, cell_mm=2.5)
-        np.testing.assert_allclose(stored["temperature"].values, expected, atol=5e-6)
+def test_truth_holds_the_cell_means_of_the_true_field(campaign, truth):
+    again = simulate(read_recipe(campaign.parent.parent / "RECIPE.toml"))
+    expected = again.temperature(again.session.frame_s, truth["x"].values, truth["y"].values, cell_mm=2.5)
+    # stored as float32
+    np.testing.assert_allclose(truth["temperature"].values, expected, atol=5e-6)
+    assert np.array_equal(truth["field_time"].values, again.clock(again.session.frame_s).astype("datetime64[ns]"))

@@ -116,7 +116,10 @@ def test_unknown_packaged_recipe_names_those_there_are():
             r"test\.period_s = 100\.0 is shorter than one cycle, 19\d\.\d s; raise it or the feed",
         ),
         ({"test": {"positions_mm": (0.0, 5.0, 4.0)}}, r"the target positions do not grow"),
-        ({"camera": {"frame_after_s": 90.0}}, r"camera\.frame_after_s = 90\.0 is after the cycle's end"),
+        (
+            {"camera": {"frame_after_s": 90.0}},
+            r"camera: the last frame of a cycle is due 28\d\.\d s after its start, past its end at 252",
+        ),
         (
             {"effect": (EffectRecipe("step_event", amplitude_um=1.0, parameters={"at_cycle": 90}),)},
             r"effect step_event: nothing moves in this test, so it cannot be scaled to 1\.0 um rms",
