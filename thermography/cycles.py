@@ -80,6 +80,11 @@ ATTRIBUTES: dict[str, dict[str, Any]] = {
         **DEGREES,
     },
     "frame_cycle": {"long_name": "cycle that the frames belong to, 0 for none", "units": "1"},
+    "frame_shift": {
+        "long_name": "largest shift of the fiducials of a frame of the block against its registration",
+        "units": "1",
+        "comment": "pixels of the sensor",
+    },
     "frame_count": {"long_name": "frames in the block", "units": "1"},
     "cycle_time": {"long_name": "mean time of the frames of the cycle", "units_metadata": "leap_seconds: utc"},
     "time": {
@@ -120,7 +125,7 @@ class CyclePart:
         """Turn pixels into cells."""
         assert self.pixels is not None
         pixels = self.pixels
-        used = (np.asarray(weights.areas.sum(axis=0)).ravel() > 0).reshape(pixels.mean.shape)
+        used = weights.used
         self.mean = weights.resample(np.where(used, pixels.mean, 0.0))
         sample = pixels.frames / (pixels.frames - 1) if pixels.frames > 1 else np.nan
         self.spread = np.sqrt(weights.average(np.where(used, pixels.variance, 0.0)) * sample)

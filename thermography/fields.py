@@ -4,53 +4,35 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from thermography.averaging import AVERAGING_LIMIT_K, MeanTemperature, accumulate, mean_temperature
+from thermography.blocks import Block, BlockResult, Camera, Override, cut_blocks, reduce_block
 from thermography.cycles import NOT_NUMBERED, CyclePart, annotate, assemble, position_covariance
-from thermography.flir import CameraParameters, FrameReference
+from thermography.flir import FrameReference
+from thermography.knocks import KNOCK_PX, SUSPECT_PX, RegisteredFrom, fiducial_shift, register_anew, watch
 from thermography.plan import PlanGrid
 from thermography.radiometry import calibrate
 from thermography.registration import Registration
-from thermography.resampling import PlanWeights, plan_weights
+from thermography.resampling import plan_weights
+from thermography.scheduling import in_order, open_pool
+
+__all__ = ["FieldError", "RegisteredFrom", "check_bounds", "check_frames", "cycle_of", "reduce_frames"]
 
 Array = NDArray[Any]
-Override = Callable[[FrameReference], CameraParameters]
 
 #: Frames of one cycle that follow each other within this time share one field of the frame stack.
 BLOCK_S = 10.0
-#: Most frames that are held in memory at once.
-BLOCK_FRAMES = 128
-#: Corrections within a block differ by no more than this.
-CORRECTION_STEP_K = 2e-3
+#: Frames whose mean the plan is registered on anew after a knock.
+RENEWAL_FRAMES = 8
 
 
 class FieldError(ValueError):
     """The frames cannot be reduced to fields; the message names the frame or cycle and what to do."""
-
-
-@dataclass(frozen=True)
-class RegisteredFrom:
-    """A registration and the first frame (index into the references) that it holds for."""
-
-    first: int
-    registration: Registration
-
-
-@dataclass(frozen=True)
-class Block:
-    """Consecutive frames that are reduced together: same cycle, registration and parameters, close in time."""
-
-    first: int
-    stop: int
-    cycle: int
-    span: int
-    parameters: CameraParameters
 
 
 def reduce_frames(
@@ -62,12 +44,14 @@ def reduce_frames(
     override: Override = lambda frame: frame.parameters,
     correction_K: Array | None = None,
     block_s: float = BLOCK_S,
+    scheduler: str | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> xr.Dataset:
     """Reduce frames of a still table to one temperature field per cycle on the table plan.
 
     Counts are averaged, not temperatures, which is exact to the second order of the calibration curve; where the counts of a
-    pixel vary too much for that, its frames are calibrated one by one.
+    pixel vary too much for that, its frames are calibrated one by one. The fiducials of every frame are compared with the
+    registration; where they have moved and stay so, the plan is registered anew from that frame on.
 
     Parameters
     ----------
@@ -85,6 +69,8 @@ def reduce_frames(
         Added to the temperature of every frame, shape (time,), for what the camera itself did (shutter steps, drift).
     block_s
         Frames of one cycle within this time share one field of `frame_temperature`; 0 gives every frame its own.
+    scheduler
+        Address of a dask scheduler whose workers see the same files; without it two threads do the work.
     progress
         Called with the number of frames done since the last call.
 
@@ -92,7 +78,8 @@ def reduce_frames(
     -------
     xr.Dataset
         Keeps `thermography.contract.FIELDS`; further `temperature_rate`, `quality_flag`, the registration's `position_u`, and
-        the attribute `frames_outside_cycles`, which names the frames that belong to no cycle (their fields are in the stack).
+        as JSON texts the attributes `frames_outside_cycles` (named; their fields are in the stack), `knocks` (frame and shift
+        in px), `frames_shaken` (moved for one frame only) and `frames_unchecked` (too little contrast to see the fiducials).
 
     Raises
     ------
@@ -100,6 +87,7 @@ def reduce_frames(
         No frame, frames of different sizes, frames out of order, cycles that overlap, or no frame within any cycle.
     """
     spans = [RegisteredFrom(0, registration)] if isinstance(registration, Registration) else list(registration)
+    _check_spans(spans)
     bounds = check_bounds(cycle_bounds)
     times = check_frames(references, spans[0].registration.shape)
     correction = _check_correction(correction_K, len(references))
@@ -109,80 +97,135 @@ def reduce_frames(
             f"no frame lies within a cycle: frames {times[0]} to {times[-1]}, cycles {bounds[0, 0]} to {bounds[-1, 1]}; "
             "check the time zones and the clock offset"
         )
-    blocks = plan_blocks(references, times, cycles, spans, correction, override=override, block_s=block_s)
-    weights = [plan_weights(span.registration, grid) for span in spans]
-    stack = np.full((len(blocks), *grid.shape), np.nan, np.float32)
-    parts: list[CyclePart] = []
-    for place, block in enumerate(blocks):
-        frames = slice(block.first, block.stop)
-        reduced = reduce_block(references[frames], block.parameters, weights[block.span])
-        reduced = replace(reduced, mean=reduced.mean + float(correction[frames].mean()))
-        stack[place] = weights[block.span].resample(reduced.mean)
-        if block.cycle != NOT_NUMBERED:
-            _gather(parts, block, reduced, times[frames], weights)
-        if progress is not None:
-            progress(block.stop - block.first)
-    if parts:
-        parts[-1].finish(weights[parts[-1].span])
-    covariances = [position_covariance(span.registration, grid) for span in spans]
-    dataset = assemble(parts, len(bounds), grid, covariances, weights).assign(
-        frame_temperature=(("time", "y", "x"), stack),
-        frame_cycle=("time", np.array([block.cycle + 1 for block in blocks], np.int32)),
-        frame_count=("time", np.array([block.stop - block.first for block in blocks], np.int32)),
-    )
-    dataset = dataset.assign_coords(time=np.array([_middle(times[block.first : block.stop]) for block in blocks]))
-    outside = [f"{references[i].path.name}#{references[i].index}" for i in np.flatnonzero(cycles == NOT_NUMBERED)]
-    return annotate(dataset).assign_attrs(frames_outside_cycles=json.dumps(outside))
+    run = _Reduction(references, times, correction, grid, spans, override)
+    done = 0
+    with open_pool(scheduler) as pool:
+        while done < len(references):
+            blocks = cut_blocks(
+                references, times, cycles, run.spans, correction, override=override, block_s=block_s, first=done
+            )
+            cameras = [pool.share(camera) for camera in run.cameras]
+            tasks = ((b, (reduce_block, references[b.first : b.stop], b.parameters, cameras[b.span])) for b in blocks)
+            results = in_order(pool, tasks)
+            for block, result in results:
+                if run.renew(block, result):
+                    results.close()
+                    break
+                run.gather(block, result)
+                done = block.stop
+                if progress is not None:
+                    progress(block.stop - block.first)
+    return run.dataset(bounds, cycles)
 
 
-def reduce_block(
-    frames: Sequence[FrameReference], parameters: CameraParameters, weights: PlanWeights
-) -> MeanTemperature:
-    """Read a block of frames and return mean and variance of the temperature of the window's pixels."""
-    counts = np.stack([frame.read().counts[weights.window] for frame in frames])
-    if len(frames) == 1:
-        mean = calibrate(counts[0], parameters).astype(float)
-        return MeanTemperature(1, mean, np.zeros_like(mean), np.zeros_like(mean))
-    reduced = mean_temperature(accumulate(counts), parameters)
-    wild = reduced.bound_K > AVERAGING_LIMIT_K
-    if wild.any():
-        temperature = calibrate(counts[:, wild], parameters).astype(float)
-        reduced.mean[wild], reduced.variance[wild] = temperature.mean(axis=0), temperature.var(axis=0)
-    return reduced
+@dataclass
+class _Reduction:
+    """What has been gathered so far, in the order of time: the registrations, the open cycle, and the frame stack."""
 
+    references: Sequence[FrameReference]
+    times: Array
+    correction_K: Array
+    grid: PlanGrid
+    spans: list[RegisteredFrom]
+    override: Override
+    cameras: list[Camera] = field(default_factory=list)
+    parts: list[CyclePart] = field(default_factory=list)
+    blocks: list[Block] = field(default_factory=list)
+    stack: list[NDArray[np.float32]] = field(default_factory=list)
+    shift_px: Array = field(default_factory=lambda: np.empty(0))
+    shaken: set[int] = field(default_factory=set)
+    baseline_px: Array = field(default_factory=lambda: np.zeros(2))
 
-def plan_blocks(
-    references: Sequence[FrameReference],
-    times: Array,
-    cycles: Array,
-    spans: Sequence[RegisteredFrom],
-    correction_K: Array,
-    *,
-    override: Override,
-    block_s: float,
-) -> list[Block]:
-    """Cut the frames into blocks: the unit of memory, of `frame_temperature`, and of what a cluster computes."""
-    starts = np.array([span.first for span in spans])
-    if starts[0] != 0 or (np.diff(starts) <= 0).any():
-        raise FieldError(f"registrations start at frames {starts.tolist()}; they must start at 0 and rise")
-    blocks: list[Block] = []
-    begin = 0
-    for i, frame in enumerate(references):
-        span = int(np.searchsorted(starts, i, side="right")) - 1
-        own = Block(i, i + 1, int(cycles[i]), span, override(frame))
-        last = blocks[-1] if blocks else None
-        if (
-            last is not None
-            and replace(last, first=i, stop=i + 1) == own
-            and i - begin < BLOCK_FRAMES
-            and times[i] - times[begin] < np.timedelta64(round(block_s * 1e9), "ns")
-            and abs(correction_K[i] - correction_K[begin]) <= CORRECTION_STEP_K
-        ):
-            blocks[-1] = replace(last, stop=i + 1)
-        else:
-            blocks.append(own)
-            begin = i
-    return blocks
+    def __post_init__(self) -> None:
+        self.shift_px = np.full(len(self.references), np.nan)
+        self.cameras = [self._camera(span.registration) for span in self.spans]
+
+    def _camera(self, registration: Registration) -> Camera:
+        weights = plan_weights(registration, self.grid)
+        return Camera(weights, watch(registration, self.grid, weights.window))
+
+    def renew(self, block: Block, result: BlockResult) -> bool:
+        """Look for a knock in a block; register anew from its first moved frame and return True, so that the block is cut again."""
+        for i, seen in zip(range(block.first, block.stop), result.shift_px, strict=True):
+            shift = seen - self.baseline_px
+            if np.hypot(*shift) > SUSPECT_PX:
+                exact = self._exact_shift(i, block.span)
+                if np.hypot(*exact) > KNOCK_PX:
+                    if i + 1 == len(self.references) or _alike(self._exact_shift(i + 1, block.span), exact):
+                        self._renew_from(i, block.span, exact)
+                        return True
+                    self.shaken.add(i)
+                elif np.isfinite(exact).all():
+                    self.baseline_px = seen - exact
+                shift = exact
+            self.shift_px[i] = np.hypot(*shift)
+        return False
+
+    def _exact_shift(self, i: int, span: int) -> Array:
+        return fiducial_shift(self._temperature(i), self.spans[span].registration, self.grid)
+
+    def _temperature(self, i: int) -> Array:
+        return calibrate(self.references[i].read().counts, self.override(self.references[i]))
+
+    def _renew_from(self, i: int, span: int, shift: Array) -> None:
+        later = [
+            j
+            for j in range(i + 1, min(i + RENEWAL_FRAMES, len(self.references)))
+            if self._same_place(j, i, span, shift)
+        ]
+        frame = np.mean([self._temperature(j) for j in [i, *later]], axis=0, dtype=float)
+        registration = register_anew(frame, self.spans[span].registration, shift, self.grid, where=self._name(i))
+        self.spans.insert(span + 1, RegisteredFrom(i, registration, (float(shift[0]), float(shift[1]))))
+        self.cameras.insert(span + 1, self._camera(registration))
+        self.baseline_px = np.zeros(2)
+
+    def _same_place(self, j: int, i: int, span: int, shift: Array) -> bool:
+        following = self.spans[span + 1].first if span + 1 < len(self.spans) else len(self.references)
+        return j < following and _alike(self._exact_shift(j, span), shift)
+
+    def gather(self, block: Block, result: BlockResult) -> None:
+        """Add a block to the stack and to the cycle that is open; a block of the next cycle or registration closes it."""
+        offset = float(self.correction_K[block.first : block.stop].mean())
+        self.blocks.append(block)
+        self.stack.append((result.cells + offset).astype(np.float32))
+        if block.cycle == NOT_NUMBERED:
+            return
+        last = self.parts[-1] if self.parts else None
+        if last is None or (last.cycle, last.span) != (block.cycle, block.span):
+            if last is not None:
+                last.finish(self.cameras[last.span].weights)
+            self.parts.append(CyclePart(block.cycle, block.span))
+        temperature = replace(result.temperature, mean=result.temperature.mean + offset)
+        self.parts[-1].add(temperature, self.times[block.first : block.stop])
+
+    def dataset(self, bounds: Array, cycles: Array) -> xr.Dataset:
+        """Put everything together."""
+        if self.parts:
+            self.parts[-1].finish(self.cameras[self.parts[-1].span].weights)
+        covariances = [position_covariance(span.registration, self.grid) for span in self.spans]
+        weights = [camera.weights for camera in self.cameras]
+        blocks = self.blocks
+        fields = assemble(self.parts, len(bounds), self.grid, covariances, weights).assign(
+            frame_temperature=(("time", "y", "x"), np.stack(self.stack)),
+            frame_cycle=("time", np.array([b.cycle + 1 for b in blocks], np.int32)),
+            frame_count=("time", np.array([b.stop - b.first for b in blocks], np.int32)),
+            frame_shift=("time", np.array([_largest(self.shift_px[b.first : b.stop]) for b in blocks], np.float32)),
+        )
+        middles = [self.times[b.first] + (self.times[b.first : b.stop] - self.times[b.first]).mean() for b in blocks]
+        knocks = [
+            {"frame": self._name(s.first), "index": s.first, "shift_px": list(s.shift_px)} for s in self.spans[1:]
+        ]
+        texts = {
+            "frames_outside_cycles": [self._name(i) for i in np.flatnonzero(cycles == NOT_NUMBERED)],
+            "knocks": knocks,
+            "frames_shaken": [self._name(i) for i in sorted(self.shaken)],
+            "frames_unchecked": [self._name(i) for i in np.flatnonzero(np.isnan(self.shift_px))],
+        }
+        fields = annotate(fields.assign_coords(time=np.array(middles)))
+        return fields.assign_attrs({name: json.dumps(value) for name, value in texts.items()})
+
+    def _name(self, i: int) -> str:
+        return f"{self.references[i].path.name}#{self.references[i].index}"
 
 
 def check_bounds(cycle_bounds: Array) -> Array:
@@ -228,15 +271,10 @@ def cycle_of(times: Array, bounds: Array) -> NDArray[np.int64]:
     return np.where(inside, index, NOT_NUMBERED)
 
 
-def _gather(
-    parts: list[CyclePart], block: Block, reduced: MeanTemperature, times: Array, weights: Sequence[PlanWeights]
-) -> None:
-    """Add a block to the cycle that is open; a block of the next cycle or registration closes it."""
-    if not parts or (parts[-1].cycle, parts[-1].span) != (block.cycle, block.span):
-        if parts:
-            parts[-1].finish(weights[parts[-1].span])
-        parts.append(CyclePart(block.cycle, block.span))
-    parts[-1].add(reduced, times)
+def _check_spans(spans: Sequence[RegisteredFrom]) -> None:
+    starts = [span.first for span in spans]
+    if not starts or starts[0] != 0 or (np.diff(starts) <= 0).any():
+        raise FieldError(f"registrations start at frames {starts}; they must start at 0 and rise")
 
 
 def _check_correction(correction_K: Array | None, frames: int) -> Array:
@@ -250,5 +288,10 @@ def _check_correction(correction_K: Array | None, frames: int) -> Array:
     return correction
 
 
-def _middle(times: Array) -> np.datetime64:
-    return times[0] + (times - times[0]).mean()
+def _alike(one: Array, other: Array) -> bool:
+    return bool(np.hypot(*one) > KNOCK_PX and np.hypot(*(one - other)) < max(KNOCK_PX, 0.3 * np.hypot(*other)))
+
+
+def _largest(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.max()) if known.size else float("nan")

@@ -174,12 +174,21 @@ def climb_ladder(seen: Sightings, start: Projection) -> tuple[Projection, int]:
 
 
 def leave_one_out(seen: Sightings, projection: Projection, coefficients: int) -> Array:
-    """Distance in mm, shape (n,), by which each disc is missed when the others alone are fitted; NaN where they cannot be."""
+    """Distance in mm, shape (n,), by which each disc is missed when the others alone are fitted; NaN where they cannot be.
+
+    From the leverage of each disc in the one fit of all (Allen 1974), which equals fitting n times as long as the projection is
+    linear over the residuals; they are hundredths of a pixel.
+    """
     count = len(seen.u_px)
     if 2 * (count - 1) < 8 + coefficients:
         return np.full(count, np.nan)
-    fits = [fit_projection(seen.without(i), projection, coefficients) for i in range(count)]
-    return np.array([np.linalg.norm(seen.plan_error(fit)[i]) for i, fit in enumerate(fits)])
+    jacobian = parameter_jacobian(projection, seen.centres_mm, coefficients)(seen.centres_mm) / seen.u_px[:, None, None]
+    flat = jacobian.reshape(2 * count, -1)
+    leverage = jacobian @ np.linalg.pinv(flat.T @ flat) @ np.swapaxes(jacobian, 1, 2)
+    misses = (seen.points_px - projection.disc_centroids(seen.centres_mm, seen.radii_mm)) / seen.u_px[:, None]
+    missed_px = np.linalg.solve(np.eye(2) - leverage, misses[..., None]) * seen.u_px[:, None, None]
+    missed_mm = np.linalg.solve(projection.jacobian(seen.centres_mm), missed_px)[..., 0]
+    return np.asarray(np.linalg.norm(missed_mm, axis=1))
 
 
 def parameter_jacobian(projection: Projection, centres_mm: Array, coefficients: int) -> Callable[[Array], Array]:
@@ -234,9 +243,10 @@ def _parameters(
 
 def _transform(matrix: Array, points: Array) -> Array:
     points = np.asarray(points, float)
-    projected = points @ matrix[:, :2].T + matrix[:, 2]
-    plane: Array = projected[..., :2] / projected[..., 2:]
-    return plane
+    x, y = points[..., 0], points[..., 1]
+    # Written out, because a product with a 2 x 3 matrix spends its time in starting BLAS threads.
+    u, v, w = (row[0] * x + row[1] * y + row[2] for row in matrix)
+    return np.stack([u / w, v / w], axis=-1)
 
 
 def _distort(normalised: Array, coefficients: Array) -> Array:

@@ -15,7 +15,7 @@ from thermography.registration import Registration
 Array = NDArray[Any]
 
 #: Every pixel is cut in this many parts squared, each of which goes to the cell that it lies in.
-PARTS = 5
+PARTS = 4
 #: Cells of which less than this part is seen unmasked are NaN.
 LEAST_COVERAGE = 0.3
 
@@ -43,6 +43,12 @@ class PlanWeights:
     window: tuple[slice, slice]
     coverage: Array
     grid: PlanGrid
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Which pixels of the window have a weight."""
+        shape = tuple(side.stop - side.start for side in self.window)
+        return np.asarray(np.asarray(self.areas.sum(axis=0)).reshape(shape) > 0)
 
     def resample(self, values: Array) -> Array:
         """Average window pixels, shape (row, column), over every cell; shape (y, x), NaN where a cell is not seen."""
@@ -111,17 +117,19 @@ def _unmasked_parts(registration: Registration, grid: PlanGrid, margin_px: float
     plan = registration.to_plan(centres)
     near = grid.contains(plan)
     centres, plan = centres[near], plan[near]
-    pixel_mm = np.linalg.norm(np.linalg.inv(registration.projection.jacobian(plan)), ord=2, axis=(1, 2))
+    to_mm = np.linalg.inv(registration.projection.jacobian(plan))
+    pixel_mm = np.linalg.norm(to_mm, axis=1).max(axis=1)
     edge = np.minimum.reduce([plan[:, 0], grid.width_mm - plan[:, 0], plan[:, 1], grid.height_mm - plan[:, 1]])
     kept = (edge >= margin_px * pixel_mm) & ~mask_discs(plan, registration.masked, margin_mm=margin_px * pixel_mm)
-    centres = centres[kept]
+    centres, plan, to_mm = centres[kept], plan[kept], to_mm[kept]
     steps = (np.arange(PARTS) + 0.5) / PARTS - 0.5
-    across, down = np.meshgrid(steps, steps)
-    parts = (centres[:, None, :] + np.stack([across, down], axis=-1).reshape(1, -1, 2)).reshape(-1, 2)
-    places = registration.to_plan(parts)
-    areas = 1 / np.abs(np.linalg.det(registration.projection.jacobian(plan[kept]))) / PARTS**2
+    across, down = (side.ravel() for side in np.meshgrid(steps, steps))
+    # Within one pixel the projection is as good as affine.
+    x = plan[:, :1] + to_mm[:, 0, :1] * across + to_mm[:, 0, 1:] * down
+    y = plan[:, 1:] + to_mm[:, 1, :1] * across + to_mm[:, 1, 1:] * down
+    areas = np.abs(to_mm[:, 0, 0] * to_mm[:, 1, 1] - to_mm[:, 0, 1] * to_mm[:, 1, 0]) / PARTS**2
     index = (centres[:, 1] * registration.shape[1] + centres[:, 0]).astype(np.int64)
-    return np.repeat(index, PARTS**2), places, np.repeat(areas, PARTS**2)
+    return np.repeat(index, PARTS**2), np.stack([x.ravel(), y.ravel()], axis=-1), np.repeat(areas, PARTS**2)
 
 
 def _outline(grid: PlanGrid) -> Array:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -44,7 +45,7 @@ class Scene:
     k1: float = 0.0
     shape: tuple[int, int] = (480, 640)
     disc_K: float = -1.5
-    discs: list = field(default_factory=lambda: DISCS)
+    discs: tuple = tuple(DISCS)
     field: Callable = smooth_field
     outside: float = 22.5
     shift_mm: tuple[float, float] = (0.0, 0.0)
@@ -79,20 +80,20 @@ class Scene:
         )
         return cv2.perspectiveTransform(ideal, np.linalg.inv(self.plan_to_pixel)).reshape(-1, 2) - self.shift_mm
 
+    def to_pixels(self, points_mm):
+        """True place on the sensor of plan points (n, 2)."""
+        ideal = cv2.perspectiveTransform((np.asarray(points_mm, float) + self.shift_mm)[None], self.plan_to_pixel)[0]
+        rays = (ideal - self.camera_matrix[:2, 2]) / FOCAL_PX
+        return (
+            self.camera_matrix[:2, 2]
+            + FOCAL_PX * rays * (1 + self.k1 * (rays**2).sum(axis=1, keepdims=True))
+            + self.shift_px
+        )
+
     def render(self, rng=None, noise_K=0.05):
         """One frame in degC, float64 (row, column)."""
-        rows, columns = self.shape
-        steps = (np.arange(self.rays) + 0.5) / self.rays - 0.5
-        column, row = np.meshgrid(
-            (np.arange(columns)[:, None] + steps).ravel(), (np.arange(rows)[:, None] + steps).ravel()
-        )
-        x, y = self.to_plan(np.stack([column, row], axis=-1).reshape(-1, 2)).T
-        value = np.where((x >= 0) & (x <= 700) & (y >= 0) & (y <= 180), self.field(x, y), self.outside)
-        for disc in self.discs:
-            inside = (x - disc.x_mm) ** 2 + (y - disc.y_mm) ** 2 < (disc.diameter_mm / 2) ** 2
-            value = np.where(inside, smooth_field(450, 80) - 2.5 + self.disc_K, value)
-        frame = value.reshape(rows, self.rays, columns, self.rays).mean(axis=(1, 3))
-        return frame if rng is None else frame + rng.normal(0, noise_K, frame.shape)
+        frame = _rendered(self)
+        return frame.copy() if rng is None else frame + rng.normal(0, noise_K, frame.shape)
 
     def registration_rms_mm(self, registration):
         """Root mean square distance over the plan between the registration and the truth, mm."""
@@ -100,6 +101,19 @@ class Scene:
         plan = np.stack([x, y], axis=-1).reshape(-1, 2)
         error = self.to_plan(registration.to_sensor(plan)) - plan
         return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
+@cache
+def _rendered(scene):
+    rows, columns = scene.shape
+    steps = (np.arange(scene.rays) + 0.5) / scene.rays - 0.5
+    column, row = np.meshgrid((np.arange(columns)[:, None] + steps).ravel(), (np.arange(rows)[:, None] + steps).ravel())
+    x, y = scene.to_plan(np.stack([column, row], axis=-1).reshape(-1, 2)).T
+    value = np.where((x >= 0) & (x <= 700) & (y >= 0) & (y <= 180), scene.field(x, y), scene.outside)
+    for disc in scene.discs:
+        inside = (x - disc.x_mm) ** 2 + (y - disc.y_mm) ** 2 < (disc.diameter_mm / 2) ** 2
+        value = np.where(inside, smooth_field(450, 80) - 2.5 + scene.disc_K, value)
+    return value.reshape(rows, scene.rays, columns, scene.rays).mean(axis=(1, 3))
 
 
 #: SC660 constants as in the vendor's own files; air and surroundings as in a workshop.

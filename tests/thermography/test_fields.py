@@ -213,3 +213,41 @@ def test_faults_are_named(scene, tmp_path, change, message):
         arguments["registration"] = [RegisteredFrom(1, registration)]
     with pytest.raises(FieldError, match=message):
         reduce_frames(arguments.pop("references"), arguments.pop("registration"), GRID, **arguments)
+
+
+def test_a_knock_of_3_px_at_frame_40_is_found_at_frame_40(scene, rng, tmp_path):
+    image, registration, still = scene
+    after = replace(still, shift_px=(2.5, -1.7)).render()
+    frames = record(
+        tmp_path / "a.seq", ((image if i < 40 else after) + rng.normal(0, 0.05, image.shape) for i in range(50))
+    )
+    fields = reduce_frames(frames, registration, GRID, edges(0, 25, 50))
+    (knock,) = json.loads(fields.attrs["knocks"])
+    assert (knock["frame"], knock["index"]) == ("a.seq#40", 40)
+    assert knock["shift_px"] == pytest.approx([2.5, -1.7], abs=0.05)
+    error = fields["temperature"].values - cell_truth()
+    assert np.sqrt(np.nanmean(error**2)) < 0.005
+    assert np.nanmax(fields["frame_shift"].values) < 0.2
+    assert json.loads(fields.attrs["frames_shaken"]) == json.loads(fields.attrs["frames_unchecked"]) == []
+
+
+def test_a_single_shaken_frame_is_reported_and_no_warm_up_is_taken_for_a_knock(scene, rng, tmp_path):
+    image, registration, still = scene
+    shaken = replace(still, shift_px=(1.5, 0.0)).render()
+
+    def warm(n):
+        gradient = Scene(disc_K=-4.0, field=lambda x, y: smooth_field(x, y) + 0.002 * n * x).render()
+        return (shaken if n == 3 else gradient) + rng.normal(0, 0.05, image.shape)
+
+    frames = record(tmp_path / "a.seq", (warm(n) for n in range(7)))
+    fields = reduce_frames(frames, registration, GRID, edges(0, 7))
+    assert json.loads(fields.attrs["knocks"]) == []
+    assert json.loads(fields.attrs["frames_shaken"]) == ["a.seq#3"]
+
+
+def test_discs_without_contrast_leave_frames_unchecked(scene, rng, tmp_path):
+    _, registration, _ = scene
+    plain = Scene(discs=()).render() + rng.normal(0, 0.05, (480, 640))
+    frames = record(tmp_path / "a.seq", [plain] * 2)
+    fields = reduce_frames(frames, registration, GRID, edges(0, 2))
+    assert json.loads(fields.attrs["frames_unchecked"]) == ["a.seq#0", "a.seq#1"]

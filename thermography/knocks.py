@@ -1,0 +1,163 @@
+"""L2 - Every frame checked against the registration: a knocked camera or table is found and registered anew from that frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from thermography.plan import Fiducial, PlanGrid
+from thermography.registration import Registration, RegistrationError, locate_fiducials, register
+
+Array = NDArray[Any]
+
+#: A shift of the fiducials together by more than this is a knock.
+KNOCK_PX = 0.5
+#: The quick check hands over to the exact one at this shift: gradients on the table move its centroids by some tenths.
+SUSPECT_PX = 0.3
+#: How far from their place the fiducials of a frame are looked for.
+REACH_PX = 12.0
+
+
+@dataclass(frozen=True)
+class RegisteredFrom:
+    """A registration, the first frame (index into the references) that it holds for, and the shift that made it necessary."""
+
+    first: int
+    registration: Registration
+    shift_px: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Quick look at the fiducials of many frames: three sums over the pixels around every disc.
+
+    Between the table around a disc (a plane through its ring) and the disc itself, the coverage's sum and its first moments are
+    linear in the pixels; their ratio is the centroid. No frame needs to be calibrated for it.
+
+    Attributes
+    ----------
+    pixels
+        Index of every pixel used, into the flattened window, (entries,).
+    weights
+        For the sum and the first moments along columns and rows, (entries, 3).
+    starts
+        First entry of every disc, and the number of entries, (discs + 1,).
+    noise_gain
+        Standard deviation of a disc's sum for pixels of unit noise, (discs,).
+    """
+
+    pixels: NDArray[np.int64]
+    weights: Array
+    starts: NDArray[np.int64]
+    noise_gain: Array
+
+    def shifts(self, counts: NDArray[np.uint16], noise_counts: float) -> Array:
+        """Median shift (column, row) px per frame of window counts (time, row, column); NaN where fewer than three discs show."""
+        sums = _disc_sums(counts.reshape(len(counts), -1), self.pixels, self.weights, self.starts)
+        shows = np.abs(sums[..., 0]) > 10 * noise_counts * self.noise_gain
+        shifts = np.full((len(counts), 2), np.nan)
+        for i in np.flatnonzero(shows.sum(axis=1) >= 3):
+            own = sums[i, shows[i]]
+            shifts[i] = np.median(own[:, 1:] / own[:, :1], axis=0)
+        return shifts
+
+
+def watch(registration: Registration, grid: PlanGrid, window: tuple[slice, slice]) -> Watch:
+    """Prepare the quick look for the fiducials of a registration that lie within a window of the sensor."""
+    pixels, weights, starts, gains = [], [], [0], []
+    origin = np.array([window[1].start, window[0].start])
+    shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
+    for name, disc in registration.fiducials.items():
+        located = registration.located[name]
+        centre = np.array([located.column_px, located.row_px]) - origin
+        found = _disc_weights(disc, centre, registration, grid, shape)
+        if found is None:
+            continue
+        pixels.append(found[0])
+        weights.append(found[1])
+        starts.append(starts[-1] + len(found[0]))
+        gains.append(float(np.linalg.norm(found[1][:, 0])))
+    if not pixels:
+        return Watch(np.empty(0, np.int64), np.empty((0, 3)), np.array([0]), np.empty(0))
+    return Watch(np.concatenate(pixels), np.concatenate(weights), np.array(starts), np.array(gains))
+
+
+def _disc_weights(
+    disc: Fiducial, centre: Array, registration: Registration, grid: PlanGrid, shape: tuple[int, int]
+) -> tuple[Array, Array] | None:
+    """Pixels around one disc and their weights in the three sums; None where the window does not hold it."""
+    place = np.array([disc.x_mm, disc.y_mm])
+    jacobian = registration.projection.jacobian(place)
+    to_mm = np.linalg.inv(jacobian)
+    radius = disc.diameter_mm / 2
+    pixel_mm = float(np.linalg.norm(to_mm, 2))
+    half = np.ceil((2 * radius + 6 * pixel_mm) * np.linalg.norm(jacobian, axis=1)).astype(int)
+    low = np.maximum(np.round(centre).astype(int) - half, 0)
+    high = np.minimum(np.round(centre).astype(int) + half + 1, np.array(shape[::-1]))
+    columns, rows = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
+    offsets = np.stack([columns - centre[0], rows - centre[1]], axis=-1).reshape(-1, 2)
+    plan = offsets @ to_mm.T + place
+    distance = np.linalg.norm(plan - place, axis=1)
+    counted = distance < radius + 3.5 * pixel_mm
+    ring = ~counted & (distance < 2 * radius + 5 * pixel_mm) & grid.contains(plan, margin_mm=1.5 * pixel_mm)
+    if ring.sum() < 12 or counted.sum() < 12:
+        return None
+    basis = np.column_stack([offsets, np.ones(len(offsets))])
+    plane = np.linalg.pinv(basis[ring])
+    moments = np.column_stack([np.ones(len(offsets)), offsets])
+    weights = np.where(counted[:, None], moments, 0.0)
+    weights[ring] -= (moments[counted].T @ basis[counted] @ plane).T
+    used = counted | ring
+    return (rows * shape[1] + columns).ravel()[used], weights[used]
+
+
+@numba.njit(cache=True, nogil=True)
+def _disc_sums(counts: Array, pixels: Array, weights: Array, starts: Array) -> Array:
+    discs = len(starts) - 1
+    sums = np.zeros((len(counts), discs, 3))
+    for frame in range(len(counts)):
+        for disc in range(discs):
+            a, b, c = 0.0, 0.0, 0.0
+            for entry in range(starts[disc], starts[disc + 1]):
+                value = float(counts[frame, pixels[entry]])
+                a += weights[entry, 0] * value
+                b += weights[entry, 1] * value
+                c += weights[entry, 2] * value
+            sums[frame, disc, 0], sums[frame, disc, 1], sums[frame, disc, 2] = a, b, c
+    return sums
+
+
+def fiducial_shift(frame: Array, registration: Registration, grid: PlanGrid) -> Array:
+    """Median shift (column, row) px of the fiducials of a calibrated frame, exactly; NaN where fewer than three show."""
+    listed = list(registration.fiducials.values())
+    located, _ = locate_fiducials(frame, listed, registration.projection, grid=grid, reach_px=REACH_PX)
+    if len(located) < 3:
+        return np.full(2, np.nan)
+    before = registration.located
+    shifts = [(d.column_px - before[name].column_px, d.row_px - before[name].row_px) for name, d in located.items()]
+    return np.asarray(np.median(shifts, axis=0))
+
+
+def register_anew(frame: Array, old: Registration, shift_px: Array, grid: PlanGrid, *, where: str) -> Registration:
+    """Register a frame after a knock: the old places, moved by the shift, are the hints.
+
+    Raises
+    ------
+    RegistrationError
+        The plan is not found any more; the message names the frame by `where`.
+    """
+    places = old.to_sensor(np.array([(disc.x_mm, disc.y_mm) for disc in old.masked])) + shift_px
+    hinted = [
+        replace(disc, column_px=float(c), row_px=float(r)) for disc, (c, r) in zip(old.masked, places, strict=True)
+    ]
+    try:
+        return register(frame, hinted, grid=grid)
+    except RegistrationError as error:
+        raise RegistrationError(
+            f"{where}: the fiducials moved by ({shift_px[0]:.1f}, {shift_px[1]:.1f}) px and the plan is not found again: {error}; "
+            "leave out the frames from here on, or give them a fiducial file of their own"
+        ) from error
