@@ -237,6 +237,7 @@ def _series_anomalies(
     found: list[Anomaly] = []
     periodogram = _Periodogram(seconds)
     p_values = {"periodic": periodogram.p_values(values)}
+    strength = {"periodic": periodogram.power(values).max(axis=-1)}
     for kind, statistic in (("slow", _slow), ("step", _step)):
         observed = statistic(values)
         shuffled = np.concatenate(
@@ -244,12 +245,13 @@ def _series_anomalies(
         )
         centre, spread = shuffled.mean(axis=0), shuffled.std(axis=0)
         largest = ((shuffled - centre) / spread).max(axis=1)
-        reached = np.count_nonzero(largest[:, None] >= (observed - centre) / spread, axis=0)
+        strength[kind] = (observed - centre) / spread
+        reached = np.count_nonzero(largest[:, None] >= strength[kind], axis=0)
         p_values[kind] = (1 + reached) / (permutations + 1)
     significant: dict[str, dict[int, tuple[float, int]]] = {}
     for kind, p in p_values.items():
         best: dict[int, tuple[float, int]] = {}
-        for at in np.argsort(p, kind="stable"):
+        for at in np.argsort(-strength[kind]):
             target = labels[at].target
             if p[at] <= level * WEIGHTS[kind] and target not in best:
                 best[target] = (float(p[at]) / WEIGHTS[kind], int(at))

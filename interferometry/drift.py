@@ -23,7 +23,15 @@ from interferometry.statespace import Order
 
 Array = NDArray[np.float64]
 
-__all__ = ["DriftDataError", "describe", "estimate_drift", "fit_joint", "flag_outliers", "state_weights"]
+__all__ = [
+    "DriftDataError",
+    "describe",
+    "estimate_drift",
+    "fit_joint",
+    "flag_outliers",
+    "state_weights",
+    "track_reversal",
+]
 
 #: Deletion residual, in standard deviations, from which a reading is flagged as an outlier: among 10,000 normal
 #: readings the chance of one is 0.07.
@@ -45,7 +53,7 @@ def estimate_drift(
     deviations : xarray.Dataset
         Keeps ``contract.DEVIATIONS``; readings may be missing, directions unequal.
     state : {"mean", "start", "end"} or float
-        Thermal state of the profile: the average over the time of the test, the first or last reading, or seconds since
+        Thermal state of the profile: the average over the measured cycles, the first or last reading, or seconds since
         the first reading.
     robust : bool
         Take weight from readings far from all others.
@@ -61,7 +69,7 @@ def estimate_drift(
         profile_u; profile_relative to the first target in the same direction, with its u; reversal (target), with its u;
         scatter (direction, target), the random standard deviation of each cell, with its u, and scatter_position
         (target), both directions together; drift from the stated thermal state at every reading (cycle, direction,
-        target), with its u, and drift_<component>: profile plus drift is the expected reading; noise, the estimated
+        target), with its u, and drift_<component> with its u: profile plus drift is the expected reading; noise, the estimated
         random part of each reading; standardised, each reading against its prediction from all others in standard
         deviations; sigma; drift_size (component), the standard deviation of each component over the test, and
         drift_rate (component), of its increments in an hour. ``attrs["state"]``, ``order``.
@@ -81,7 +89,8 @@ def describe(deviations: xr.Dataset, joint: JointFit, *, state: str | float = "m
     columns = np.column_stack([fit.response, fit.design])
     levels, level_covariance, u, d = fit.system.smooth(columns)
     total, through = _with_start_rates(levels, fit.system.seconds / 3600.0, joint)
-    at_state = _drift_at_state(joint, columns, state_weights(fit.system.seconds, state))
+    weights = state_weights(fit.system.seconds, joint.readings["cycle"].values, state)
+    at_state = _drift_at_state(joint, columns, weights)
     drift = total - at_state.drift
     dependence = through - at_state.through
     joined = level_covariance + at_state.covariance - at_state.with_drift - at_state.with_drift.transpose(0, 2, 1)
@@ -89,6 +98,7 @@ def describe(deviations: xr.Dataset, joint: JointFit, *, state: str | float = "m
     loadings = fit.system.loadings
     at_position = np.einsum("kc,kc->k", loadings, drift)
     at_position_u = np.sqrt(np.maximum(np.einsum("kc,kce,ke->k", loadings, covariance, loadings), 0.0))
+    component_u = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
     noise = fit.system.variance * (u[:, 0] - u[:, 1:] @ fit.coefficients)
     result = _describe_profile(deviations, joint, at_state)
     scatter, freedom = _scatter(joint, u, d)
@@ -121,8 +131,9 @@ def describe(deviations: xr.Dataset, joint: JointFit, *, state: str | float = "m
                 {"units": "um", "long_name": "random change within an hour"},
             ),
             **{
-                f"drift_{name}": (DIMS, grid.per_reading(drift[:, at]), {"units": "um"})
+                f"drift_{name}{suffix}": (DIMS, grid.per_reading(values[:, at]), {"units": "um"})
                 for at, name in enumerate(joint.components)
+                for suffix, values in (("", drift), ("_u", component_u))
             },
         }
     )
@@ -131,30 +142,70 @@ def describe(deviations: xr.Dataset, joint: JointFit, *, state: str | float = "m
     return result
 
 
+def track_reversal(deviations: xr.Dataset, estimated: xr.Dataset) -> xr.Dataset:
+    """Return the reversal B_i in every cycle: as read, and smoothed where the readings ask for a change.
+
+    Parameters
+    ----------
+    deviations : xarray.Dataset
+    estimated : xarray.Dataset
+        What `estimate_drift` returns for them.
+
+    Returns
+    -------
+    xarray.Dataset
+        Per cycle and target, in um: as_read, the difference of the two directions' readings freed of the drift between
+        them, with its u; reversal, the joint estimate, with its u (profile and its change taken as independent). It is
+        constant where no drift of the reversal was found.
+    """
+    own = "drift_reversal" in estimated
+    change = (
+        estimated["drift_reversal"].mean("direction") if own else xr.zeros_like(estimated["drift"].mean("direction"))
+    )
+    change = change.mean("target") + xr.zeros_like(estimated["reversal"])
+    change_u = estimated["drift_reversal_u"].mean(("direction", "target")) if own else 0.0
+    common = estimated["drift"] - (_signs(estimated) * estimated["drift_reversal"] / 2 if own else 0.0)
+    free = (deviations["deviation"] - common).transpose("cycle", "direction", "target")
+    as_read = free.sel(direction="positive", drop=True) - free.sel(direction="negative", drop=True)
+    scatter = estimated["scatter"]
+    as_read_u = ((scatter**2).sum("direction", skipna=False) ** 0.5).broadcast_like(as_read)
+    smoothed = (estimated["reversal"] + change).transpose("cycle", "target")
+    smoothed_u = ((estimated["reversal_u"] ** 2 + change_u**2) ** 0.5).broadcast_like(smoothed)
+    named = {"as_read": as_read, "as_read_u": as_read_u, "reversal": smoothed, "reversal_u": smoothed_u}
+    return xr.Dataset({name: value.transpose("cycle", "target") for name, value in named.items()}).map(
+        lambda value: value.assign_attrs(units="um")
+    )
+
+
+def _signs(estimated: xr.Dataset) -> xr.DataArray:
+    return xr.where(estimated["direction"] == "positive", 1.0, -1.0)
+
+
 def flag_outliers(deviations: xr.Dataset, estimated: xr.Dataset) -> xr.Dataset:
     """Return the deviations with the outlier flag set where a reading lies beyond OUTLIER_LIMIT of the joint estimate."""
     beyond = np.abs(np.nan_to_num(estimated["standardised"].values)) > OUTLIER_LIMIT
     return flags.set_flag(deviations, flags.OUTLIER, beyond)
 
 
-def state_weights(seconds: Array, state: str | float) -> Array:
+def state_weights(seconds: Array, cycle: NDArray[np.int64], state: str | float) -> Array:
     """Return the weights of the readings (n,) in a thermal state: they sum to one.
+
+    In the mean state every cycle counts alike, whatever it lacks: with complete readings it is their plain mean.
 
     Raises
     ------
     DriftDataError
         The state has an unknown name or lies outside the test.
     """
-    weights = np.zeros(seconds.size)
     if state == "mean":
-        weights[1:] += np.diff(seconds) / 2
-        weights[:-1] += np.diff(seconds) / 2
-        return weights / weights.sum()
+        _, own, readings = np.unique(cycle, return_inverse=True, return_counts=True)
+        return 1.0 / (readings.size * readings[own.ravel()])
     instant = {"start": seconds[0], "end": seconds[-1]}.get(str(state), state)
     if isinstance(instant, str) or not seconds[0] <= instant <= seconds[-1]:
         raise DriftDataError(
             f"state={state!r} is neither 'mean', 'start', 'end' nor seconds within {seconds[0]:g} .. {seconds[-1]:g}"
         )
+    weights = np.zeros(seconds.size)
     after = int(np.searchsorted(seconds, instant))
     before = max(after - 1, 0)
     share = (instant - seconds[before]) / (seconds[after] - seconds[before]) if after > before else 0.0

@@ -183,28 +183,40 @@ def build_chart(
     )
 
 
-def compare(deviations: xr.Dataset) -> xr.Dataset:
-    """Set conventional and differenced standard deviations side by side.
+def compare(deviations: xr.Dataset, estimated: xr.Dataset | None = None) -> xr.Dataset:
+    """Set conventional and differenced standard deviations side by side, and that of the joint estimate.
 
     The ratio s_i / s of the differences is a property of the drift: 0.71 without any, 3.09 where the drift's own
     standard deviation is about 4.25 times the random one. It says nothing about an estimator's quality.
 
+    Parameters
+    ----------
+    deviations : xarray.Dataset
+    estimated : xarray.Dataset, optional
+        What `drift.estimate_drift` returns.
+
     Returns
     -------
     xarray.Dataset
-        Per direction and link, in um: conventional (of the link's further target), differenced, ratio.
+        Per direction and link, in um: conventional (of the link's further target), differenced, differenced_single
+        (divided by sqrt 2), joint (the scatter of the joint estimate, if given); ratio of the first two.
     """
     links = evaluate_neighbours(deviations)
-    conventional = evaluate_conventional(deviations)["standard_deviation"]
-    further = conventional.sel(target=links["link"].values).rename(target="link").drop_vars("link")
-    further = further.assign_coords(link=links["link"].values)
-    return xr.Dataset(
+    numbers = links["link"].values
+
+    def further(values: xr.DataArray) -> xr.DataArray:
+        return values.sel(target=numbers).rename(target="link").assign_coords(link=numbers)
+
+    conventional = further(evaluate_conventional(deviations)["standard_deviation"])
+    table = xr.Dataset(
         {
-            "conventional": further.assign_attrs(units="um"),
+            "conventional": conventional.assign_attrs(units="um"),
             "differenced": links["standard_deviation"],
-            "ratio": (further / links["standard_deviation"]).assign_attrs(units="1"),
+            "differenced_single": links["position_standard_deviation"],
+            "ratio": (conventional / links["standard_deviation"]).assign_attrs(units="1"),
         }
     )
+    return table if estimated is None else table.assign(joint=further(estimated["scatter"]))
 
 
 def telescoping_error(deviations: xr.Dataset) -> float:

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import optimize
+from scipy import optimize, stats
+
+from interferometry.jointfit import loadings_of
 
 Array = NDArray[np.float64]
 
@@ -17,6 +19,9 @@ SHARES = {"t63": 1 - math.exp(-1), "t95": 0.95}
 #: A spacing this close to a whole number of leads hides the screw's periodic error.
 SPACING_TOLERANCE = 0.02
 LONGEST_SEARCH_CYCLES = 100_000
+SHORTEST_TEST_CYCLES = 10
+#: An exponential is reported where it explains a component better than a constant at this level.
+SETTLING_LEVEL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -155,25 +160,40 @@ def estimate_settling(estimated: xr.Dataset, deviations: xr.Dataset) -> list[Set
     Returns
     -------
     list of Settling
-        One per drift component that changes by more than its noise; none for a stable machine.
+        One per drift component that settles; none for a stable machine.
     """
+    seconds, series = _cycle_components(estimated, deviations)
+    if seconds.size < SHORTEST_TEST_CYCLES:
+        return []
+    names = [str(name) for name in estimated["component"].values]
+    fitted = [_fit_exponential(name, seconds, series[:, at]) for at, name in enumerate(names)]
+    return [one for one in fitted if one is not None]
+
+
+def _cycle_components(estimated: xr.Dataset, deviations: xr.Dataset) -> tuple[Array, Array]:
+    """Return the middle of each measured cycle (s since the first reading) and its drift components, not smoothed in time."""
     time = deviations["time"].values.astype("datetime64[ns]")
     first = time[~np.isnat(time)].min()
-    seconds = np.array([(cycle[~np.isnat(cycle)] - first).astype("f8").mean() * 1e-9 for cycle in time])
-    found = []
-    for name in estimated["component"].values:
-        series = np.nanmean(estimated[f"drift_{name}"].values, axis=(1, 2))
-        noise = float(estimated["sigma"]) / math.sqrt(deviations.sizes["target"])
-        if np.ptp(series) > 4 * noise and series.size > 8:
-            found.append(_fit_exponential(str(name), seconds, series))
-    return found
+    left = (deviations["deviation"] - estimated["profile"]).transpose(*deviations["deviation"].dims).values
+    sign = np.where(deviations["direction"].values == "positive", 1.0, -1.0)[:, None] * np.ones(left.shape[2])
+    position = np.broadcast_to(deviations["position"].values, left.shape[1:])
+    span = float(deviations["position"].min()), float(deviations["position"].max())
+    loadings = loadings_of(sign.ravel(), position.ravel(), estimated["component"].values.tolist(), span)
+    seconds, rows = [], []
+    for cycle, values in zip(time, left, strict=True):
+        present = np.isfinite(values.ravel())
+        if np.linalg.matrix_rank(loadings[present]) < loadings.shape[1]:
+            continue
+        rows.append(np.linalg.lstsq(loadings[present], values.ravel()[present], rcond=None)[0])
+        seconds.append((cycle.ravel()[present] - first).astype("f8").mean() * 1e-9)
+    return np.array(seconds), np.array(rows)
 
 
-def _fit_exponential(name: str, seconds: Array, series: Array) -> Settling:
+def _fit_exponential(name: str, seconds: Array, series: Array) -> Settling | None:
     length = float(seconds[-1] - seconds[0])
 
     def solve(log_tau: float) -> tuple[float, Array, Array]:
-        basis = np.column_stack([np.ones(seconds.size), 1 - np.exp(-(seconds - seconds[0]) / math.exp(log_tau))])
+        basis = np.column_stack([np.ones(seconds.size), 1 - np.exp(-seconds / math.exp(log_tau))])
         coefficients = np.linalg.lstsq(basis, series, rcond=None)[0]
         left = series - basis @ coefficients
         return float(left @ left), coefficients, left
@@ -186,20 +206,28 @@ def _fit_exponential(name: str, seconds: Array, series: Array) -> Settling:
     lowest, coefficients, left = solve(float(best.x))
     lag = float((left[1:] * left[:-1]).sum() / max(float((left**2).sum()), 1e-300))
     independent = max(seconds.size * (1 - max(lag, 0.0)) / (1 + max(lag, 0.0)), 5.0)
-    limit = max(lowest, 1e-12) * (1 + 3.84 / max(independent - 3, 1.0))
-    inside = grid[sums <= limit]
-    low = math.exp(inside[0]) if inside.size else math.exp(best.x)
-    open_ended = inside.size > 0 and inside[-1] == grid[-1]
-    high = math.inf if open_ended else math.exp(inside[-1]) if inside.size else math.exp(best.x)
-    tau, start = math.exp(float(best.x)), float(seconds[0])
+    gain = (float(((series - series.mean()) ** 2).sum()) - lowest) / 2 / max(lowest / (independent - 3), 1e-300)
+    if stats.f.sf(gain, 2, independent - 3) > SETTLING_LEVEL:
+        return None
+    limit = max(lowest, 1e-12) * (1 + 3.84 / (independent - 3))
+
+    def side(end: float) -> float:
+        """Return where the sum of squares crosses the limit between the best time constant and an end of the search."""
+        if solve(end)[0] <= limit:
+            return end
+        return float(optimize.brentq(lambda one: solve(one)[0] - limit, float(best.x), end))
+
+    low, top = math.exp(side(grid[0])), side(grid[-1])
+    high = math.inf if top == grid[-1] else math.exp(top)
+    tau = math.exp(float(best.x))
     until = {key: -math.log(1 - share) for key, share in SHARES.items()}
     return Settling(
         component=name,
-        t63_s=start + tau * until["t63"],
-        t63_low_s=start + low * until["t63"],
-        t63_high_s=start + high * until["t63"],
-        t95_s=start + tau * until["t95"],
-        t95_low_s=start + low * until["t95"],
-        t95_high_s=start + high * until["t95"],
+        t63_s=tau * until["t63"],
+        t63_low_s=low * until["t63"],
+        t63_high_s=high * until["t63"],
+        t95_s=tau * until["t95"],
+        t95_low_s=low * until["t95"],
+        t95_high_s=high * until["t95"],
         amplitude_um=float(coefficients[1]),
     )

@@ -35,16 +35,10 @@ class Truth:
         return self.shift + self.stretch * self.position
 
     def mean_profile(self, present: np.ndarray) -> np.ndarray:
-        """Profile (direction, target) at the mean thermal state over time, the truth of the joint estimate."""
-        order = np.argsort(self.seconds[present])
-        t = self.seconds[present][order]
-        weights = np.zeros(t.size)
-        weights[1:] += np.diff(t) / 2
-        weights[:-1] += np.diff(t) / 2
-        weights /= weights.sum()
-        shift = float(weights @ self.shift[present][order])
-        stretch = float(weights @ self.stretch[present][order])
-        return self.profile + shift + stretch * self.position
+        """Profile (direction, target) at the mean thermal state of the measured cycles, each counted alike."""
+        weights = present / np.maximum(present.sum(axis=(1, 2), keepdims=True), 1)
+        weights = weights / weights.sum()
+        return self.profile + (weights * self.shift).sum() + (weights * self.stretch).sum() * self.position
 
 
 def schedule(cycles: int) -> np.ndarray:

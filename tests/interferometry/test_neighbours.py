@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from interferometry.drift import estimate_drift
 from interferometry.neighbours import (
     build_chart,
     compare,
@@ -17,7 +18,7 @@ from interferometry.neighbours import (
     simulate_derived_sequence,
     telescoping_error,
 )
-from tests.interferometry.simulated_campaigns import simulate
+from tests.interferometry.simulated_campaigns import SIGMA_UM, simulate
 
 
 def test_equations_4_and_6_to_the_letter(rng: np.random.Generator) -> None:
@@ -89,6 +90,14 @@ def test_conventional_s_is_drift_and_differenced_s_is_not(rng: np.random.Generat
     single = evaluate_neighbours(deviations)["position_standard_deviation"]
     # Random part 0.4 um, plus the stretch between neighbours, which differencing does not remove.
     assert 0.38 < float(single.mean()) < 0.47
+
+
+def test_three_standard_deviations_side_by_side(rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng)
+    table = compare(deviations, estimate_drift(deviations)).sel(direction="positive")
+    assert float(table["joint"].mean()) == pytest.approx(SIGMA_UM, abs=0.02)
+    assert (table["conventional"] > table["differenced"]).all()
+    assert table["ratio"].values == pytest.approx((table["conventional"] / table["differenced"]).values)
 
 
 def test_links_of_white_noise_are_correlated_by_minus_one_half(rng: np.random.Generator) -> None:
