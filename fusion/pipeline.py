@@ -21,6 +21,14 @@ from fusion.results import Notice, assemble
 from fusion.sources import read_source
 from fusion.stages import Outcome
 
+#: Where each stage keeps its Dataset; what ends up in fusion.nc is kept apart while it may have to be resumed.
+FILES = {
+    "fields": "fields.nc",
+    "deviations": "deviations.nc",
+    "correlation": ".stages/correlation.nc",
+    "model": ".stages/model.nc",
+}
+
 
 @dataclass
 class Run:
@@ -45,7 +53,7 @@ class Run:
         Parameters
         ----------
         name : str
-            Name of the stage and of its file, ``<name>.nc``.
+            Name of the stage.
         tables : tuple of str
             Tables of the campaign file that decide its result, with the files that they name.
         after : tuple of str
@@ -56,7 +64,7 @@ class Run:
         asked = self.campaign.model_dump(mode="json", include=set(tables))
         files = {file: self.inputs[file] for table in tables for file in self.campaign.files_of(table)}
         key = digest(name, versions(), asked, files, [self.keys[earlier] for earlier in after])
-        path = self.folder / f"{name}.nc"
+        path = self.folder / FILES[name]
         begun = time.monotonic()
         if self.stamps.done(name, key):
             note = self.stamps.note(name)
@@ -117,14 +125,22 @@ def run_campaign(
         lambda: stages.reduce_thermography(source, report=report),
     )
     deviations = run.stage("deviations", ("interferometry",), (), lambda: stages.evaluate_interferometry(source))
-    fused = run.stage(
-        "fusion",
-        ("plan", "interferometry", "drivers", "model"),
-        ("fields", "deviations"),
-        lambda: stages.fuse(source, fields, deviations, report=report),
+    fused, outside = stages.align_recordings(source, fields, deviations)
+    run.notices.extend(outside)
+    joint = ("plan", "interferometry", "drivers")
+    maps = run.stage(
+        "correlation", joint, ("fields", "deviations"), lambda: stages.correlate_field(fields, fused, report=report)
     )
+    model = run.stage(
+        "model",
+        (*joint, "model"),
+        ("fields", "deviations"),
+        lambda: stages.model_drift(source, fused, deviations, report=report),
+    )
+    fusion = stages.join_fusion(fused, maps, model)
+    write_dataset(folder / "fusion.nc", fusion)
     stages.write_exr(folder / "maps", fields, report=report)
-    return _finish(run, {"fields": fields, "deviations": deviations, "fusion": fused})
+    return _finish(run, {"fields": fields, "deviations": deviations, "fusion": fusion})
 
 
 def _finish(run: Run, datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:

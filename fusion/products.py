@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-STAMPS = ".stages.json"
+STAMPS = ".stages/stamps.json"
 _PARTIAL = ".partial"
 
 

@@ -78,7 +78,12 @@ def read_source(campaign: Campaign) -> Source:
     drivers = read_drivers(campaign.resolve(campaign.drivers.file)) if campaign.drivers is not None else None
     frames, rejected = index_frames(campaign.frame_paths())
     listed = [
-        {"file": relative_name(one.path, campaign.folder), "index": one.index, "reason": one.reason} for one in rejected
+        {
+            "file": relative_name(one.path, campaign.folder),
+            "index": one.index,
+            "reason": one.reason.replace(f"{campaign.folder}/", ""),
+        }
+        for one in rejected
     ]
     timed = [frame for frame in frames if not np.isnat(frame.time)]
     listed += [

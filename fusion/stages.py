@@ -19,7 +19,7 @@ from fusion.groups import group, joined
 from fusion.loop import LoopResult, close_loop
 from fusion.model import ModelFit, fit_model
 from fusion.products import write_atomically
-from fusion.progress import Report, step_of
+from fusion.progress import Report
 from fusion.readings import Readings, read_fused
 from fusion.results import Notice
 from fusion.sources import Source, counted, listed
@@ -35,9 +35,15 @@ from thermography.radiometry import calibrate
 from thermography.registration import Registration, register
 
 #: What each stage is called in progress and provenance.
-LABELS = {"fields": "thermal fields", "deviations": "deviations", "fusion": "drift and field"}
+LABELS = {
+    "fields": "thermal fields",
+    "deviations": "deviations",
+    "correlation": "correlation",
+    "model": "anomalies and closed loop",
+}
 #: The plan is registered on the mean of so many first frames: noise falls, and the table has hardly warmed yet.
 _REGISTRATION_FRAMES = 5
+_CORRELATION_CELL_MM = 10.0
 _KELVIN = 273.15
 
 
@@ -199,12 +205,28 @@ def by_direction(values: xr.DataArray) -> dict[str, list[float]]:
     return {str(name): np.asarray(values.sel(direction=name), float).tolist() for name in values["direction"].values}
 
 
-def fuse(source: Source, fields: xr.Dataset, deviations: xr.Dataset, *, report: Report) -> Outcome:
-    """Bring both recordings together, correlate drift and field, and close the loop."""
+def align_recordings(source: Source, fields: xr.Dataset, deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
+    """Give every reading the field, the environment and the drivers at its own time; note readings outside the frames' time."""
     fused = align(deviations, fields, source.axis, environment=source.environment, drivers=source.drivers)
-    share = step_of(report, "correlation")
-    share(0, 100)
-    maps = correlate(fused, fields["frame_temperature"], progress=lambda part: share(round(100 * part), 100))
+    return fused, outside_notices(fused)
+
+
+def correlate_field(fields: xr.Dataset, fused: xr.Dataset, *, report: Report) -> Outcome:
+    """Test every part of the field as a source of the drift.
+
+    The cells are averaged to about a centimetre first: within one cycle heat spreads further than that in steel, so nothing is lost
+    but noise and time.
+    """
+    cell = float(np.median(np.diff(fields["x"])))
+    block = max(1, int(_CORRELATION_CELL_MM / cell))
+    film = fields["frame_temperature"].coarsen(x=block, y=block, boundary="trim").mean()
+    report("correlation", 0, 100)
+    maps = correlate(fused, film, progress=lambda part: report("correlation", round(100 * part), 100))
+    return Outcome(maps, {"hotspots": hotspot_part(fields, maps)})
+
+
+def model_drift(source: Source, fused: xr.Dataset, deviations: xr.Dataset, *, report: Report) -> Outcome:
+    """Find positions that stand out and their cause, then close the loop on the others."""
     report("anomalies", 0, 1)
     anomalies = detect_anomalies(group(deviations, "drift"), deviations)
     diagnoses = diagnose(anomalies, fused)
@@ -216,15 +238,17 @@ def fuse(source: Source, fields: xr.Dataset, deviations: xr.Dataset, *, report: 
         set_aside=[(one.target, name) for one in anomalies for name in directions_of(one.direction)],
         progress=lambda done, total, what: report("closed loop", done, total),
     )
-    dataset = joined(fused, correlation=maps, loop=loop_variables(fused, readings, found))
-    dataset.attrs.update({f"correlation_{name}": value for name, value in maps.attrs.items()})
     parts = {
-        "hotspots": hotspot_part(fields, maps),
         "anomalies": [anomaly_part(*pair) for pair in zip(anomalies, diagnoses, strict=True)],
         "loop": found.as_json(),
     }
-    notices = [*outside_notices(fused), *(Notice("loop", text, "") for text in found.warnings)]
-    return Outcome(dataset, parts, tuple(notices))
+    return Outcome(loop_variables(fused, readings, found), parts)
+
+
+def join_fusion(fused: xr.Dataset, maps: xr.Dataset, loop: xr.Dataset) -> xr.Dataset:
+    """Return everything that joins both recordings in one Dataset, for fusion.nc."""
+    dataset = joined(fused, correlation=maps, loop=loop)
+    return dataset.assign_attrs({f"correlation_{name}": value for name, value in maps.attrs.items()})
 
 
 def directions_of(direction: str) -> tuple[str, ...]:

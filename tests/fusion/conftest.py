@@ -1,0 +1,52 @@
+"""A small campaign of the twin and its results, simulated and run once for all tests that look at products."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fusion.pipeline import run_campaign
+from fusion.twin import simulate_campaign
+
+RECIPE = """\
+[campaign]
+title = "Small campaign"
+axis = "X"
+seed = 5
+
+[test]
+cycles = 24
+targets = 6
+spacing_mm = 50
+period_s = 180
+
+[duty]
+kind = "random"
+mean_hold_min = 12
+
+[laser]
+noise_um = 0.3
+
+[[effect]]
+name = "reversal_drift"
+amplitude_um = 1.5
+"""
+
+
+@pytest.fixture(scope="session")
+def campaign_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A campaign of 24 cycles and 6 targets with a reversal that drifts, undeclared; cells of 20 mm keep it quick."""
+    folder = tmp_path_factory.mktemp("twin")
+    (folder / "recipe.toml").write_text(RECIPE)
+    campaign = simulate_campaign(folder / "recipe.toml", folder / "campaign")
+    campaign.write_text(campaign.read_text().replace('cell_size = "5 mm"', 'cell_size = "20 mm"'))
+    return campaign.parent
+
+
+@pytest.fixture(scope="session")
+def results_folder(campaign_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The products of that campaign, complete."""
+    out = tmp_path_factory.mktemp("run") / "results"
+    run_campaign(campaign_folder / "campaign.toml", out)
+    return out
