@@ -165,14 +165,14 @@ def find_steps(levels: Levels, *, smallest_step_K: float = 0.1, threshold: float
     fresh = np.flatnonzero(~levels.repeated)
     if fresh.size < 5:
         return []
-    excess, sigma = _excess_change(levels, fresh)
+    excess, rate, sigma = _excess_change(levels, fresh)
     candidates = np.flatnonzero(np.abs(excess) > max(smallest_step_K, threshold * sigma))
     level = levels.level[fresh]
     flags = []
     for place in candidates:
         step, u = _fit_step(levels.time[fresh], level, int(place), candidates)
         index = int(fresh[place])
-        stays = step * excess[place] > 0 and abs(step) > 0.5 * abs(excess[place])
+        stays = _remainder(levels.time[fresh], level, int(place), float(rate[place])) / excess[place] > 0.5
         together = levels.share[index] >= _SHARE_THAT_MOVES
         if stays and together:
             text = f"the picture jumped by {step:+.3f} K between two frames and stayed (flat-field correction)"
@@ -193,8 +193,8 @@ def anchor(levels: Levels, steps: Sequence[CameraFlag]) -> NDArray[np.float64]:
     return offset
 
 
-def _excess_change(levels: Levels, fresh: NDArray[np.intp]) -> tuple[NDArray[np.float64], float]:
-    """Return each change beyond what the local rate explains, K, and the robust standard deviation of such changes."""
+def _excess_change(levels: Levels, fresh: NDArray[np.intp]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Return each change beyond what the local rate explains (K), that rate (K/s), and the robust standard deviation of the excess."""
     level = levels.level[fresh]
     seconds = (levels.time[fresh] - levels.time[fresh[0]]).astype(np.int64) / 1000
     interval, change = np.diff(seconds), np.diff(level)
@@ -202,7 +202,15 @@ def _excess_change(levels: Levels, fresh: NDArray[np.intp]) -> tuple[NDArray[np.
     local_rate = ndimage.median_filter(rate, size=2 * _NEIGHBOUR_FRAMES + 1, mode="nearest")
     excess = np.concatenate(([0.0], change - local_rate * interval))
     sigma = float(stats.median_abs_deviation(excess[1:], scale="normal"))
-    return excess, sigma
+    return excess, np.concatenate(([0.0], local_rate)), sigma
+
+
+def _remainder(time: NDArray[np.datetime64], level: NDArray[np.float64], place: int, rate: float) -> float:
+    """Return how much higher the frames after `place` lie than those before it, beyond the local rate, K."""
+    before, after = slice(max(place - _NEIGHBOUR_FRAMES, 0), place), slice(place, place + _NEIGHBOUR_FRAMES)
+    seconds = (time - time[place]).astype(np.int64) / 1000
+    between = np.median(seconds[after]) - np.median(seconds[before])
+    return float(np.median(level[after]) - np.median(level[before]) - rate * between)
 
 
 def _fit_step(
@@ -328,14 +336,19 @@ def find_bad_pixels(counts: NDArray[np.uint16], *, threshold: float = 8.0) -> ND
 
 
 def _stands_out(picture: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
-    """Whether a pixel is off the median of its neighbourhood much further than its neighbours are off theirs.
+    """Whether a pixel is off its neighbours much further than the pixels around it are off theirs.
 
-    Along an edge of the scene many neighbours are off their median, so edges do not stand out.
+    Off means: further from all but two of the eight neighbours. On an edge or corner of the scene at least three neighbours
+    belong to the same surface, while clusters of up to three bad pixels still stand out.
     """
-    off = np.abs(picture - ndimage.median_filter(picture, size=3))
+    rows, columns = picture.shape
+    padded = np.pad(picture, 1, mode="reflect")
+    shifts = [(row, column) for row in range(3) for column in range(3) if (row, column) != (1, 1)]
+    distances = [np.abs(picture - padded[row : row + rows, column : column + columns]) for row, column in shifts]
+    off = np.partition(distances, 2, axis=0)[2]
     ring = np.ones((5, 5), bool)
     ring[2, 2] = False
-    neighbours = ndimage.percentile_filter(off, 90, footprint=ring)
-    typical = max(float(np.median(off[off > 0])), 1.0) if (off > 0).any() else 1.0
-    result: NDArray[np.bool_] = off > threshold * np.maximum(neighbours, typical)
+    around = ndimage.percentile_filter(off, 90, footprint=ring)
+    typical = max(float(np.median(off)), 1.0)
+    result: NDArray[np.bool_] = off > threshold * np.maximum(around, typical)
     return result
