@@ -8,52 +8,25 @@ family-wise p value compares it with the maximum over all cells, lags and channe
 Two limits are built into the answer. A session that is one warm-up moves every series along one curve; it is tested beside free
 exponentials and its best verdict is "not separable". And a map without a finding says how large an effect it would have found.
 
-Sources of the procedure: Harris (2020), bioRxiv 2020.11.29.402719 (nonsense correlations); Westfall and Young (1993),
-*Resampling-based multiple testing*; Benjamini and Hochberg (1995), J. R. Stat. Soc. B 57, 289.
+Sources of the procedure: Harris (2020), bioRxiv 2020.11.29.402719 (nonsense correlations);
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from fusion.attribution_kernel import (
-    Array32,
-    NullBank,
-    estimate_effects,
-    likelihood_ratios,
-    null_bank,
-    resample,
-    tiles,
-    whiten_series,
-)
-from fusion.channels import (
-    Array,
-    ClockedReadings,
-    DriftSeries,
-    lag_operators,
-    read_clock,
-    reduce_channels,
-    target_series,
-)
-from fusion.excitation import Excitation, describe_excitation, warm_up_columns
+from fusion.attribution import LAGS_S, LEVEL, Film, Tested, evaluate_film
+from fusion.channels import Array, ClockedReadings, DriftSeries, read_clock, reduce_channels, target_series
+from fusion.excitation import Excitation, describe_excitation
 
-#: Time constants of the first-order lags, s.
-LAGS_S = (0.0, 600.0, 1200.0, 2400.0, 3600.0, 5400.0)
-#: Family-wise level of the verdicts.
-LEVEL = 0.05
 #: Verdict codes of the maps, in the order of the CF flag meanings.
 NOT_ATTRIBUTABLE, ATTRIBUTABLE, NOT_SEPARABLE = 0, 1, 2
 _FLAG_MEANINGS = "not_attributable attributable not_separable"
-#: Standard normal quantile of 0.8: an effect is found with 80 % power this many uncertainties above the threshold.
-_POWER_80 = 0.8416
-#: Bins of the pooled null distribution of one cell's statistic.
-_BINS = np.concatenate([np.arange(0.0, 40.0, 0.1), [np.inf]])
 #: Cells with gaps in up to this share of the frames are filled by interpolation in time; others are left out.
 _GAP_SHARE = 0.2
 
@@ -62,55 +35,13 @@ class CorrelationError(ValueError):
     """The field cannot be correlated with the drift; the message says what is missing."""
 
 
-@dataclass(frozen=True)
-class Film:
-    """Temperatures to test: columns over time.
-
-    Attributes
-    ----------
-    seconds : (frames,) s since the first frame
-    values : (frames, columns) temperature minus its mean over time, K
-    """
-
-    seconds: Array
-    values: Array
-
-
-@dataclass(frozen=True)
-class Tested:
-    """What the test of one film found; columns are cells, regions or modes.
-
-    Attributes
-    ----------
-    names : (channels,) with "joint" (common and proportional together) last where both exist
-    statistic, lag_index : (channels, columns) likelihood ratio and the lag that it was reached at
-    p_value, q_value : (channels, columns) family-wise over everything tested, and false-discovery rate within the channel
-    coefficient, coefficient_u, detectable : (channels, columns) um per K
-    threshold : (channels,) of the statistic at the family-wise level
-    null_maxima : (draws, channels) maximum statistic of every redrawn null
-    false_alarm_rate : share of fresh nulls in which anything passed the threshold
-    """
-
-    names: tuple[str, ...]
-    statistic: Array
-    lag_index: NDArray[np.int64]
-    p_value: Array
-    q_value: Array
-    coefficient: Array
-    coefficient_u: Array
-    detectable: Array
-    threshold: Array
-    null_maxima: Array
-    false_alarm_rate: float
-    banks: tuple[NullBank, ...]
-
-
 def correlate(
     fused_readings: xr.Dataset,
     field: xr.DataArray,
     *,
     lags_s: Sequence[float] = LAGS_S,
     draws: int = 499,
+    checks: int = 199,
     per_target: bool = False,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
@@ -126,7 +57,9 @@ def correlate(
     lags_s : sequence of float
         Time constants of the first-order response, s.
     draws : int
-        Series redrawn from the fitted null.
+        Series redrawn from the fitted null, which set the threshold.
+    checks : int
+        Fresh nulls on which the rate of false alarms of this threshold is measured.
     per_target : bool
         Also test every target and direction by itself (16 times the work for 16 targets).
     seed : int
@@ -154,7 +87,14 @@ def correlate(
     series = reduce_channels(readings)
     excitation = describe_excitation(film.seconds, film.values)
     tested = evaluate_film(
-        series, film, excitation, lags_s=lags_s, draws=draws, rng=np.random.default_rng(seed), progress=progress
+        series,
+        film,
+        excitation,
+        lags_s=lags_s,
+        draws=draws,
+        checks=checks,
+        rng=np.random.default_rng(seed),
+        progress=progress,
     )
     dataset = _lay_out(tested, series, film, seen, field, lags_s, excitation)
     dataset.attrs["readings_outside_film"] = readings.outside_film
@@ -182,147 +122,6 @@ def read_film(field: xr.DataArray, frame_seconds: Array) -> tuple[Film, NDArray[
     return Film(frame_seconds, values - values.mean(axis=0)), seen
 
 
-def evaluate_film(
-    series: Sequence[DriftSeries],
-    film: Film,
-    excitation: Excitation,
-    *,
-    lags_s: Sequence[float] = LAGS_S,
-    draws: int = 499,
-    rng: np.random.Generator,
-    progress: Callable[[float], None] | None = None,
-) -> Tested:
-    """Test all columns of a film as sources of all series, with one family-wise error over columns, lags and series.
-
-    The first two series, where they are "common" and "proportional", are also tested together at the same lag.
-    """
-    operators = lag_operators(film.seconds, lags_s)
-    responses = [np.stack([one.sampling @ operator for operator in operators]).astype(np.float32) for one in series]
-    cells32 = film.values.astype(np.float32)
-    banks = tuple(
-        null_bank(one.values, one.seconds, one.variance, nuisance_columns(one.seconds, excitation)) for one in series
-    )
-    names = [one.name for one in series]
-    joint = names[:2] == ["common", "proportional"]
-    if joint:
-        names.append("joint")
-    stacks = _draw(series, banks, draws, rng)
-    whitened = [whiten_series(bank, stack) for bank, stack in zip(banks, stacks, strict=True)]
-
-    columns, lags = film.values.shape[1], len(lags_s)
-    statistic = np.zeros((len(names), columns))
-    lag_index = np.zeros((len(names), columns), int)
-    maxima = np.zeros((len(names), whitened[0].series.shape[1] - 1))
-    pooled = np.zeros((len(names), _BINS.size - 1))
-    effects = np.zeros((3, len(names), columns))
-    effects[1:] = np.inf
-    for tile in tiles(columns * lags, lags):
-        cells = slice(tile.start // lags, tile.stop // lags)
-        ratios = []
-        estimates = []
-        for response, bank, white in zip(responses, banks, whitened, strict=True):
-            regressors = _respond_tile(response, cells32[:, cells])
-            ratios.append(likelihood_ratios(bank, white, regressors).reshape(-1, cells.stop - cells.start, lags))
-            estimates.append(estimate_effects(bank, regressors))
-        if joint:
-            ratios.append(ratios[0] + ratios[1])
-        for c, ratio in enumerate(ratios):
-            best = ratio.max(axis=2)
-            chosen = ratio[0].argmax(axis=1)
-            statistic[c, cells] = best[0]
-            lag_index[c, cells] = chosen
-            maxima[c] = np.maximum(maxima[c], best[1:].max(axis=1))
-            pooled[c] += np.histogram(best[1:], _BINS)[0]
-            if c < len(series):
-                pick = np.arange(best.shape[1]) * lags + chosen
-                found = estimates[c]
-                effects[:, c, cells] = found.coefficient[pick], found.coefficient_u[pick], found.null_u[pick]
-            else:
-                # The joint effect is that at the far end of travel: common plus proportional at +1.
-                pick = np.arange(best.shape[1]) * lags + chosen
-                effects[0, c, cells] = estimates[0].coefficient[pick] + estimates[1].coefficient[pick]
-                for row, part in ((1, "coefficient_u"), (2, "null_u")):
-                    effects[row, c, cells] = np.hypot(
-                        getattr(estimates[0], part)[pick], getattr(estimates[1], part)[pick]
-                    )
-        if progress is not None:
-            progress(tile.stop / (columns * lags))
-    # Half of the redrawn nulls set the threshold, the other half, with their own drift size, measure what it lets through.
-    calibration, check = maxima[:, :draws], maxima[:, draws:]
-    p_value, threshold = _family_wise(statistic, calibration)
-    return Tested(
-        names=tuple(names),
-        statistic=statistic,
-        lag_index=lag_index,
-        p_value=p_value,
-        q_value=np.stack([_false_discovery(row, counts) for row, counts in zip(statistic, pooled, strict=True)]),
-        coefficient=effects[0],
-        coefficient_u=effects[1],
-        detectable=(np.sqrt(threshold)[:, None] + _POWER_80) * effects[2],
-        threshold=threshold,
-        null_maxima=calibration.T,
-        false_alarm_rate=float((check >= threshold[:, None]).any(axis=0).mean()),
-        banks=banks,
-    )
-
-
-def nuisance_columns(seconds: Array, excitation: Excitation) -> Array:
-    """Columns of every hypothesis: level and trend, and for a session that is one warm-up also free exponentials."""
-    centred = (seconds - seconds.mean()) / max(float(np.ptp(seconds)), 1e-9)
-    columns = np.column_stack([np.ones_like(seconds), centred])
-    if not excitation.warm_up_only:
-        return columns
-    return np.column_stack([columns, warm_up_columns(seconds)])
-
-
-def _draw(
-    series: Sequence[DriftSeries], banks: Sequence[NullBank], draws: int, rng: np.random.Generator
-) -> list[Array]:
-    """The measured series, `draws` nulls with permuted residuals, and as many Gaussian nulls from refitted drifts, stacked."""
-    longest = max(one.values.size for one in series)
-    keys = rng.random((draws, longest))
-    stacks = []
-    for one, bank in zip(series, banks, strict=True):
-        orders = np.argsort(keys[:, : one.values.size], axis=1)
-        stacks.append(np.vstack([one.values, resample(bank, orders), resample(bank, orders, rng)]))
-    return stacks
-
-
-def _respond_tile(response: Array32, cells: Array32) -> Array32:
-    """Regressors (n, cells * lags), lags innermost, of film cells (frames, cells) under responses (lags, n, frames)."""
-    seen = np.tensordot(response, cells, axes=(2, 0))
-    return np.ascontiguousarray(seen.transpose(1, 2, 0)).reshape(seen.shape[1], -1)
-
-
-def _family_wise(statistic: Array, maxima: Array) -> tuple[Array, Array]:
-    """Family-wise p (channels, columns) and thresholds (channels,): smallest p over channels against its own null."""
-    channels, draws = maxima.shape
-    ordered = np.sort(maxima, axis=1)
-
-    def exceed(channel: int, values: Array) -> Array:
-        return (draws - np.searchsorted(ordered[channel], values, side="left") + 1.0) / (draws + 1.0)
-
-    smallest = np.sort(np.min([exceed(c, maxima[c]) for c in range(channels)], axis=0))
-    single = np.stack([exceed(c, statistic[c]) for c in range(channels)])
-    p_value = (np.searchsorted(smallest, single, side="right") + 1.0) / (draws + 1.0)
-    # The largest single-channel p that is still significant after the step over channels sets each channel's threshold.
-    admitted = smallest[max(int(np.floor(LEVEL * (draws + 1))) - 1, 0)]
-    rank = np.clip(np.ceil((1.0 - admitted) * (draws + 1)).astype(int), 1, draws) - 1
-    return np.minimum(p_value, 1.0), ordered[:, rank]
-
-
-def _false_discovery(statistic: Array, counts: Array) -> Array:
-    """Benjamini-Hochberg q values of one channel from the pooled null distribution of one cell's statistic."""
-    above = np.cumsum(counts[::-1])[::-1]
-    place = np.clip(np.searchsorted(_BINS, statistic, side="right") - 1, 0, counts.size - 1)
-    p = (above[place] + 1.0) / (counts.sum() + 1.0)
-    order = np.argsort(p)
-    scaled = p[order] * p.size / np.arange(1, p.size + 1)
-    q = np.empty_like(p)
-    q[order] = np.minimum(np.minimum.accumulate(scaled[::-1])[::-1], 1.0)
-    return q
-
-
 def _session_verdict(p_value: Array, excitation: Excitation) -> int:
     if excitation.warm_up_only:
         return NOT_SEPARABLE
@@ -338,6 +137,80 @@ def _naive(series: DriftSeries, film: Film) -> Array:
     return (values @ seen) / np.where(size > 0, size, 1.0)
 
 
+def describe(
+    tested: Tested, series: Sequence[DriftSeries], film: Film, lags_s: Sequence[float], excitation: Excitation
+) -> dict[str, tuple[Array, dict[str, Any]]]:
+    """What the test found per channel and column, by name: values (channels, columns) and attributes with units."""
+    verdict = np.where(tested.p_value <= LEVEL, ATTRIBUTABLE, NOT_ATTRIBUTABLE)
+    if excitation.warm_up_only:
+        verdict = np.full_like(verdict, NOT_SEPARABLE)
+    naive = [_naive(one, film) for one in series]
+    naive += naive[:1] * (len(tested.names) - len(series))
+    per_kelvin = {"units": "um/K"}
+    return {
+        "statistic": (tested.statistic, {"units": "1", "long_name": "profile likelihood ratio"}),
+        "p_value": (tested.p_value, {"units": "1", "long_name": "family-wise p value"}),
+        "q_value": (tested.q_value, {"units": "1", "long_name": "false-discovery rate"}),
+        "sensitivity": (tested.coefficient, {**per_kelvin, "long_name": "drift per rise of this place"}),
+        "sensitivity_u": (tested.coefficient_u, {**per_kelvin, "long_name": "standard uncertainty of the sensitivity"}),
+        "detectable_sensitivity": (
+            tested.detectable,
+            {**per_kelvin, "long_name": "sensitivity found with 80 % power at this place"},
+        ),
+        "lag": (
+            np.asarray(lags_s, float)[tested.lag_index],
+            {"units": "s", "long_name": "time constant of the response"},
+        ),
+        "verdict": (
+            verdict.astype(np.int8),
+            {"flag_values": np.array([0, 1, 2], np.int8), "flag_meanings": _FLAG_MEANINGS},
+        ),
+        "naive_correlation": (
+            np.stack(naive),
+            {"units": "1", "long_name": "plain correlation, for contrast only: two trending series always correlate"},
+        ),
+    }
+
+
+def describe_session(tested: Tested, excitation: Excitation) -> xr.Dataset:
+    """What holds for the whole session: thresholds, noise and unexplained drift per channel, false alarms, verdict."""
+    nulls = list(tested.banks) + [tested.banks[0]] * (len(tested.names) - len(tested.banks))
+    per_channel: dict[str, tuple[list[float], dict[str, Any]]] = {
+        "threshold": (tested.threshold.tolist(), {"units": "1", "long_name": "statistic at a family-wise p of 0.05"}),
+        "noise": ([bank.sigma for bank in nulls], {"units": "um", "long_name": "noise of one value of the channel"}),
+        "unexplained_drift": (
+            [bank.drift_per_hour for bank in nulls],
+            {"units": "um", "long_name": "standard deviation over one hour of the drift that nothing explains"},
+        ),
+        "drift_order": (
+            [float(bank.fitted.order) for bank in nulls],
+            {"units": "1", "long_name": "0 none, 1 random walk, 2 integrated random walk"},
+        ),
+    }
+    session = _session_verdict(tested.p_value, excitation)
+    return xr.Dataset(
+        {name: (("channel",), values, attrs) for name, (values, attrs) in per_channel.items()}
+        | {
+            "false_alarm_rate": (
+                (),
+                tested.false_alarm_rate,
+                {"units": "1", "long_name": "share of fresh nulls flagged"},
+            ),
+            "warm_up_share": (
+                (),
+                excitation.warm_up_share,
+                {"units": "1", "long_name": "share of the field's course that one warm-up explains"},
+            ),
+        },
+        coords={"channel": list(tested.names)},
+        attrs={
+            "verdict": _FLAG_MEANINGS.split()[session].replace("_", " "),
+            "excitation": "warm-up only" if excitation.warm_up_only else "varied",
+            "draws": tested.null_maxima.shape[0],
+        },
+    )
+
+
 def _lay_out(
     tested: Tested,
     series: Sequence[DriftSeries],
@@ -347,73 +220,18 @@ def _lay_out(
     lags_s: Sequence[float],
     excitation: Excitation,
 ) -> xr.Dataset:
-    """The findings as maps with units."""
-    shape = (len(tested.names), field.sizes["y"], field.sizes["x"])
+    """The findings as maps; cells that were not tested are NaN, their verdict "not attributable"."""
+    dataset = describe_session(tested, excitation).assign_coords(y=field["y"], x=field["x"])
+    for name, (values, attrs) in describe(tested, series, film, lags_s, excitation).items():
+        blank = np.zeros if values.dtype.kind == "i" else _nans
+        whole = blank((values.shape[0], seen.size), dtype=values.dtype)
+        whole[:, seen] = values if values.dtype.kind == "i" else np.where(np.isfinite(values), values, np.nan)
+        dataset[name] = (("channel", "y", "x"), whole.reshape(-1, field.sizes["y"], field.sizes["x"]), attrs)
+    return dataset
 
-    def spread(values: Array) -> Array:
-        whole = np.full((values.shape[0], seen.size), np.nan)
-        whole[:, seen] = np.where(np.isfinite(values), values, np.nan)
-        return whole.reshape(values.shape[0], *shape[1:])
 
-    dims = ("channel", "y", "x")
-    verdict = np.where(tested.p_value <= LEVEL, ATTRIBUTABLE, NOT_ATTRIBUTABLE)
-    if excitation.warm_up_only:
-        verdict = np.full_like(verdict, NOT_SEPARABLE)
-    session = _session_verdict(tested.p_value, excitation)
-    naive = [_naive(one, film) for one in series]
-    if len(tested.names) > len(series):
-        naive.append(naive[0])
-    lags = np.asarray(lags_s, float)[tested.lag_index]
-    nulls = list(tested.banks) + [tested.banks[0]] * (len(tested.names) - len(series))
-    per_kelvin = {"units": "um/K"}
-    maps: dict[str, tuple[tuple[str, ...], Array, dict[str, Any]]] = {
-        "statistic": (dims, spread(tested.statistic), {"units": "1", "long_name": "profile likelihood ratio"}),
-        "p_value": (dims, spread(tested.p_value), {"units": "1", "long_name": "family-wise p value"}),
-        "q_value": (dims, spread(tested.q_value), {"units": "1", "long_name": "false-discovery rate"}),
-        "sensitivity": (dims, spread(tested.coefficient), {**per_kelvin, "long_name": "drift per rise of this cell"}),
-        "sensitivity_u": (dims, spread(tested.coefficient_u), per_kelvin),
-        "detectable_sensitivity": (
-            dims,
-            spread(tested.detectable),
-            {**per_kelvin, "long_name": "sensitivity found with 80 % power at this place"},
-        ),
-        "lag": (dims, spread(lags), {"units": "s", "long_name": "time constant of the response"}),
-        "verdict": (
-            dims,
-            np.nan_to_num(spread(verdict.astype(float))).astype(np.int8),
-            {"flag_values": np.array([0, 1, 2], np.int8), "flag_meanings": _FLAG_MEANINGS},
-        ),
-        "naive_correlation": (
-            dims,
-            spread(np.stack(naive)),
-            {"units": "1", "long_name": "plain correlation, for contrast only: two trending series always correlate"},
-        ),
-        "threshold": (("channel",), tested.threshold, {"units": "1", "long_name": "statistic at p = 0.05"}),
-        "noise": (
-            ("channel",),
-            np.array([bank.sigma for bank in nulls]),
-            {"units": "um", "long_name": "noise of one value of the channel"},
-        ),
-        "unexplained_drift": (
-            ("channel",),
-            np.array([bank.drift_per_hour for bank in nulls]),
-            {"units": "um", "long_name": "drift over one hour that nothing explains"},
-        ),
-        "drift_order": (
-            ("channel",),
-            np.array([bank.fitted.order for bank in nulls]),
-            {"long_name": "0 none, 1 random walk, 2 integrated random walk"},
-        ),
-        "false_alarm_rate": ((), np.array(tested.false_alarm_rate), {"units": "1"}),
-        "warm_up_share": ((), np.array(excitation.warm_up_share), {"units": "1"}),
-    }
-    coords = {"channel": list(tested.names), "y": field["y"], "x": field["x"]}
-    attrs = {
-        "verdict": _FLAG_MEANINGS.split()[session].replace("_", " "),
-        "excitation": "warm-up only" if excitation.warm_up_only else "varied",
-        "draws": tested.null_maxima.shape[0],
-    }
-    return xr.Dataset(maps, coords=coords, attrs=attrs)
+def _nans(shape: tuple[int, int], dtype: np.dtype[Any]) -> Array:
+    return np.full(shape, np.nan, dtype=dtype)
 
 
 def _correlate_targets(

@@ -36,7 +36,10 @@ from fusion.explanations import (
 Cause = Literal["structural", "local_temperature", "stick_slip", "step", "undetermined"]
 
 #: Least probability of each cause. tests/fusion/test_diagnosis_thresholds.py sets and checks them on simulated campaigns.
-THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "stick_slip": 0.85, "step": 0.6}
+THRESHOLDS: dict[str, float] = {"structural": 0.4, "local_temperature": 0.8, "stick_slip": 0.5, "step": 0.6}
+#: An effect bound to the approach must explain scatter better than equal scatter in both directions by this much (nats); plain
+#: scatter does so by chance in one case of twenty.
+APPROACH_NATS = 1.7
 #: Level of the bootstrap tests that a lasting cause must pass.
 LEVEL = 0.05
 
@@ -151,7 +154,7 @@ def weigh(case: _Case) -> dict[str, float]:
     cycles = case.residual.seconds.size
     one = 0.5 * float(np.log(cycles))
     scatter = case.memoryless
-    sticking = max(scatter.one_direction, scatter.along_approach) - float(np.log(2.0))
+    sticking = max(scatter.one_direction, scatter.along_approach) - APPROACH_NATS
     share = 1.0 / (1.0 + float(np.exp(np.clip(scatter.both - sticking, -50, 50))))
     score = {
         "structural": case.slow.white + float(np.log(max(1.0 - share, 1e-30))),

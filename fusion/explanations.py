@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from fusion.attribution_kernel import (
     NullBank,
@@ -327,58 +327,58 @@ def memoryless_likelihoods(residual: Residual) -> Memoryless:
     rows = [row[np.isfinite(row)] for row in residual.values]
     rows = [row - row.mean() if row.size else row for row in rows]
     usual = residual.typical_um
-    with_spread = [usual * factor for factor in np.exp(np.linspace(-0.2, 0.2, 9))]
-    prior = [-0.5 * (np.log(scale / usual) / _SIGMA_SPREAD) ** 2 for scale in with_spread]
-    extra = usual * np.geomspace(0.1, 4.0, 25)
-
-    def gaussian(row: Array, sigma: float) -> float:
-        return float(stats.norm.logpdf(row, scale=sigma).sum())
-
-    def larger(row: Array, sigma: float) -> float:
-        return max(gaussian(row, float(np.hypot(sigma, more))) for more in extra)
-
-    def rare(sigma: float, more: float) -> float:
-        wide = float(np.hypot(sigma, more / np.sqrt(_RARE_SHARE)))
-        return sum(
-            float(
-                np.logaddexp(
-                    np.log(1 - _RARE_SHARE) + stats.norm.logpdf(row, scale=sigma),
-                    np.log(_RARE_SHARE) + stats.norm.logpdf(row, scale=wide),
-                ).sum()
-            )
-            for row in rows
-        )
-
-    def sticking(sigma: float, more: float, sign: float) -> float:
-        along = np.concatenate([sign * rows[0], -sign * rows[1]])
-        always = float(stats.exponnorm.logpdf(along + more, more / sigma, scale=sigma).sum())
-        amount = more / np.sqrt(2 * _RARE_SHARE)
-        centred = along + _RARE_SHARE * amount
-        now_and_then = np.logaddexp(
-            np.log(1 - _RARE_SHARE) + stats.norm.logpdf(centred, scale=sigma),
-            np.log(_RARE_SHARE) + stats.exponnorm.logpdf(centred, amount / sigma, scale=sigma),
-        )
-        return max(always, float(now_and_then.sum()))
-
-    both = max(
-        p
-        + max(
-            max(sum(gaussian(row, float(np.hypot(sigma, more))) for row in rows), rare(sigma, more)) for more in extra
-        )
-        for sigma, p in zip(with_spread, prior, strict=True)
-    )
-    sides = [
-        max(
-            p + larger(rows[side], sigma) + gaussian(rows[1 - side], sigma)
-            for sigma, p in zip(with_spread, prior, strict=True)
-        )
-        for side in (0, 1)
-    ]
+    spread = np.exp(np.linspace(-2.0, 2.0, 9) * _SIGMA_SPREAD)
+    prior = -0.5 * np.linspace(-2.0, 2.0, 9)[:, None] ** 2
+    sigma = usual * spread[:, None]
+    # Explanations live on the grid (usual scatter of this target, extra scatter), both in um.
+    extra = usual * np.geomspace(0.1, 4.0, 25)[None, :]
+    wide = np.hypot(sigma, extra)
+    rare = np.hypot(sigma, extra / np.sqrt(_RARE_SHARE))
+    steady = sum((_gaussian(row, wide) for row in rows), np.zeros_like(wide))
+    bursts = sum((_mixture(_normal(row, sigma), _normal(row, rare)) for row in rows), np.zeros_like(wide))
+    both = float((prior + np.maximum(steady, bursts)).max())
+    sides = [float((prior + _gaussian(rows[k], wide) + _gaussian(rows[1 - k], sigma)).max()) for k in (0, 1)]
     along = [
-        max(p + sticking(sigma, more, sign) for sigma, p in zip(with_spread, prior, strict=True) for more in extra)
+        float((prior + _sticking(np.concatenate([sign * rows[0], -sign * rows[1]]), sigma, extra)).max())
         for sign in (-1.0, 1.0)
     ]
     return Memoryless(both, max(sides), max(along), int(np.argmax(sides)), along[0] > along[1])
+
+
+def _normal(row: Array, sigma: Array) -> Array:
+    """Log-density of every reading under every sigma, (..., n)."""
+    scaled = row / sigma[..., None]
+    return -0.5 * (scaled**2 + np.log(2.0 * np.pi)) - np.log(sigma)[..., None]
+
+
+def _gaussian(row: Array, sigma: Array) -> Array:
+    return _normal(row, sigma).sum(axis=-1)
+
+
+def _mixture(usual: Array, disturbed: Array) -> Array:
+    """Log-likelihood where a small share of the readings is disturbed."""
+    return np.logaddexp(np.log(1 - _RARE_SHARE) + usual, np.log(_RARE_SHARE) + disturbed).sum(axis=-1)
+
+
+def _one_sided(amounts: Array, sigma: Array, mean: Array) -> Array:
+    """Log-density of normal noise plus an exponential amount (Grushka 1972, Anal. Chem. 44, 1733)."""
+    rate = sigma / mean
+    scaled = amounts / sigma[..., None]
+    return (
+        -np.log(mean)[..., None]
+        + 0.5 * rate[..., None] ** 2
+        - scaled * rate[..., None]
+        + special.log_ndtr(scaled - rate[..., None])
+    )
+
+
+def _sticking(along: Array, sigma: Array, extra: Array) -> Array:
+    """Readings along the motion, centred: an exponential amount at every approach, or at a small share of them."""
+    sigma, extra = np.broadcast_arrays(sigma, extra)
+    always = _one_sided(along + extra[..., None], sigma, extra).sum(axis=-1)
+    amount = extra / np.sqrt(2.0 * _RARE_SHARE)
+    centred = along + _RARE_SHARE * amount[..., None]
+    return np.maximum(always, _mixture(_normal(centred, sigma), _one_sided(centred, sigma, amount)))
 
 
 def warm_up_like(seconds: Array, temperature: Array) -> float:
