@@ -17,7 +17,7 @@ Array = NDArray[Any]
 LADDER: tuple[tuple[str, int], ...] = (("homography", 0), ("homography+k1", 1), ("homography+k1,k2,p1,p2", 4))
 
 #: A richer lens model is taken only if it lowers the leave-one-out error to less than this part.
-LADDER_GAIN = 0.85
+LADDER_GAIN = 0.75
 
 #: Points on the rim of a disc whose image polygon's centroid predicts the disc's centroid; 24 err by less than 0.1 % of the bias.
 RIM = np.exp(2j * np.pi * np.arange(24) / 24)
