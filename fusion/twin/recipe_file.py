@@ -119,6 +119,9 @@ def check_recipe(recipe: Recipe) -> Recipe:
             raise RecipeError(f"anomaly {number}: target = {anomaly.target}; the test has targets 1 to {targets}")
     for number, effect in enumerate(recipe.effect, 1):
         _check_effect(effect, number)
+    for name in ("reflected_source", "sensor_fault"):
+        if sum(effect.name == name for effect in recipe.effect) > 1:
+            raise RecipeError(f"effect {name} is there more than once; the twin has one of it, remove the others")
     return recipe
 
 

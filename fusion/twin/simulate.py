@@ -5,7 +5,7 @@ Nothing is rendered here; a campaign of 100 cycles takes well under a second, so
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ PROBE_AT_MM = (640.0, 30.0)
 class Truth:
     """What the instruments recorded and why.
 
+    `recipe` is the one that was asked for, with the size of a sensor's fault found.
     `readings` (cycle, direction, target): `deviation` as measured (NaN where lost), `time`, and one variable per part of it, um;
     their names are `parts`. `frames` (time): what the camera adds of its own. `plate` gives the true field anywhere, any time.
     """
@@ -89,6 +90,7 @@ def simulate(recipe: Recipe) -> Truth:
     air = simulate_air(recipe.room, grid_s, seed)
     plate, local_rise = _heat(recipe, schedule, grid_s, duty, air)
     session = _session(recipe, schedule, grid_s, duty, air, plate)
+    recipe = replace(recipe, effect=tuple(_size_fault(effect, session) for effect in recipe.effect))
 
     line = plate.line_integrals(schedule.positions_mm)
     line -= [np.interp(0.0, grid_s, column) for column in line.T]
@@ -239,11 +241,26 @@ def _session(recipe: Recipe, schedule: Schedule, grid_s: Floats, duty: Floats, a
 
 
 def _scale(effect: EffectRecipe, recipe: Recipe, session: Session) -> Floats:
-    """Return an effect's series in um, scaled to the rms that the recipe asks for."""
+    """Return an effect's series in um, scaled to the rms that the recipe asks for (a sensor's fault is scaled before)."""
     value = EFFECTS[effect.name].series(session, **effect.parameters)
-    if effect.amplitude_um is None:
+    if effect.amplitude_um is None or effect.name == "sensor_fault":
         return value
     return np.asarray(value * _gain(effect.amplitude_um, spread(value, session), f"effect {effect.name}"))
+
+
+def _size_fault(effect: EffectRecipe, session: Session) -> EffectRecipe:
+    """Return a sensor's fault with the jump that gives the wanted rms: what is logged and what the laser errs by stay one."""
+    if effect.name != "sensor_fault" or effect.amplitude_um is None:
+        return effect
+    parameters = EFFECTS[effect.name].parameters | effect.parameters
+    if parameters["kind"] == "stuck":
+        raise RecipeError(
+            "effect sensor_fault: a stuck sensor errs by what it misses; remove amplitude_um, or use kind = 'jump'"
+        )
+    for _ in range(8):
+        found = spread(EFFECTS[effect.name].series(session, **parameters), session)
+        parameters["size"] *= _gain(effect.amplitude_um, found, "effect sensor_fault")
+    return replace(effect, parameters=parameters)
 
 
 def _scale_camera(effect: EffectRecipe, recipe: Recipe, session: Session) -> Floats:

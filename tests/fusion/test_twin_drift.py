@@ -112,6 +112,17 @@ def test_sensor_fault_is_believed_and_logged():
     assert error[-1, :, -1].mean() == pytest.approx(0.57, abs=0.02)
 
 
+@pytest.mark.parametrize("sensor", ["air_temperature", "air_pressure"])
+def test_sensor_fault_of_a_given_rms_logs_the_jump_that_causes_it(plain, sensor):
+    truth = with_effect("sensor_fault", 0.4, at_cycle=20, sensor=sensor)
+    jump = float((environment_log(truth)[sensor] - environment_log(plain)[sensor])[-1])
+    per_unit = {"air_temperature": 0.955e-3, "air_pressure": -0.268e-3}[sensor]
+    # a step after 19 of 40 cycles has the rms 0.4994 of its height; the sensitivities are those of 20 degC and 1013.25 hPa, and
+    # n - 1 is proportional to p / T: 3 % less air and a temperature sensitivity that is 5 % smaller here
+    height = per_unit * jump * plain.readings["position"].values[1:]
+    assert 0.4994 * np.sqrt(np.mean(height**2)) == pytest.approx(0.4, rel=0.06)
+
+
 def test_refractivity_has_the_published_sensitivities():
     def at(t: float = 20.0, p: float = 1013.25, h: float = 50.0) -> float:
         return float(refractivity(np.array(t), np.array(p), np.array(h))) * 1e6

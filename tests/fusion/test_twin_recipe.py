@@ -125,6 +125,14 @@ def test_unknown_packaged_recipe_names_those_there_are():
             r"effect step_event: nothing moves in this test, so it cannot be scaled to 1\.0 um rms",
         ),
         (
+            {"effect": (EffectRecipe("sensor_fault", amplitude_um=1.0, parameters={"kind": "stuck"}),)},
+            r"effect sensor_fault: a stuck sensor errs by what it misses; remove amplitude_um, or use kind = 'jump'",
+        ),
+        (
+            {"effect": (EffectRecipe("sensor_fault"), EffectRecipe("sensor_fault"))},
+            r"effect sensor_fault is there more than once; the twin has one of it",
+        ),
+        (
             {"effect": (EffectRecipe("reflected_source", amplitude_um=1.0),)},
             r"effect reflected_source: amplitude_um has no meaning for a spot; write amplitude_K",
         ),
