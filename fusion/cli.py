@@ -139,10 +139,10 @@ def schema(
     name: Annotated[str, typer.Argument(metavar="results|campaign", help="Which file to describe.")] = "results",
 ) -> None:
     """Print the JSON Schema of results.json, or of the campaign file."""
-    from fusion.config import Campaign
+    from fusion.config import campaign_schema
     from fusion.results import results_schema
 
-    schemas = {"results": results_schema, "campaign": Campaign.model_json_schema}
+    schemas = {"results": results_schema, "campaign": campaign_schema}
     if name not in schemas:
         errors.print(f'thermofuse: there is no schema "{name}"; write results or campaign', highlight=False)
         raise typer.Exit(BAD_INPUT)

@@ -9,7 +9,16 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    WithJsonSchema,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from fusion.faults import Place, describe, suggest
@@ -59,13 +68,21 @@ def _fraction(value: object) -> object:
     return value
 
 
-Millimetres = Annotated[float, _quantity("mm")]
-PositiveMillimetres = Annotated[float, _quantity("mm"), _within(0.0, 1e5, "this length in mm")]
-Celsius = Annotated[float, _quantity("degC"), _within(-273.15, 3000.0, "a temperature in degC")]
-Seconds = Annotated[float, _quantity("s")]
-PositiveSeconds = Annotated[float, _quantity("s"), _within(0.0, 1e6, "this time in s")]
-PartsPerMillion = Annotated[float, _quantity("ppm/K"), _within(-10.0, 200.0, "an expansion coefficient in ppm/K")]
-Feed = Annotated[float, _quantity("mm/min"), _within(0.0, 1e6, "a feed rate in mm/min")]
+def _written(example: str) -> WithJsonSchema:
+    """How a quantity looks in the file, for the JSON Schema."""
+    return WithJsonSchema({"type": "string", "description": "number with unit", "examples": [example]})
+
+
+Millimetres = Annotated[float, _quantity("mm"), _written("5 mm")]
+PositiveMillimetres = Annotated[float, _quantity("mm"), _within(0.0, 1e5, "this length in mm"), _written("5 mm")]
+Metres = Annotated[float, _quantity("mm"), AfterValidator(lambda mm: mm / 1e3), _written("1.2 m")]
+Celsius = Annotated[float, _quantity("degC"), _within(-273.15, 3000.0, "a temperature in degC"), _written("22 degC")]
+Seconds = Annotated[float, _quantity("s"), _written("37 s")]
+PositiveSeconds = Annotated[float, _quantity("s"), _within(0.0, 1e6, "this time in s"), _written("2 s")]
+PartsPerMillion = Annotated[
+    float, _quantity("ppm/K"), _within(-10.0, 200.0, "an expansion coefficient in ppm/K"), _written("11.7 ppm/K")
+]
+Feed = Annotated[float, _quantity("mm/min"), _within(0.0, 1e6, "a feed rate in mm/min"), _written("300 mm/min")]
 Fraction = Annotated[float, BeforeValidator(_fraction), _within(0.0, 1.0, "this fraction")]
 
 
@@ -88,9 +105,7 @@ class ThermographyTable(_Table):
     reflected_temperature_degC: Celsius | None = Field(default=None, alias="reflected_temperature")
     atmospheric_temperature_degC: Celsius | None = Field(default=None, alias="atmospheric_temperature")
     relative_humidity: Fraction | None = None
-    object_distance_m: Annotated[float, _quantity("mm"), AfterValidator(lambda mm: mm / 1e3)] | None = Field(
-        default=None, alias="object_distance"
-    )
+    object_distance_m: Metres | None = Field(default=None, alias="object_distance")
     clock_offset_s: Seconds | None = Field(default=None, alias="clock_offset")
     table: Literal["still", "moving"] = "still"
 
@@ -222,6 +237,14 @@ class Campaign(_Table):
         paths = list(self.frame_paths()) if table == "thermography" else []
         paths += [self.resolve(name) for name in names if name is not None]
         return {relative_name(path, self.folder): path for path in paths}
+
+
+def campaign_schema() -> dict[str, Any]:
+    """Return the JSON Schema of the campaign file, quantities as they are written there."""
+    schema = Campaign.model_json_schema()
+    del schema["properties"]["path"]
+    schema["required"] = [name for name in schema["required"] if name != "path"]
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "thermofuse campaign"}
 
 
 def relative_name(path: Path, folder: Path) -> str:

@@ -6,9 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from fusion.pipeline import run_campaign
-from fusion.twin import simulate_campaign
-
 RECIPE = """\
 [campaign]
 title = "Small campaign"
@@ -37,6 +34,8 @@ amplitude_um = 1.5
 @pytest.fixture(scope="session")
 def campaign_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A campaign of 24 cycles and 6 targets with a reversal that drifts, undeclared; cells of 20 mm keep it quick."""
+    from fusion.twin import simulate_campaign
+
     folder = tmp_path_factory.mktemp("twin")
     (folder / "recipe.toml").write_text(RECIPE)
     campaign = simulate_campaign(folder / "recipe.toml", folder / "campaign")
@@ -47,6 +46,8 @@ def campaign_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def results_folder(campaign_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The products of that campaign, complete."""
+    from fusion.pipeline import run_campaign
+
     out = tmp_path_factory.mktemp("run") / "results"
     run_campaign(campaign_folder / "campaign.toml", out)
     return out

@@ -1,0 +1,130 @@
+"""The command: exit codes, one paragraph for bad input, tables that hold the numbers of the products."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tomllib
+from pathlib import Path
+
+import jsonschema
+import pytest
+from typer.testing import CliRunner, Result
+
+from fusion import cli
+
+
+def invoke(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments], env={"COLUMNS": "160"})
+
+
+@pytest.fixture(autouse=True)
+def _consoles_follow_the_runner(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The runner swaps stdout and stderr after import, so the consoles have to look them up anew."""
+    monkeypatch.setattr(cli, "console", cli.Console(width=160))
+    monkeypatch.setattr(cli, "errors", cli.Console(stderr=True, soft_wrap=True))
+
+
+def test_run_ends_with_a_summary_and_the_report(results_folder: Path, campaign_folder: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(results_folder, tmp_path / "results")
+    result = invoke("run", campaign_folder / "campaign.toml", "--out", out, "--resume")
+    assert result.exit_code == 0, result.output
+    loop = json.loads((out / "results.json").read_text())["loop"]
+    assert "reversal_drift (p < 0.001), held-out error" in result.output
+    assert f"{loop['verdict']}: The declared model lacked an effect: reversal that changes with time" in result.output
+    assert result.output.rstrip().endswith(f"report: {out / 'report.html'}")
+    assert "input files: done in" in result.output
+
+
+def test_bad_input_is_one_paragraph_without_a_traceback(
+    campaign_folder: Path, results_folder: Path, tmp_path: Path
+) -> None:
+    broken = tmp_path / "campaign.toml"
+    broken.write_text((campaign_folder / "campaign.toml").read_text().replace('"20 mm"', "20"))
+    result = invoke("run", broken, "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"thermofuse: {broken}, line 17: ")
+    assert 'plan.cell_size = 20: a length needs its unit in the value; write for example "5 mm"' in result.stderr
+    assert "Traceback" not in result.output
+    assert not (tmp_path / "out").exists()
+
+    result = invoke("run", campaign_folder / "campaign.toml", "--out", results_folder)
+    assert (result.exit_code, "is not empty; add --resume" in result.stderr) == (2, True)
+
+
+def test_a_fault_of_the_program_is_no_bad_input(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def broken(*arguments: object, **options: object) -> None:
+        raise ValueError("shapes do not match")
+
+    monkeypatch.setattr("fusion.pipeline.run_campaign", broken)
+    result = invoke("run", tmp_path / "campaign.toml")
+    assert result.exit_code == 1
+    assert isinstance(result.exception, ValueError)
+
+
+def test_stopping_tells_how_to_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def stopped(*arguments: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fusion.pipeline.run_campaign", stopped)
+    result = invoke("run", tmp_path / "campaign.toml")
+    assert result.exit_code == 130
+    assert result.stderr == "thermofuse: stopped; finished stages are kept, add --resume to continue\n"
+
+
+def test_schemas_are_valid_and_accept_the_files(results_folder: Path, campaign_folder: Path) -> None:
+    schema = json.loads(invoke("schema", "results").output)
+    jsonschema.Draft202012Validator(schema).validate(json.loads((results_folder / "results.json").read_text()))
+    campaign = json.loads(invoke("schema", "campaign").output)
+    jsonschema.Draft202012Validator.check_schema(campaign)
+    written = tomllib.loads((campaign_folder / "campaign.toml").read_text())
+    jsonschema.Draft202012Validator(campaign).validate(written)
+    written["plan"]["cell_size"] = 5
+    assert not jsonschema.Draft202012Validator(campaign).is_valid(written)
+    result = invoke("schema", "truth")
+    assert (result.exit_code, result.stderr) == (
+        2,
+        'thermofuse: there is no schema "truth"; write results or campaign\n',
+    )
+
+
+def test_inspect_tells_what_files_hold(campaign_folder: Path, tmp_path: Path) -> None:
+    frame = sorted((campaign_folder / "thermal").iterdir())[0]
+    result = invoke("inspect", frame, campaign_folder / "laser.csv", campaign_folder / "environment.csv")
+    assert result.exit_code == 0, result.output
+    assert "FLIR, 1 frame of 640 x 480" in result.output
+    assert "deviations, 24 cycles, 6 targets from 0 to 250 mm, 288 of 288 readings" in result.output
+    assert "air_pressure" in result.output
+    assert (
+        invoke("inspect", tmp_path / "absent.jpg").stderr
+        == f"thermofuse: {tmp_path / 'absent.jpg'}: No such file or directory\n"
+    )
+
+
+def test_iso230_evaluates_a_window(campaign_folder: Path) -> None:
+    result = invoke("iso230", campaign_folder / "laser.csv", "--cycles", "1-5")
+    assert result.exit_code == 0, result.output
+    assert "laser.csv, cycles 1..5" in result.output
+    for bad, message in (
+        ("one", 'thermofuse: --cycles "one" is not a window of cycles; write for example 1-5\n'),
+        ("20-30", 'thermofuse: --cycles "20-30" asks for cycles that were not measured; there are 1 to 24\n'),
+    ):
+        refused = invoke("iso230", campaign_folder / "laser.csv", "--cycles", bad)
+        assert (refused.exit_code, refused.stderr) == (2, message)
+
+
+def test_two_campaigns_get_a_folder_each() -> None:
+    folders = cli._folders([Path("a/campaign.toml"), Path("b/campaign.toml")], Path("out"))
+    assert [folder for _, folder in folders] == [Path("out/a"), Path("out/b")]
+    same = cli._folders([Path("a/one.toml"), Path("a/two.toml")], Path("out"))
+    assert [folder for _, folder in same] == [Path("out/a_1"), Path("out/a_2")]
+    assert cli._folders([Path("a/campaign.toml")], None) == [(Path("a/campaign.toml"), Path("a/results"))]
+
+
+def test_simulate_writes_a_campaign_once(tmp_path: Path) -> None:
+    recipe = tmp_path / "recipe.toml"
+    recipe.write_text('[campaign]\ntitle = "Two cycles"\n\n[test]\ncycles = 2\ntargets = 3\nspacing_mm = 100\n')
+    result = invoke("simulate", recipe, "--out", tmp_path / "campaign")
+    assert result.exit_code == 0, result.output
+    assert result.output.rstrip().endswith(f"campaign: {tmp_path / 'campaign' / 'campaign.toml'}")
+    assert invoke("simulate", recipe, "--out", tmp_path / "campaign").exit_code == 2

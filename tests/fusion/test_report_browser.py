@@ -1,0 +1,125 @@
+"""report.html in a headless chromium: offline, no error, readable on a phone, the map answers to slider and pointer."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed (Debian: apt-get install chromium)"),
+]
+
+from playwright.sync_api import Page, sync_playwright  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def report(results_folder: Path) -> Path:
+    return results_folder / "report.html"
+
+
+@pytest.fixture(scope="module")
+def opened(report: Path) -> Iterator[tuple[Page, list[str]]]:
+    """The report in a desktop window, and everything that went wrong or left the file while it loaded."""
+    faults: list[str] = []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1280, "height": 900})
+        page.on("pageerror", lambda error: faults.append(f"page error: {error}"))
+        page.on(
+            "console", lambda message: faults.append(f"console: {message.text}") if message.type == "error" else None
+        )
+        page.on(
+            "request", lambda request: faults.append(f"request: {request.url}") if is_foreign(request.url) else None
+        )
+        page.goto(report.as_uri())
+        yield page, faults
+        browser.close()
+
+
+def is_foreign(url: str) -> bool:
+    return not url.startswith(("file://", "data:"))
+
+
+def test_it_opens_offline_without_a_fault(opened: tuple[Page, list[str]], report: Path) -> None:
+    page, faults = opened
+    assert faults == []
+    assert "Small campaign" in page.title()
+    assert report.stat().st_size < 15e6
+    assert not re.search(r"""(?:src|href)\s*=\s*["'](?!#|data:)""", report.read_text(encoding="utf-8"))
+
+
+def test_every_section_and_figure_is_there(opened: tuple[Page, list[str]]) -> None:
+    page, _ = opened
+    for section in (
+        "summary",
+        "data",
+        "registration",
+        "fields",
+        "drift",
+        "paper",
+        "iso230",
+        "anomalies",
+        "correlation",
+        "loop",
+        "glossary",
+    ):
+        assert page.locator(f"section#{section}").count() == 1, section
+    figures = page.locator("figure svg")
+    assert figures.count() >= 18
+    for at in range(figures.count()):
+        box = figures.nth(at).bounding_box()
+        assert box is not None and box["width"] > 300 and box["height"] > 80
+    ids = page.evaluate("[...document.querySelectorAll('[id]')].map(e => e.id)")
+    assert len(ids) == len(set(ids))
+    for target in page.evaluate("[...document.querySelectorAll('nav a')].map(a => a.getAttribute('href').slice(1))"):
+        assert target in ids
+
+
+def test_the_summary_comes_first_and_fits_one_screen(opened: tuple[Page, list[str]]) -> None:
+    page, _ = opened
+    box = page.locator("section#summary").bounding_box()
+    assert box is not None and box["y"] + box["height"] < 900
+    assert "reversal that changes with time" in page.locator("section#summary .headline").inner_text()
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_nothing_scrolls_sideways(opened: tuple[Page, list[str]], width: int) -> None:
+    page, _ = opened
+    page.set_viewport_size({"width": width, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    page.set_viewport_size({"width": 1280, "height": 900})
+
+
+def test_the_map_follows_slider_and_pointer(opened: tuple[Page, list[str]]) -> None:
+    page, faults = opened
+    root = page.locator(".map").first
+    canvas = root.locator("canvas.field")
+    pixels = "c => c.getContext('2d').getImageData(0, 0, c.width, c.height).data.reduce((a, b) => a + b, 0)"
+    last = canvas.evaluate(pixels)
+    assert root.locator(".cycle-label").inner_text() == "cycle 24"
+    root.locator("input[type=range]").focus()
+    page.keyboard.press("Home")
+    assert root.locator(".cycle-label").inner_text() == "cycle 1"
+    assert canvas.evaluate(pixels) != last
+    root.locator("select").select_option("temperature")
+    box = canvas.bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    shown = re.fullmatch(
+        r"x (\d+) mm, y (\d+) mm: rise (-?[\d.]+) K, temperature ([\d.]+) °C", root.locator(".readout").inner_text()
+    )
+    assert shown is not None
+    assert abs(float(shown[1]) - 350) <= 20 and abs(float(shown[2]) - 90) <= 20
+    assert float(shown[3]) == 0.0 and 15 < float(shown[4]) < 40
+    assert faults == []
+
+
+def test_it_prints(opened: tuple[Page, list[str]]) -> None:
+    page, _ = opened
+    assert page.pdf(format="A4").startswith(b"%PDF")
