@@ -38,8 +38,6 @@ PARAMETERS: dict[str, tuple[str, str, str]] = {
     "atmosphere_beta2": ("atmosphere_beta2", "m-0.5", ""),
     "atmosphere_x": ("atmosphere_x", "1", ""),
 }
-#: Frames per chunk with ``chunks={}``: about 20 MB of a 640 x 480 camera.
-_PREFERRED_FRAMES = 32
 
 
 class FlirBackendEntrypoint(BackendEntrypoint):
@@ -105,7 +103,6 @@ def open_frames(paths: Iterable[str | os.PathLike[str]]) -> xr.Dataset:
         ("time", "row", "column"),
         indexing.LazilyIndexedArray(_FrameStack(frames)),
         {"long_name": "counts of the detector", "units": "1"},
-        {"preferred_chunks": {"time": _PREFERRED_FRAMES, "row": frames[0].shape[0], "column": frames[0].shape[1]}},
     )
     dataset = xr.Dataset(
         {"counts": counts, **_parameter_variables(frames), "camera_temperature": _camera_temperatures(frames)},

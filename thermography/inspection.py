@@ -82,7 +82,7 @@ class Inspection:
         inside = ", ".join(
             f"{name} {value - ZERO_CELSIUS_K:.1f}"
             for name, value in first.housekeeping.items()
-            if value != ZERO_CELSIUS_K
+            if abs(value - ZERO_CELSIUS_K) > 1e-3
         )
         lines = [
             f"{self.path}: FLIR, {count} of {columns} x {rows}, samples {first.samples.encoding}",
