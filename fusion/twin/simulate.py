@@ -334,14 +334,34 @@ def _dataset(recipe: Recipe, schedule: Schedule, series: dict[str, Floats]) -> x
     """Return the readings as (cycle, direction, target), measured deviation and every part of it."""
     dims = ("cycle", "direction", "target")
     parts = {name: (dims, grid(value, schedule.cycles), {"units": "um"}) for name, value in series.items()}
-    deviation = sum(value for _, value, _ in parts.values())
+    deviation = np.sum([value for _, value, _ in parts.values()], axis=0)
+    random = np.sum(
+        [value for name, (_, value, _) in parts.items() if name == "noise" or name.endswith("structural")], axis=0
+    )
+    known = {
+        "mean_profile": (
+            dims[1:],
+            (deviation - random).mean(axis=0),
+            {"units": "um", "long_name": "profile at the test's mean state"},
+        ),
+        "scatter": (
+            dims[1:],
+            random.std(axis=0, ddof=min(1, schedule.cycles - 1)),
+            {"units": "um", "long_name": "sample standard deviation of what is random"},
+        ),
+    }
     lost = (
         stream(recipe.campaign.seed, "lost readings").uniform(size=np.shape(deviation)) < recipe.test.missing_fraction
     )
     start = np.datetime64(recipe.campaign.start.removesuffix("Z"), "ns")
     time = start + np.round(grid(schedule.time_s, schedule.cycles) * 1e3).astype("timedelta64[ms]")
     return xr.Dataset(
-        {"deviation": (dims, np.where(lost, np.nan, deviation), {"units": "um"}), "time": (dims, time), **parts},
+        {
+            "deviation": (dims, np.where(lost, np.nan, deviation), {"units": "um"}),
+            "time": (dims, time),
+            **parts,
+            **known,
+        },
         coords={
             "cycle": np.arange(1, schedule.cycles + 1),
             "direction": ["positive", "negative"],
