@@ -11,15 +11,15 @@ from typing import Any
 
 import xarray as xr
 
-from fusion import stages
+from fusion import stages, stages_thermal
 from fusion.config import Campaign, load_campaign
+from fusion.outcome import Outcome
 from fusion.products import StageStamps, digest, open_folder, read_dataset, write_dataset, write_json, write_text
 from fusion.progress import Report, silent
 from fusion.provenance import describe_run, hash_inputs, versions
 from fusion.report import render_report
 from fusion.results import Notice, assemble
 from fusion.sources import read_source
-from fusion.stages import Outcome
 
 #: Where each stage keeps its Dataset; what ends up in fusion.nc is kept apart while it may have to be resumed.
 FILES = {
@@ -122,7 +122,7 @@ def run_campaign(
         "fields",
         ("thermography", "plan", "interferometry"),
         (),
-        lambda: stages.reduce_thermography(source, report=report),
+        lambda: stages_thermal.reduce_thermography(source, scheduler=scheduler, report=report),
     )
     deviations = run.stage("deviations", ("interferometry",), (), lambda: stages.evaluate_interferometry(source))
     fused, outside = stages.align_recordings(source, fields, deviations)
@@ -139,7 +139,7 @@ def run_campaign(
     )
     fusion = stages.join_fusion(fused, maps, model)
     write_dataset(folder / "fusion.nc", fusion)
-    stages.write_exr(folder / "maps", fields, report=report)
+    stages_thermal.write_exr(folder / "maps", fields, report=report)
     return _finish(run, {"fields": fields, "deviations": deviations, "fusion": fusion})
 
 

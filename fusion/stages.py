@@ -1,24 +1,20 @@
-"""around - The stages of the main job, each one a call of the steps in order: fields, deviations, fusion."""
+"""around - The stages after the thermal one: deviations evaluated, both recordings joined, correlated, modelled."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from fusion.alignment import align, camera_on_laser_clock, cycle_bounds
-from fusion.contracts import check
+from fusion.alignment import align
 from fusion.correlation import correlate
 from fusion.diagnosis import Diagnosis, diagnose
 from fusion.effects import library
 from fusion.groups import group, joined
 from fusion.loop import LoopResult, close_loop
 from fusion.model import ModelFit, fit_model
-from fusion.products import write_atomically
+from fusion.outcome import Outcome
 from fusion.progress import Report
 from fusion.readings import Readings, read_fused
 from fusion.results import Notice
@@ -26,13 +22,7 @@ from fusion.sources import Source, counted, listed
 from interferometry import iso230, neighbours
 from interferometry.anomalies import Anomaly, detect_anomalies
 from interferometry.drift import estimate_drift, flag_outliers
-from thermography.contract import FIELDS
-from thermography.exr import write_maps
-from thermography.fields import reduce_frames
 from thermography.hotspots import Hotspot, detect_hotspots
-from thermography.overrides import Overrides
-from thermography.radiometry import calibrate
-from thermography.registration import Registration, register
 
 #: What each stage is called in progress and provenance.
 LABELS = {
@@ -41,124 +31,12 @@ LABELS = {
     "correlation": "correlation",
     "model": "anomalies and closed loop",
 }
-#: The plan is registered on the mean of so many first frames: noise falls, and the table has hardly warmed yet.
-_REGISTRATION_FRAMES = 5
 _CORRELATION_CELL_MM = 10.0
-_KELVIN = 273.15
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a stage found: its Dataset, its shares of results.json, and what it left out."""
-
-    dataset: xr.Dataset
-    parts: dict[str, Any]
-    notices: tuple[Notice, ...] = ()
 
 
 def effect_names() -> tuple[str, ...]:
     """Return the names that a campaign may declare, a user's own effects included."""
     return tuple(library())
-
-
-def reduce_thermography(source: Source, *, report: Report) -> Outcome:
-    """Register the plan on the first frames and reduce all frames to one field per cycle."""
-    override = Overrides(campaign_constants(source))
-    first = [frame.read() for frame in source.frames[:_REGISTRATION_FRAMES]]
-    reference = np.mean([calibrate(frame.counts, override(frame)) for frame in first], axis=0)
-    report("registration", 0, 1)
-    registration = register(reference, source.fiducials, grid=source.grid)
-    report("registration", 1, 1)
-    offset = source.thermography.clock_offset_s or 0.0
-    bounds = cycle_bounds(source.deviations) + np.timedelta64(round(offset * 1e9), "ns")
-    total, done = len(source.frames), 0
-
-    def count(more: int) -> None:
-        nonlocal done
-        done += more
-        report("frames", done, total)
-
-    report("frames", 0, total)
-    fields = reduce_frames(source.frames, registration, source.grid, bounds, override=override, progress=count)
-    check(fields, FIELDS, name="the fields")
-    fields = fields.assign_coords(cycle=source.deviations["cycle"].values)
-    for name in ("time", "cycle_time"):
-        fields[name] = (fields[name].dims, camera_on_laser_clock(fields[name].values, offset), fields[name].attrs)
-    fields = fields.assign(registration_variables(registration, reference))
-    fields = fields.assign(target_places(source))
-    parts = {
-        "registration": {
-            "rms_mm": registration.rms_mm,
-            "leave_one_out_mm": registration.leave_one_out_mm,
-            "frames_rejected": source.frames_rejected,
-        },
-        "alignment": {
-            "clock_offset_s": {"value": offset, "u": 0.0 if source.thermography.clock_offset_s is not None else None}
-        },
-    }
-    return Outcome(fields, parts, tuple(registration_notices(registration)))
-
-
-def campaign_constants(source: Source) -> dict[str, float]:
-    """Return the camera parameters that the campaign file overrides, in the units of the parameters."""
-    table = source.thermography
-    given = {
-        "emissivity": table.emissivity,
-        "relative_humidity": table.relative_humidity,
-        "object_distance_m": table.object_distance_m,
-        "reflected_temperature_K": _kelvin(table.reflected_temperature_degC),
-        "atmospheric_temperature_K": _kelvin(table.atmospheric_temperature_degC),
-    }
-    return {name: value for name, value in given.items() if value is not None}
-
-
-def _kelvin(celsius: float | None) -> float | None:
-    return None if celsius is None else celsius + _KELVIN
-
-
-def registration_variables(registration: Registration, reference: np.ndarray) -> xr.Dataset:
-    """Return the registration as variables: the fiducials with their errors, the homography, and the frame it was made on."""
-    names = list(registration.located)
-    places = [registration.located[name] for name in names]
-    listed = [registration.fiducials[name] for name in names]
-    along = {
-        "fiducial_x": ([one.x_mm for one in listed], "mm"),
-        "fiducial_y": ([one.y_mm for one in listed], "mm"),
-        "fiducial_column": ([one.column_px for one in places], "1"),
-        "fiducial_row": ([one.row_px for one in places], "1"),
-        "fiducial_residual": ([registration.residual_mm[name] for name in names], "mm"),
-        "fiducial_leave_one_out": ([registration.leave_one_out_mm[name] for name in names], "mm"),
-    }
-    variables: dict[str, Any] = {name: ("fiducial", values, {"units": unit}) for name, (values, unit) in along.items()}
-    variables["homography"] = (("plan_axis", "sensor_axis"), registration.homography, {"units": "1"})
-    variables["reference_frame"] = (
-        ("row", "column"), reference.astype("f4"), {"units": "degC", "units_metadata": "temperature: on_scale"},
-    )  # fmt: skip
-    return xr.Dataset(variables, coords={"fiducial": names})
-
-
-def registration_notices(registration: Registration) -> list[Notice]:
-    """Return one notice for all fiducials that were not used."""
-    if not registration.left_out:
-        return []
-    named = "; ".join(f"{name}: {reason}" for name, reason in registration.left_out.items())
-    return [
-        Notice(
-            "fiducials_left_out",
-            f"{len(registration.left_out)} entries of the fiducial list not used: {named}.",
-            "Correct the list of fiducials, or clean and repaint the discs; the others carry the registration.",
-        )
-    ]
-
-
-def target_places(source: Source) -> xr.Dataset:
-    """Return the plan points of the targets, along ``target``."""
-    x, y = source.axis.points(source.deviations["position"].values)
-    targets = source.deviations["target"].values
-    return xr.Dataset(
-        {"target_x": ("target", x, {"units": "mm"}), "target_y": ("target", y, {"units": "mm"})},
-        coords={"target": targets},
-    )
 
 
 def evaluate_interferometry(source: Source) -> Outcome:
@@ -346,27 +224,3 @@ def _hotspot(spot: Hotspot, maps: xr.Dataset) -> dict[str, Any]:
         "p_value": float(p[at]),
         "lag_s": float(here["lag"][at]),
     }
-
-
-def write_exr(folder: Path, fields: xr.Dataset, *, report: Report) -> list[Path]:
-    """Write the fields of every cycle as OpenEXR maps and return the files."""
-    total = fields.sizes["cycle"]
-    paths = []
-    for done, cycle in enumerate(fields["cycle"].values):
-        report("OpenEXR maps", done, total)
-        maps = exr_maps(fields.sel(cycle=cycle))
-        path = folder / f"cycle_{cycle:04d}.exr"
-        paths.append(write_atomically(path, lambda temporary, maps=maps: write_maps(temporary, maps)))  # type: ignore[misc]
-    report("OpenEXR maps", total, total)
-    return paths
-
-
-def exr_maps(field: xr.Dataset) -> Mapping[str, np.ndarray]:
-    """Return the maps of one cycle for OpenEXR; the mask is 1 where the table was seen."""
-    maps = {
-        "temperature": field["temperature"],
-        "rise": field["temperature_rise"],
-        "uncertainty": field["temperature_u"],
-        "mask": np.isfinite(field["temperature"]),
-    }
-    return {name: np.ascontiguousarray(values, dtype="f4") for name, values in maps.items()}
