@@ -213,7 +213,8 @@ def _draw(
         n = one.values.size
         orders = np.argsort(keys[:, :n], axis=1)
         fresh = np.empty((checks, n), np.int64)
-        stacks.append(np.vstack([one.values, resample(bank, orders), resample(bank, fresh, rng)]))
+        drawn = resample(bank, orders, rng)
+        stacks.append(np.vstack([one.values, drawn, resample(bank, fresh, rng, gaussian=True)]))
     return stacks
 
 

@@ -129,19 +129,28 @@ def null_bank(values: Array, seconds: Array, variance: Array, nuisance: Array, *
     return NullBank(tuple(whitenings), freedom, values, best, float(sigmas[best]), -0.5 * freedom * np.asarray(scores))
 
 
-def resample(bank: NullBank, orders: NDArray[np.int64], rng: np.random.Generator | None = None) -> Array:
-    """Draw series (draws, n) from the fitted null by putting its whitened residuals into other orders.
+def resample(bank: NullBank, orders: NDArray[np.int64], rng: np.random.Generator, *, gaussian: bool = False) -> Array:
+    """Draw series (draws, n) from the null: drift sizes by their likelihood, whitened residuals put into other orders.
 
     Parameters
     ----------
     orders : (draws, n) one order of the residuals per draw; the same orders for several series keep what they share
-    rng : if given, Gaussian innovations instead of the residuals' own
+    rng : generator for the drift sizes (and for the innovations if gaussian)
+    gaussian : Gaussian innovations instead of the residuals' own
     """
-    null = bank.fitted
-    residual = null.project @ bank.values
-    residual = (residual - residual.mean()) * np.sqrt(residual.size / bank.freedom)
-    innovations = residual[orders] if rng is None else rng.standard_normal(orders.shape) * residual.std()
-    return innovations @ null.colour.T
+    weight = np.exp(bank.log_likelihood - bank.log_likelihood.max())
+    chosen = rng.choice(weight.size, size=orders.shape[0], p=weight / weight.sum())
+    series = np.empty(orders.shape)
+    for g in np.unique(chosen):
+        null = bank.whitenings[g]
+        rows = np.flatnonzero(chosen == g)
+        residual = null.project @ bank.values
+        residual = (residual - residual.mean()) * np.sqrt(residual.size / bank.freedom)
+        innovations = (
+            rng.standard_normal((rows.size, residual.size)) * residual.std() if gaussian else residual[orders[rows]]
+        )
+        series[rows] = innovations @ null.colour.T
+    return series
 
 
 @dataclass(frozen=True)

@@ -254,7 +254,7 @@ def fit_lasting(residual: Residual, columns: Array, rng: np.random.Generator) ->
     bank = _bank(parts.mean, seconds)
     regressors = np.ascontiguousarray(columns[parts.rows], np.float32)
     orders = np.empty((_LEVELS, parts.mean.size), np.int64)
-    stack = np.vstack([parts.mean, resample(bank, orders, rng)])
+    stack = np.vstack([parts.mean, resample(bank, orders, rng, gaussian=True)])
     ratios = likelihood_ratios(bank, whiten_series(bank, stack), regressors)
     best = ratios.max(axis=1)
     place = int(ratios[0].argmax())
