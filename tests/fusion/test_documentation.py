@@ -1,0 +1,82 @@
+"""What the documentation shows works: campaign files load, snippets run, commands exist, names are complete."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.main import get_command
+
+from fusion import cli
+from fusion.config import EFFECT_NAMES, load_campaign
+from fusion.effects import LIBRARY, Effect
+from fusion.wording import CAUSES, EFFECTS
+
+ROOT = Path(__file__).resolve().parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(text: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
+
+
+def test_the_campaign_file_of_the_readme_loads(tmp_path: Path) -> None:
+    campaign, record = blocks(README, "toml")
+    (tmp_path / "thermal").mkdir()
+    for name in ("thermal/a.jpg", "fiducials.csv", "laser.csv", "environment.csv", "drivers.csv", "spindle.xlsx"):
+        (tmp_path / name).touch()
+    (tmp_path / "campaign.toml").write_text(campaign, encoding="utf-8")
+    assert load_campaign(tmp_path / "campaign.toml").model.declared == ("axis_expansion", "table_offset")
+    (tmp_path / "record.toml").write_text('[campaign]\ntitle = "Spindle"\n' + record, encoding="utf-8")
+    assert load_campaign(tmp_path / "record.toml").record is not None
+
+
+def test_every_command_of_the_readme_exists() -> None:
+    known = set(get_command(cli.app).commands)  # type: ignore[attr-defined]
+    shown = {line.split()[1] for line in "\n".join(blocks(README, "sh")).splitlines() if line.startswith("thermofuse ")}
+    assert shown == known
+
+
+def test_the_effect_of_contributing_is_a_whole_effect() -> None:
+    (snippet,) = blocks((ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"), "python")
+    names: dict[str, object] = {}
+    exec(compile(snippet, "CONTRIBUTING.md", "exec"), names)
+    effect = names["bed_bending"]
+    assert isinstance(effect, Effect)
+
+    class Readings:
+        seconds = np.array([0.0, 600.0, 1200.0])
+        share = np.array([0.0, 0.5, 1.0])
+
+    members = list(effect.members(Readings(), {}))  # type: ignore[arg-type]
+    assert [member.columns.shape for member in members] == [(3, 1)] * 3
+
+
+def test_the_layout_of_contributing_names_real_files() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    for name in re.findall(r"`((?:fusion|data)/[\w./]+)`", text):
+        assert (ROOT / name).exists(), name
+
+
+@pytest.mark.parametrize("table", ["config", "words"])
+def test_every_effect_of_the_library_has_its_name_and_its_words(table: str) -> None:
+    library = {effect.name for effect in LIBRARY}
+    assert library == set(EFFECT_NAMES if table == "config" else EFFECTS)
+
+
+def test_every_cause_has_its_words_and_checks() -> None:
+    from fusion.diagnosis import CHECKS
+    from fusion.results import CAUSES as NAMES
+
+    assert set(CAUSES) == set(CHECKS) == set(NAMES)
+
+
+def test_the_makefile_makes_what_the_readme_says() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target in re.findall(r"^make (\w+)", README, flags=re.MULTILINE):
+        assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["scripts"]["thermofuse"] == "fusion.cli:main"
