@@ -199,7 +199,7 @@ def _scatter_direction(estimated: xr.Dataset, target: int, others: NDArray[np.in
     variance = estimated["scatter"].values[:, target] ** 2
     freedom = estimated["scatter_freedom"].values[:, target]
     names = estimated["direction"].values
-    if not np.isfinite(variance).all():
+    if variance.size < 2 or not np.isfinite(variance).all():
         return str(names[int(np.isfinite(variance).argmax())])
     usual = np.nanmedian(estimated["scatter"].values[:, others] ** 2, axis=1)
     weak = int(np.argmin(variance / usual))
@@ -280,11 +280,14 @@ def _series(estimated: xr.Dataset) -> tuple[list[_Series], Array]:
 
 
 def _cycle_seconds(deviations: xr.Dataset) -> Array:
-    """Return the middle of each cycle in seconds since the first reading."""
+    """Return the middle of each cycle in seconds since the first reading; a cycle without readings lies between its neighbours."""
     time = deviations["time"].values.astype("datetime64[ns]")
     first = time[~np.isnat(time)].min()
-    middles = [(cycle[~np.isnat(cycle)] - first).astype("f8").mean() * 1e-9 for cycle in time]
-    return np.array(middles)
+    known = ~np.isnat(time)
+    measured = known.any(axis=(1, 2))
+    seconds = np.where(known, (time - first).astype("f8") * 1e-9, 0.0)
+    middles = seconds.sum(axis=(1, 2))[measured] / known.sum(axis=(1, 2))[measured]
+    return np.interp(np.arange(measured.size), np.flatnonzero(measured), middles)
 
 
 def _slow(values: Array) -> Array:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from interferometry import flags
 from interferometry.deviations import DIMS
 from interferometry.driftaverage import average_drift
-from interferometry.jointfit import DriftDataError, JointFit, fit_joint, loadings_of, span_mm
+from interferometry.jointfit import DriftDataError, JointFit, fit_joint, index_of, loadings_of, span_mm
 from interferometry.statespace import Order
 
 Array = NDArray[np.float64]
@@ -71,8 +71,8 @@ def estimate_drift(
         (target), both directions together; drift from the stated thermal state at every reading (cycle, direction,
         target), with its u, and drift_<component> with its u: profile plus drift is the expected reading; noise, the estimated
         random part of each reading; standardised, each reading against its prediction from all others in standard
-        deviations; sigma; drift_size (component), the standard deviation of each component over the test, and
-        drift_rate (component), of its increments in an hour. ``attrs["state"]``, ``order``.
+        deviations (infinite where it was too wild to enter the fit); sigma; drift_size (component), the standard
+        deviation of each component over the test, and drift_rate (component), of its increments in an hour. ``attrs["state"]``, ``order``.
 
     Raises
     ------
@@ -103,6 +103,8 @@ def describe(deviations: xr.Dataset, joint: JointFit, *, state: str | float = "m
     result = _describe_profile(deviations, joint, at_state)
     scatter, freedom = _scatter(joint, u, d)
     grid = _Grid(deviations, joint)
+    standardised = grid.per_reading(fit.deletion_residuals())
+    standardised[grid.is_left_out(deviations)] = np.inf
     target = joint.cells[:, 1]
     targets = deviations.sizes["target"]
     pooled_freedom = np.bincount(target, freedom, minlength=targets)
@@ -112,7 +114,7 @@ def describe(deviations: xr.Dataset, joint: JointFit, *, state: str | float = "m
     result = result.assign(
         {
             "scatter": (DIMS[1:], grid.per_cell(scatter), {"units": "um", "long_name": "random standard deviation"}),
-            "scatter_u": (DIMS[1:], grid.per_cell(scatter / np.sqrt(2 * freedom)), {"units": "um"}),
+            "scatter_u": (DIMS[1:], grid.per_cell(scatter / np.sqrt(2 * np.maximum(freedom, 1.0))), {"units": "um"}),
             "scatter_freedom": (DIMS[1:], grid.per_cell(freedom), {"units": "1"}),
             "scatter_position": (
                 ("target",),
@@ -122,7 +124,7 @@ def describe(deviations: xr.Dataset, joint: JointFit, *, state: str | float = "m
             "drift": (DIMS, grid.per_reading(at_position), {"units": "um", "long_name": "drift from the stated state"}),
             "drift_u": (DIMS, grid.per_reading(at_position_u), {"units": "um"}),
             "noise": (DIMS, grid.per_reading(noise), {"units": "um", "long_name": "random part of the reading"}),
-            "standardised": (DIMS, grid.per_reading(fit.deletion_residuals()), {"units": "1"}),
+            "standardised": (DIMS, standardised, {"units": "1"}),
             "sigma": ((), fit.sigma, {"units": "um"}),
             "drift_size": (("component",), drift.std(axis=0), {"units": "um"}),
             "drift_rate": (
@@ -183,7 +185,8 @@ def _signs(estimated: xr.Dataset) -> xr.DataArray:
 
 def flag_outliers(deviations: xr.Dataset, estimated: xr.Dataset) -> xr.Dataset:
     """Return the deviations with the outlier flag set where a reading lies beyond OUTLIER_LIMIT of the joint estimate."""
-    beyond = np.abs(np.nan_to_num(estimated["standardised"].values)) > OUTLIER_LIMIT
+    with np.errstate(invalid="ignore"):
+        beyond = np.abs(estimated["standardised"].values) > OUTLIER_LIMIT
     return flags.set_flag(deviations, flags.OUTLIER, beyond)
 
 
@@ -305,7 +308,8 @@ def _scatter(joint: JointFit, u: Array, d: Array) -> tuple[Array, Array]:
     cells = len(joint.cells)
     squares = np.bincount(joint.cell, weighted * residual**2, minlength=cells).astype(float)
     freedom = np.bincount(joint.cell, weighted * expected, minlength=cells).astype(float)
-    return np.sqrt(squares / freedom), freedom
+    known = np.where(freedom > 0.5, freedom, np.nan)
+    return np.sqrt(squares / known), np.where(freedom > 0.5, freedom, 0.0)
 
 
 class _Grid:
@@ -314,7 +318,7 @@ class _Grid:
     def __init__(self, deviations: xr.Dataset, joint: JointFit) -> None:
         self._shape = deviations["deviation"].shape
         self._direction, self._target = joint.cells[:, 0], joint.cells[:, 1]
-        self._cycle = np.searchsorted(deviations["cycle"].values, joint.readings["cycle"].values)
+        self._cycle = index_of(deviations["cycle"].values, joint.readings["cycle"].values)
         self._cell = joint.cell
 
     def per_cell(self, values: Array) -> Array:
@@ -326,6 +330,12 @@ class _Grid:
         filled = np.full(self._shape, np.nan)
         filled[self._cycle, self._direction[self._cell], self._target[self._cell]] = values
         return filled
+
+    def is_left_out(self, deviations: xr.Dataset) -> NDArray[np.bool_]:
+        """Mark readings that were taken but did not enter the fit."""
+        held = np.isfinite(deviations["deviation"].values) & ~np.isnat(deviations["time"].values)
+        held[self._cycle, self._direction[self._cell], self._target[self._cell]] = False
+        return held
 
     def per_pair(self, matrix: Array) -> Array:
         filled = np.full((*self._shape[1:], *self._shape[1:]), np.nan)

@@ -153,8 +153,8 @@ def plot_pair_scatter(scatter: xr.Dataset, ax: Axes | None = None, *, quantity: 
     """Draw figure 10; ``quantity`` says which of the two is shown, and the axis names it."""
     ax = _axes(ax)
     label = {
-        "mean_difference_u": "standard uncertainty of the mean difference, equation (6) [um]",
-        "standard_deviation": "sample standard deviation of the difference [um]",
+        "mean_difference_u": "u of the mean difference,\nequation (6) [um]",
+        "standard_deviation": "sample standard deviation\nof the difference [um]",
     }[quantity]
     return _bars(ax, scatter[quantity], label)
 
@@ -174,7 +174,8 @@ def _bars(ax: Axes, values: xr.DataArray, label: str) -> Axes:
         one = values.sel(direction=direction)
         ax.bar(one["link"].values + shift, one.values, 0.4, color=_COLOURS[direction], label=_ARROWS[direction])
     ax.set(xlabel="position (pair with the one before)", ylabel=label)
-    ax.legend()
+    ax.margins(y=0.25)
+    ax.legend(ncols=2)
     return ax
 
 

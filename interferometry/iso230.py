@@ -13,6 +13,8 @@ import GTC
 import numpy as np
 import xarray as xr
 
+from interferometry.deviations import DIRECTIONS
+
 #: Quantities of the axis that carry an uncertainty.
 QUANTITIES = ("B", "R", "E", "M", "A")
 STANDARD_CYCLES = 5
@@ -83,16 +85,18 @@ def evaluate(
         mean_bidirectional, reversal (B_i), repeatability_bidirectional (R_i). Per direction: R_unidirectional,
         E_unidirectional, A_unidirectional. Of the axis: B, mean_reversal, R, E, M, A, each of QUANTITIES with its
         standard uncertainty ``<name>_u``. Quantities that need both directions are NaN where one was not measured.
-        ``attrs["window"]`` names the cycles and says when they are not the five of the standard.
+        ``attrs["window"]`` names the cycles, says when they are not the five of the standard, and which targets are
+        left out because a direction read them fewer than twice.
 
     Raises
     ------
     ValueError
-        The window names a cycle that was not measured, or leaves a measured target with fewer than two readings.
+        The window names a cycle that was not measured, or no target has two readings in it.
     """
+    deviations = deviations.reindex(direction=list(DIRECTIONS))
     x, numbers = _select(deviations, cycles)
     count = np.isfinite(x).sum(axis=0)
-    _check_counts(deviations, count)
+    x, count, few = _leave_out_single_readings(deviations, x, count)
     mean, s = _mean_and_s(x, count)
     reversal, both = mean[0] - mean[1], (mean[0] + mean[1]) / 2
     repeatability = np.fmax(2 * s[0] + 2 * s[1] + np.abs(reversal), np.fmax(4 * s[0], 4 * s[1]))
@@ -129,7 +133,7 @@ def evaluate(
     result = result.assign(_uncertainties(result, deviations["position"].values, budget or Iso230Budget()))
     for name in result.data_vars:
         result[name].attrs["units"] = "1" if name == "count" else "um"
-    result.attrs["window"] = _name_window(numbers)
+    result.attrs["window"] = _name_window(numbers, few)
     return result
 
 
@@ -195,13 +199,19 @@ def _select(deviations: xr.Dataset, cycles: Sequence[int] | None) -> tuple[np.nd
     return deviations["deviation"].values[chosen], numbers[chosen]
 
 
-def _check_counts(deviations: xr.Dataset, count: np.ndarray) -> None:
-    for direction, readings in zip(deviations["direction"].values, count, strict=True):
-        if not readings.any():
-            continue
-        few = deviations["target"].values[readings < 2].tolist()
-        if few:
-            raise ValueError(f"targets {few} have fewer than two readings in direction {direction}; widen the window")
+def _leave_out_single_readings(
+    deviations: xr.Dataset, x: np.ndarray, count: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Take out, by name, positions that a measured direction read fewer than twice: they have no standard deviation."""
+    measured = count.any(axis=1, keepdims=True)
+    single = (count < 2) & measured
+    if not ((count >= 2) & measured).any():
+        raise ValueError("no target has two readings in the window; widen it")
+    names = [
+        f"{deviations['target'].values[target]} {deviations['direction'].values[direction]}"
+        for direction, target in np.argwhere(single)
+    ]
+    return np.where(single, np.nan, x), np.where(single, 0, count), names
 
 
 def _mean_and_s(x: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -218,11 +228,11 @@ def _largest(values: np.ndarray) -> float:
     return float(finite.max()) if finite.size else np.nan
 
 
-def _name_window(cycles: np.ndarray) -> str:
-    span = f"cycles {cycles[0]}..{cycles[-1]}" if cycles.size > 1 else f"cycle {cycles[0]}"
-    if cycles.size == STANDARD_CYCLES:
-        return span
-    return f"{span} ({cycles.size} cycles, not the {STANDARD_CYCLES} of the standard's acceptance test)"
+def _name_window(cycles: np.ndarray, left_out: Sequence[str]) -> str:
+    name = f"cycles {cycles[0]}..{cycles[-1]}" if cycles.size > 1 else f"cycle {cycles[0]}"
+    if cycles.size != STANDARD_CYCLES:
+        name += f" ({cycles.size} cycles, not the {STANDARD_CYCLES} of the standard's acceptance test)"
+    return name + (f"; without targets {', '.join(left_out)} (fewer than two readings)" if left_out else "")
 
 
 def _uncertainties(

@@ -31,6 +31,9 @@ BASE_COMPONENTS = ("shift", "stretch")
 #: A further component is added where its contrast over the cycles is serially dependent at this level.
 COMPONENT_LEVEL = 1e-3
 
+#: Median absolute deviations from which a reading is left out before the fit.
+GROSS_LIMIT = 50.0
+
 
 class DriftDataError(ValueError):
     """The deviations cannot be fitted jointly; the message says what is missing."""
@@ -70,6 +73,9 @@ def fit_joint(
     """Fit profile and drift; see `drift.estimate_drift`, which also describes the result."""
     readings = sort_readings(deviations)
     _check_readings(deviations, readings)
+    if robust:
+        readings = readings.isel(reading=~is_gross(readings))
+        _check_readings(deviations, readings)
     cells, cell = _cells(deviations, readings)
     if components is not None:
         unknown = sorted(set(components) - set(COMPONENTS))
@@ -93,14 +99,45 @@ def _check_readings(deviations: xr.Dataset, readings: xr.Dataset) -> None:
         raise DriftDataError(
             f"{cycles} cycles and {targets} targets hold readings; the joint estimate needs two of each"
         )
+    if not _without_medians(readings).any():
+        raise DriftDataError("readings repeat exactly: there is no random part to weigh them by; export more digits")
+
+
+def is_gross(readings: xr.Dataset) -> NDArray[np.bool_]:
+    """Mark readings so wild that they would mislead even a robust fit's start: sentinels, beam breaks, other targets.
+
+    A reading is compared with the median of its position and direction, and then with the median of its pass; what is
+    left, drift included, scatters by some median absolute deviation, and GROSS_LIMIT of them are beyond any drift.
+    """
+    left = _without_medians(readings)
+    usual = float(np.median(np.abs(left))) or float(np.mean(np.abs(left)))
+    return np.abs(left) > GROSS_LIMIT * usual
+
+
+def _without_medians(readings: xr.Dataset) -> Array:
+    """Return readings less the median of their position and direction, and then less that of their pass."""
+    left = readings["deviation"].values.astype(float)
+    passes = readings["cycle"].values * 2 + (readings["sign"].values > 0)
+    cells = readings["target"].values * 2 + (readings["sign"].values > 0)
+    for groups in (cells, passes):
+        _, own = np.unique(groups, return_inverse=True)
+        medians = np.array([np.median(left[own == one]) for one in range(own.max() + 1)])
+        left = left - medians[own]
+    return left
 
 
 def _cells(deviations: xr.Dataset, readings: xr.Dataset) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the (direction, target) indices that hold readings, and each reading's place among them."""
     direction = np.where(readings["sign"].values > 0, 0, 1)
-    target = np.searchsorted(deviations["target"].values, readings["target"].values)
+    target = index_of(deviations["target"].values, readings["target"].values)
     cells, cell = np.unique(np.column_stack([direction, target]), axis=0, return_inverse=True)
     return cells, np.asarray(cell).ravel()
+
+
+def index_of(labels: NDArray[np.int64], values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return where each value stands among the labels, in whatever order these are."""
+    order = np.argsort(labels, kind="stable")
+    return np.asarray(order[np.searchsorted(labels, values, sorter=order)])
 
 
 def loadings_of(sign: Array, position_mm: Array, components: Sequence[str], span_mm: tuple[float, float]) -> Array:
@@ -162,7 +199,7 @@ def _asks_for(joint: JointFit, component: str) -> bool:
 def _serial_p_value(series: Array) -> float:
     """Return the one-sided p-value of positive serial dependence by the von Neumann ratio (normal approximation)."""
     n = series.size
-    if n < 8:
+    if n < 8 or np.ptp(series) == 0:
         return 1.0
     centred = series - series.mean()
     ratio = float((np.diff(series) ** 2).sum() / (centred**2).sum())

@@ -182,7 +182,7 @@ def _cycle_components(estimated: xr.Dataset, deviations: xr.Dataset) -> tuple[Ar
     seconds, rows = [], []
     for cycle, values in zip(time, left, strict=True):
         present = np.isfinite(values.ravel())
-        if np.linalg.matrix_rank(loadings[present]) < loadings.shape[1]:
+        if not present.any() or np.linalg.matrix_rank(loadings[present]) < loadings.shape[1]:
             continue
         rows.append(np.linalg.lstsq(loadings[present], values.ravel()[present], rcond=None)[0])
         seconds.append((cycle.ravel()[present] - first).astype("f8").mean() * 1e-9)

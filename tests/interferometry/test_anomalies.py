@@ -76,6 +76,15 @@ def test_a_period_is_measured(rng: np.random.Generator) -> None:
     assert one.extra_um == pytest.approx(0.4, abs=0.12)
 
 
+def test_lost_cycles_and_a_lost_direction_do_not_disturb(rng: np.random.Generator) -> None:
+    made = noise(rng)
+    made[:, :, 2] += 0.7 * rng.standard_normal((100, 2))
+    deviations, _ = simulate(rng, noise=made)
+    deviations["deviation"].values[30:40] = np.nan
+    deviations["deviation"].values[:, 1, 9] = np.nan
+    assert [(one.target, one.kind) for one in found(deviations)] == [(3, "scatter")]
+
+
 def test_results_are_repeatable(rng: np.random.Generator) -> None:
     made = noise(rng)
     made[:, :, 2] += 0.5 * rng.standard_normal((100, 2))

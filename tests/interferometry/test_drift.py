@@ -196,6 +196,29 @@ def test_readings_that_cannot_be_fitted_are_refused(rng: np.random.Generator) ->
         estimate_drift(timeless)
 
 
+def test_readings_that_repeat_exactly_are_refused(rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=4)
+    deviations["deviation"].values[:] = 1.0
+    with pytest.raises(DriftDataError, match="readings repeat exactly"):
+        estimate_drift(deviations)
+
+
+def test_a_sentinel_does_not_reach_the_fit(rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=20)
+    clean = estimate_drift(deviations)
+    deviations["deviation"].values[7, 0, 3] = 99999.0
+    struck = estimate_drift(deviations)
+    assert float(struck["sigma"]) == pytest.approx(float(clean["sigma"]), rel=0.01)
+    flagged = flag_outliers(deviations, struck)["quality_flag"].values & flags.OUTLIER.mask
+    assert np.argwhere(flagged).tolist() == [[7, 0, 3]]
+
+
+def test_the_order_of_targets_does_not_matter(rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=10)
+    shuffled = estimate_drift(deviations.isel(target=rng.permutation(16))).sortby("target")
+    np.testing.assert_allclose(shuffled["profile"], estimate_drift(deviations)["profile"], atol=1e-9)
+
+
 def test_sorted_readings_hold_the_real_time(rng: np.random.Generator) -> None:
     readings = sort_readings(simulate(rng, cycles=2)[0])
     assert float(readings["seconds"][32]) == pytest.approx(CYCLE_S)

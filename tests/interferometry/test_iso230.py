@@ -121,11 +121,21 @@ def test_a_missing_reading_is_skipped(rng: np.random.Generator) -> None:
     assert float(result["standard_deviation"][1, 3]) == pytest.approx(np.nanstd(x[:, 1, 3], ddof=1))
 
 
+def test_a_target_read_once_is_left_out_by_name(rng: np.random.Generator) -> None:
+    x = rng.normal(0, 1, (5, 2, 4))
+    x[1:, 1, 3] = np.nan
+    x[0, 1, 3] = 100.0
+    result = evaluate(test_made(x))
+    assert result.attrs["window"] == "cycles 1..5; without targets 4 negative (fewer than two readings)"
+    assert float(result["A"]) < 50.0
+    assert np.isnan(float(result["reversal"][3]))
+
+
 def test_windows_that_cannot_be_evaluated_are_refused(rng: np.random.Generator) -> None:
     test = test_made(rng.normal(0, 1, (5, 2, 4)))
     with pytest.raises(ValueError, match=r"cycles \[6, 7\] of the window were not measured"):
         evaluate(test, cycles=[5, 6, 7])
-    with pytest.raises(ValueError, match=r"targets \[1, 2, 3, 4\] have fewer than two readings in direction positive"):
+    with pytest.raises(ValueError, match="no target has two readings in the window; widen it"):
         evaluate(test, cycles=[5])
     with pytest.raises(ValueError, match="5 cycles do not fill a window of 8"):
         evaluate_windows(test, length=8)

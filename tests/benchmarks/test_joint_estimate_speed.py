@@ -1,0 +1,67 @@
+"""Speed of the joint estimate, as ratios against a dense solution of the same model measured in the same run."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from interferometry.anomalies import detect_anomalies
+from interferometry.deviations import sort_readings
+from interferometry.drift import estimate_drift
+from interferometry.jointfit import fit_joint
+from interferometry.statespace import fit_fixed_effects
+from tests.interferometry.simulated_campaigns import simulate
+
+pytestmark = pytest.mark.slow
+
+
+def cpu_seconds(work: object, repeat: int = 3) -> float:
+    """Smallest processor time of a few calls in s."""
+    best = np.inf
+    for _ in range(repeat):
+        start = time.process_time()
+        work()  # type: ignore[operator]
+        best = min(best, time.process_time() - start)
+    return best
+
+
+def test_one_likelihood_against_dense_cholesky(rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=60, kind="rw")
+    joint = fit_joint(deviations, order=1, robust=False, components=["shift", "stretch"])
+    system, fit = joint.fit.system, joint.fit
+    t = system.seconds - system.seconds[0]
+    walk = np.minimum.outer(t, t)
+
+    def dense() -> float:
+        total = np.diag(system.variance)
+        for c, ratio in enumerate(system.ratios):
+            total = total + ratio * walk * np.outer(system.loadings[:, c], system.loadings[:, c])
+        factor = linalg.cholesky(total, lower=True)
+        whitened = linalg.solve_triangular(factor, np.column_stack([fit.response, fit.design]), lower=True)
+        _, rss, *_ = np.linalg.lstsq(whitened[:, 1:], whitened[:, 0], rcond=None)
+        return float(rss[0])
+
+    recursive = cpu_seconds(lambda: fit_fixed_effects(system, fit.response, fit.design))
+    ratio = cpu_seconds(dense, 1) / recursive
+    print(f"\n{t.size} readings: dense scipy Cholesky / recursive filter = {ratio:.0f}")
+    assert dense() == pytest.approx(fit.rss, rel=1e-6)
+
+
+def test_cost_grows_with_the_number_of_readings(rng: np.random.Generator) -> None:
+    seconds = {}
+    for cycles in (100, 1000):
+        deviations, _ = simulate(rng, cycles=cycles, kind="duty")
+        estimated = estimate_drift(deviations)
+        seconds[cycles] = (
+            sort_readings(deviations).sizes["reading"],
+            cpu_seconds(lambda d=deviations: estimate_drift(d), 1),  # type: ignore[misc]
+            cpu_seconds(lambda e=estimated, d=deviations: detect_anomalies(e, d), 1),  # type: ignore[misc]
+        )
+    for cycles, (readings, estimate_s, anomalies_s) in seconds.items():
+        print(
+            f"\n{cycles} cycles, {readings} readings: estimate {estimate_s:.2f} s, anomalies {anomalies_s:.2f} s of processor"
+        )
+    print(f"ten times the readings cost {seconds[1000][1] / seconds[100][1]:.1f} times the time")
