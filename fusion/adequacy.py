@@ -9,7 +9,7 @@ not from the whitened noise: the drift swallows a part of slow patterns (statist
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +83,26 @@ def examine(
     named_sites = [sites[k] for k in kept]
     shape = _describe(cycles, along_time, named_sites, along_sites, readings) if p_value < LEVEL else ""
     return Remainder(p_value, p_values, shape, rms if shape else 0.0, cycles, along_time, named_sites, along_sites)
+
+
+def with_drift(found: Remainder, fit: DriftFit) -> Remainder:
+    """Count a common drift or a stretch as a remainder where it is larger than the noise of a reading.
+
+    The fit lets both wander freely, so no test of the residual can see them; their size is what the model leaves unexplained.
+    """
+    drift, _ = fit.drift()
+    loaded = drift * fit.system.loadings
+    sizes = np.sqrt(np.mean((loaded - loaded.mean(axis=0)) ** 2, axis=0))
+    largest = int(np.argmax(sizes))
+    if sizes[largest] <= fit.sigma:
+        return found
+    course = "smooth" if fit.system.order == 2 else "irregular"
+    where = ("all positions alike", "growing along the axis")[largest] if sizes.size == 2 else f"channel {largest + 1}"
+    return replace(
+        found,
+        shape=f"a slow, {course} drift that no effect of the library follows; {where}, both directions",
+        rms_um=float(sizes[largest]),
+    )
 
 
 def _matrix(readings: Readings, values: Array) -> tuple[NDArray[np.int64], list[tuple[int, str]], Array]:

@@ -112,6 +112,8 @@ def _needs_material(readings: Readings) -> str | None:
 
 def warm_up(readings: Readings, minutes: float) -> Array:
     """Approach to a steady state from the first reading on, 0 to 1, (n,)."""
+    if minutes <= 0.0:
+        return np.ones_like(readings.seconds)
     return 1.0 - np.exp(-readings.seconds / (60.0 * minutes))
 
 
@@ -131,8 +133,9 @@ def _states(readings: Readings, near: Member | None) -> Iterator[tuple[Array, Pa
             yield readings.at(lagged), {"follows": "mean_rise", "time_constant_min": minutes}
     for name in readings.drivers:
         for minutes in _near(near, "time_constant_min", (5.0, *_STATE_LAGS_MIN), ratio=2.0):
-            lagged = readings.series[name].lagged(60.0 * minutes, at_rest=0.0)
-            yield readings.at(lagged), {"follows": name, "time_constant_min": minutes}
+            for start, at_rest in (("settled", None), ("at rest", 0.0)):
+                lagged = readings.series[name].lagged(60.0 * minutes, at_rest=at_rest)
+                yield readings.at(lagged), {"follows": name, "time_constant_min": minutes, "start": start}
     for minutes in _near(near, "time_constant_min", WARM_UPS_MIN, ratio=2.0):
         yield warm_up(readings, minutes), {"follows": "warm_up", "time_constant_min": minutes}
 
@@ -155,12 +158,20 @@ def _unseen_heat_source(readings: Readings, _: Mapping[str, float], near: Member
     for name in readings.drivers:
         unit = readings.series[name].units
         for minutes in _near(near, "time_constant_min", LAGS_MIN, ratio=1.5):
-            state = readings.at(readings.series[name].lagged(60.0 * minutes, at_rest=0.0))
-            found: Parameters = {"follows": name, "time_constant_min": minutes}
-            per = (f"um/({unit})",)
-            yield Member(_column(state), {**found, "shape": "flat"}, per)
-            yield Member(_column(state * readings.share), {**found, "shape": "linear"}, per)
-            yield Member(_column(state, state * readings.share), {**found, "shape": "flat and linear"}, per * 2)
+            settled = readings.at(readings.series[name].lagged(60.0 * minutes))
+            # What the body was before the log began is not known; its memory of it dies away with the same time constant.
+            memory = np.exp(-readings.seconds / (60.0 * minutes))
+            for shape, along in (
+                ("flat", (1.0,)),
+                ("linear", (readings.share,)),
+                ("flat and linear", (1.0, readings.share)),
+            ):
+                found: Parameters = {"follows": name, "time_constant_min": minutes, "shape": shape}
+                known = [settled * factor for factor in along]
+                start = [memory * factor for factor in along]
+                per = (f"um/({unit})",) * len(along)
+                yield Member(_column(*known), {**found, "start": "settled"}, per)
+                yield Member(_column(*known, *start), {**found, "start": "free"}, per + ("um",) * len(along))
 
 
 def refractivity_change_ppm(readings: Readings) -> Array:

@@ -51,7 +51,10 @@ def jumps(series: Series) -> list[tuple[float, float, float]]:
         low, high = max(0, k - 3), min(changes.size, k + 4)
         excess[k] = changes[k] - np.median(np.delete(changes[low:high], k - low))
     scatter = 1.4826 * np.median(np.abs(excess - np.median(excess)))
-    found = np.flatnonzero(np.abs(excess) > _JUMP_SIGMAS * max(scatter, 1e-9))
+    # A log in steps of its resolution has no finer scatter than one step.
+    steps = np.abs(changes[changes != 0.0])
+    resolution = float(steps.min()) if steps.size and np.unique(np.round(steps, 9)).size < steps.size / 2 else 0.0
+    found = np.flatnonzero(np.abs(excess) > _JUMP_SIGMAS * max(scatter, resolution, 1e-9))
     return [(float(series.seconds[k]), float(series.seconds[k + 1]), float(excess[k])) for k in found]
 
 

@@ -9,6 +9,7 @@ open loop with frozen coefficients. Procedure and its error rates: statistics st
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +84,10 @@ def close_loop(
         rounds.append(scores)
         best = search.choose(scores, models[-1])
         if best is None:
+            asked = search.ask_sealed(scores, models[-1])
+            if asked is not None:
+                chosen.append((asked, scores))
+                models.append(search.fit([*models[-1].terms, Term(asked.name, member_of(asked))]))
             break
         chosen.append((best, scores))
         models.append(search.fit([*models[-1].terms, Term(best.name, member_of(best))], models[-1]))
@@ -99,7 +104,7 @@ def close_loop(
     ]
     report(MOST_EFFECTS + 1, MOST_EFFECTS + 2, "second look, at all cycles")
     whole, steps = _second_look(search, whole, steps, errors[-1], rounds)
-    remainder = adequacy.examine(readings, whole.fit, rng, set_aside=set_aside)
+    remainder = _remainder(whole, seed, set_aside)
     report(MOST_EFFECTS + 2, MOST_EFFECTS + 2, "loop closed")
     return LoopResult(
         declared=list(declared),
@@ -124,6 +129,18 @@ def close_loop(
         after=whole,
         sealed=~used,
     )
+
+
+def set_aside_sites(found: LoopResult, sites: Collection[tuple[int, str]], *, seed: int = 1) -> LoopResult:
+    """The same result with sites (target, direction) whose anomaly has its own diagnosis no longer counted as a remainder."""
+    remainder = _remainder(found.after, seed, sites)
+    return replace(found, remainder=remainder, verdict=_verdict(bool(found.steps), bool(remainder.shape)))
+
+
+def _remainder(whole: ModelFit, seed: int, set_aside: Collection[tuple[int, str]]) -> adequacy.Remainder:
+    """What is left: a shape among the sites, or, where there is none, a drift of all of them that nothing explains."""
+    found = adequacy.examine(whole.readings, whole.fit, np.random.default_rng(seed), set_aside=set_aside)
+    return found if found.shape else adequacy.with_drift(found, whole.fit)
 
 
 def _verdict(added: bool, left: bool) -> str:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fusion.effects import Member
 from fusion.readings import Readings
-from interferometry.statespace import Array, DriftFit, drift_system, estimate, fit_fixed_effects
+from interferometry.statespace import Array, DriftFit, DriftSystem, estimate, fit_fixed_effects
 
 #: The scatter of a site is trusted like this many further readings with the scatter of all sites.
 _SHRINKAGE_READINGS = 20
@@ -71,7 +71,8 @@ class ModelFit:
         covariance = self.fit.covariance[place, place]
         return columns @ self.fit.coefficients[place], np.sqrt(np.einsum("ni,ij,nj->n", columns, covariance, columns))
 
-    def _design(self) -> Array:
+    def whole_design(self) -> Array:
+        """Columns of the fit for all readings, (n, p)."""
         columns = [self.profile, *(term.member.columns for term in self.terms)]
         design = np.column_stack(columns)
         if self.fit.system.order == 2:
@@ -79,24 +80,27 @@ class ModelFit:
             design = np.column_stack([design, self.readings.loadings * hours])
         return design
 
+    def whole_system(self) -> DriftSystem:
+        """All readings under the fitted drift, those that were used marked as observed."""
+        variance = np.ones(self.used.size)
+        variance[self.used] = self.fit.system.variance
+        return DriftSystem(
+            self.readings.seconds,
+            self.readings.loadings,
+            self.fit.system.order,
+            self.fit.system.ratios,
+            variance,
+            self.used,
+        )
+
     def open_loop_errors(self) -> tuple[Array, Array]:
         """Errors of predicting the readings that were not used, um, and the predicted standard deviation, both (n_unused,).
 
         Coefficients are frozen; the drift keeps the value it had at the last used reading. Readings of a site that the fit has
         never seen are NaN.
         """
-        system = self.fit.system
-        variance = np.ones(self.used.size)
-        variance[self.used] = system.variance
-        seen = drift_system(
-            self.readings.seconds,
-            self.readings.loadings,
-            order=system.order,
-            ratios=system.ratios,
-            variance=variance,
-            observed=self.used,
-        )
-        design = self._design()
+        seen = self.whole_system()
+        design = self.whole_design()
         errors, spread = seen.innovations(np.column_stack([self.readings.response, design]))
         through = errors[:, 1:]
         missed = errors[:, 0] - through @ self.fit.coefficients

@@ -17,8 +17,22 @@ from numpy.typing import NDArray
 from fusion.effects import Member
 from interferometry.statespace import Array, DriftFit, DriftSystem, fit_fixed_effects
 
-#: log10 factors on the two drift variances: as estimated, or less drift in one or both, down to hardly any.
-_GRID = ((0.0, 0.0), (-1.0, 0.0), (-2.5, 0.0), (0.0, -1.0), (0.0, -2.5), (-1.0, -1.0), (-2.5, -2.5), (0.5, 0.5))
+#: log10 factors on the two drift variances: as estimated, less drift in one or both down to none, and as much more as the simulated
+#: campaigns may hold, so that a strong drift is not mistaken for an effect there.
+_GRID = (
+    (0.0, 0.0),
+    (-1.0, 0.0),
+    (-2.5, 0.0),
+    (0.0, -1.0),
+    (0.0, -2.5),
+    (-1.0, -1.0),
+    (-2.5, -2.5),
+    (-6.0, -6.0),
+    (0.5, 0.5),
+    (1.0, 0.0),
+    (0.0, 1.0),
+    (1.0, 1.0),
+)
 #: A candidate of which the model explains all but this share adds nothing that these data can show.
 _SEPARABLE_SHARE = 1e-4
 DRAWS = 200
@@ -257,19 +271,22 @@ def _least_ratio(system: DriftSystem) -> float:
     return 0.0625 / span if system.order == 1 else 3.0 * 0.0625 / span**3
 
 
-def simulate_null(fit: DriftFit, rng: np.random.Generator, *, draws: int = DRAWS) -> Array:
+def simulate_null(
+    fit: DriftFit, rng: np.random.Generator, *, draws: int = DRAWS, over: DriftSystem | None = None
+) -> Array:
     """Responses (n, draws) in which only the model's drift and noise act; the noise is drawn from the fit's residuals.
 
-    Fixed effects are left out, because every score is the same whatever they are.
+    Fixed effects are left out, because every score is the same whatever they are. ``over`` names other readings than the fit's own.
     """
     noise, share = fit.noise()
+    system = fit.system if over is None else over
     relative = noise / np.sqrt(np.maximum(share, 1e-12))
-    drawn = rng.choice(relative, size=(noise.size, draws)) * np.sqrt(fit.system.variance)[:, None]
-    steps = np.diff(fit.system.seconds, prepend=fit.system.seconds[0])
+    drawn = rng.choice(relative, size=(system.seconds.size, draws)) * np.sqrt(system.variance)[:, None]
+    steps = np.diff(system.seconds, prepend=system.seconds[0])
     ratios = plausible_ratios(fit, rng, draws=draws)
-    for ratio, loading in zip(ratios.T, fit.system.loadings.T, strict=True):
-        shocks = rng.standard_normal((noise.size, draws)) * np.sqrt(steps)[:, None]
-        if fit.system.order == 1:
+    for ratio, loading in zip(ratios.T, system.loadings.T, strict=True):
+        shocks = rng.standard_normal(drawn.shape) * np.sqrt(steps)[:, None]
+        if system.order == 1:
             drift = np.cumsum(shocks, axis=0)
         else:
             rate = np.cumsum(shocks, axis=0)
@@ -278,3 +295,46 @@ def simulate_null(fit: DriftFit, rng: np.random.Generator, *, draws: int = DRAWS
             drift = np.cumsum((before + own) * steps[:, None], axis=0)
         drawn += fit.sigma * np.sqrt(ratio) * drift * loading[:, None]
     return drawn
+
+
+def ask_sealed(
+    fit: DriftFit, whole: DriftSystem, response: Array, design: Array, member: Member, rng: np.random.Generator
+) -> tuple[float, float, float]:
+    """Put one candidate to the sealed readings, predicted in open loop.
+
+    Parameters
+    ----------
+    fit : the model without the candidate, fitted to the readings before the seal
+    whole : all readings, those before the seal marked as observed
+    response, design : (n,) and (n, p) for all readings
+    member : the candidate, with columns for all readings
+
+    Returns
+    -------
+    before, after, p_value
+        Root mean square errors without and with the candidate, and the chance of so small an error after where the candidate is not
+        there and the model's own drift is all that happens. Coefficients, noise and drift come from before the seal alone.
+    """
+    train = whole.observed
+    null = simulate_null(fit, rng, over=replace(whole, observed=np.ones_like(train)))
+    responses = np.column_stack([response, null])
+    p, count = design.shape[1], responses.shape[1]
+    centre = np.maximum(fit.system.ratios, _least_ratio(fit.system))
+    likelihood: dict[bool, list[Array]] = {False: [], True: []}
+    error: dict[bool, list[Array]] = {False: [], True: []}
+    for pair in _GRID:
+        system = replace(whole, ratios=centre * np.resize(10.0 ** np.asarray(pair), centre.size))
+        errors, spread = system.innovations(np.column_stack([responses, design, member.columns]))
+        root = np.sqrt(spread[train])[:, None]
+        for with_member in (False, True):
+            used = slice(count, count + p + (member.columns.shape[1] if with_member else 0))
+            y, x = errors[train, :count] / root, errors[train, used] / root
+            beta = _solve(x.T @ x, x.T @ y)
+            variance = ((y - x @ beta) ** 2).mean(axis=0)
+            likelihood[with_member].append(-0.5 * (y.shape[0] * np.log(variance) + np.log(spread[train]).sum()))
+            error[with_member].append(((errors[~train, :count] - errors[~train, used] @ beta) ** 2).mean(axis=0))
+    before, after = (
+        np.sqrt(np.take_along_axis(np.array(error[key]), np.argmax(likelihood[key], axis=0)[None, :], axis=0)[0])
+        for key in (False, True)
+    )
+    return float(before[0]), float(after[0]), float((1 + (after[1:] <= after[0]).sum()) / after.size)

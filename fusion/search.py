@@ -12,12 +12,16 @@ from fusion.episodes import cycle_starts
 from fusion.gates import blocked_reason
 from fusion.model import ModelFit, Term, fit_model
 from fusion.readings import Readings
-from fusion.scoring import DRAWS, FamilyScore, Judge, simulate_null
+from fusion.scoring import DRAWS, FamilyScore, Judge, ask_sealed, simulate_null
 
 #: Chance of adding an effect where nothing is missing, over the whole search.
 ENTRY_LEVEL = 0.05
 #: Chance that an effect which is not there passes its confirmation on unused readings; the search has been paid for already.
 CONFIRMATION_LEVEL = 0.2
+#: An effect with a larger p-value, uncorrected, is not worth the one question to the sealed readings.
+_WORTH_ASKING = 0.1
+#: Chance that the one question to the sealed readings is answered with yes where the effect is not there.
+ASKED_LEVEL = 0.02
 _BLOCKS = 10
 _MAY_REPEAT = frozenset({"step_event", "camera_offset", "sensor_fault", "periodic_disturbance"})
 
@@ -41,6 +45,7 @@ class Search:
             name: reason for name, effect in effects.items() if (reason := effect.needs(readings)) is not None
         }
         self.blocked: dict[str, str] = {}
+        self.asked: dict[str, float | str] = {}
 
     def fit(self, terms: Sequence[Term], like: ModelFit | None = None) -> ModelFit:
         """Fit terms to the readings that are not sealed."""
@@ -92,6 +97,34 @@ class Search:
                 self.blocked[score.name] = reason
                 continue
             return self._refined(score, model)
+        return None
+
+    def ask_sealed(self, scores: Sequence[FamilyScore], model: ModelFit) -> FamilyScore | None:
+        """Put the strongest candidate that the search could not decide on to the sealed readings, as a single question.
+
+        One question, chosen before the seal is opened, needs no correction for the search.
+        """
+        for score in scores:
+            if score.member is None or score.p_value > _WORTH_ASKING or score.name in self.blocked:
+                continue
+            part = self.readings.subset(model.used)
+            reason = blocked_reason(self.effects[score.name], score.member, part, model, scores)
+            if reason is not None:
+                self.blocked[score.name] = reason
+                continue
+            asked = self._refined(score, model)
+            before, after, p_value = ask_sealed(
+                model.fit,
+                model.whole_system(),
+                self.readings.response,
+                model.whole_design(),
+                member_of(asked),
+                self.rng,
+            )
+            self.asked = {"effect": score.name, "rmse_before_um": before, "rmse_after_um": after, "p_value": p_value}
+            if after < before and p_value <= ASKED_LEVEL:
+                return FamilyScore(**{**vars(asked), "held_out_p": p_value})
+            return None
         return None
 
     def _refined(self, score: FamilyScore, model: ModelFit) -> FamilyScore:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from fusion.correlation import correlate
 from fusion.diagnosis import Diagnosis, diagnose
 from fusion.effects import library
 from fusion.groups import group, joined
-from fusion.loop import LoopResult, close_loop
+from fusion.loop import LoopResult, close_loop, set_aside_sites
 from fusion.model import ModelFit, fit_model
 from fusion.outcome import Outcome
 from fusion.progress import Report
@@ -104,29 +105,48 @@ def correlate_field(fields: xr.Dataset, fused: xr.Dataset, *, report: Report) ->
 
 
 def model_drift(source: Source, fused: xr.Dataset, deviations: xr.Dataset, *, report: Report) -> Outcome:
-    """Find positions that stand out and their cause, then close the loop on the others."""
-    report("anomalies", 0, 1)
-    anomalies = detect_anomalies(group(deviations, "drift"), deviations)
-    diagnoses = diagnose(anomalies, fused)
-    report("anomalies", 1, 1)
+    """Close the loop, then look for positions that stand out from what the model explains, and for their cause.
+
+    An effect that moves whole stretches of the axis makes their positions stand out too; it is taken out before positions are judged.
+    """
     readings = read_fused(fused)
     found = close_loop(
         readings,
         source.campaign.model.declared,
-        set_aside=[(one.target, name) for one in anomalies for name in directions_of(one.direction)],
         progress=lambda done, total, what: report("closed loop", done, total),
     )
+    variables = loop_variables(fused, readings, found)
+    report("anomalies", 0, 1)
+    explained = variables["contribution"].sum("effect", skipna=False)
+    cleaned = deviations.assign(deviation=deviations["deviation"].copy(data=(fused["deviation"] - explained).values))
+    anomalies = detect_anomalies(estimate_drift(cleaned), cleaned)
+    diagnoses = diagnose(anomalies, fused.assign(deviation=fused["deviation"].copy(data=cleaned["deviation"].values)))
+    found = set_aside_sites(found, diagnosed_sites(anomalies, diagnoses, deviations.sizes["target"]))
+    report("anomalies", 1, 1)
     parts = {
         "anomalies": [anomaly_part(*pair) for pair in zip(anomalies, diagnoses, strict=True)],
         "loop": found.as_json(),
     }
-    return Outcome(loop_variables(fused, readings, found), parts)
+    return Outcome(variables, parts)
 
 
 def join_fusion(fused: xr.Dataset, maps: xr.Dataset, loop: xr.Dataset) -> xr.Dataset:
     """Return everything that joins both recordings in one Dataset, for fusion.nc."""
     dataset = joined(fused, correlation=maps, loop=loop)
     return dataset.assign_attrs({f"correlation_{name}": value for name, value in maps.attrs.items()})
+
+
+def diagnosed_sites(
+    anomalies: Sequence[Anomaly], diagnoses: Sequence[Diagnosis], targets: int
+) -> list[tuple[int, str]]:
+    """Return the sites (target, direction) whose anomaly has a cause of its own.
+
+    Where more than a quarter of the targets stands out, that is no matter of single positions, and none is set aside.
+    """
+    found = [one for one, why in zip(anomalies, diagnoses, strict=True) if why.cause != "undetermined"]
+    if 4 * len({one.target for one in found}) > targets:
+        return []
+    return [(one.target, name) for one in found for name in directions_of(one.direction)]
 
 
 def directions_of(direction: str) -> tuple[str, ...]:
