@@ -12,7 +12,7 @@ from fusion.alignment import align
 from fusion.correlation import correlate
 from fusion.diagnosis import Diagnosis, diagnose
 from fusion.effects import library
-from fusion.groups import group, joined
+from fusion.groups import joined
 from fusion.loop import LoopResult, close_loop, set_aside_sites
 from fusion.model import ModelFit, fit_model
 from fusion.outcome import Outcome
@@ -121,7 +121,7 @@ def model_drift(source: Source, fused: xr.Dataset, deviations: xr.Dataset, *, re
     cleaned = deviations.assign(deviation=deviations["deviation"].copy(data=(fused["deviation"] - explained).values))
     anomalies = detect_anomalies(estimate_drift(cleaned), cleaned)
     diagnoses = diagnose(anomalies, fused.assign(deviation=fused["deviation"].copy(data=cleaned["deviation"].values)))
-    found = set_aside_sites(found, diagnosed_sites(anomalies, diagnoses, deviations.sizes["target"]))
+    found = set_aside_sites(found, sites_of(anomalies, deviations.sizes["target"]))
     report("anomalies", 1, 1)
     parts = {
         "anomalies": [anomaly_part(*pair) for pair in zip(anomalies, diagnoses, strict=True)],
@@ -136,17 +136,14 @@ def join_fusion(fused: xr.Dataset, maps: xr.Dataset, loop: xr.Dataset) -> xr.Dat
     return dataset.assign_attrs({f"correlation_{name}": value for name, value in maps.attrs.items()})
 
 
-def diagnosed_sites(
-    anomalies: Sequence[Anomaly], diagnoses: Sequence[Diagnosis], targets: int
-) -> list[tuple[int, str]]:
-    """Return the sites (target, direction) whose anomaly has a cause of its own.
+def sites_of(anomalies: Sequence[Anomaly], targets: int) -> list[tuple[int, str]]:
+    """Return the sites (target, direction) that are reported as anomalies, with a cause or without one, and not by the loop again.
 
     Where more than a quarter of the targets stands out, that is no matter of single positions, and none is set aside.
     """
-    found = [one for one, why in zip(anomalies, diagnoses, strict=True) if why.cause != "undetermined"]
-    if 4 * len({one.target for one in found}) > targets:
+    if 4 * len({one.target for one in anomalies}) > targets:
         return []
-    return [(one.target, name) for one in found for name in directions_of(one.direction)]
+    return [(one.target, name) for one in anomalies for name in directions_of(one.direction)]
 
 
 def directions_of(direction: str) -> tuple[str, ...]:
