@@ -51,7 +51,8 @@ class Anomaly:
     extra_um : float
         Standard deviation beyond that of the other positions; for a step its height, for a period its amplitude.
     stands_out : bool
-        Whether its scatter stands out from the natural spread of the others (generalised ESD, 5 %).
+        Whether it is more than the natural spread of scatter between positions (generalised ESD, 5 %). Always true of
+        the other kinds, which no spread of scatter can produce.
     at_cycle : int or None
         Of a step: the first cycle after it.
     period_s : float or None
@@ -385,7 +386,7 @@ def _describe_series(
         p_value=p_value,
         scatter_um=scatter,
         extra_um=extra,
-        stands_out=False,
+        stands_out=True,
         at_cycle=at_cycle,
         period_s=period_s,
     )

@@ -158,7 +158,8 @@ def compensate(
     -------
     xarray.Dataset
         The deviations compensated, and beside them, in um at every reading: correction_scale and correction_dead_path
-        (both already added), compensation_u; air_index (1). ``attrs["outside_environment"]`` counts readings before
+        (both already added); air_u, material_u and dead_path_u, and compensation_u, their root sum of squares;
+        air_index (1). ``attrs["outside_environment"]`` counts readings before
         the first or after the last logged condition, which take that condition.
 
     Raises
@@ -186,11 +187,13 @@ def compensate(
     first = np.unravel_index(int(np.nanargmin(_seconds(deviations))), index.shape)
     sign = 1.0 if away else -1.0
     correction_dead_path = -sign * dead_path_error_um(index, float(index[first]), dead_path_mm=dead_path_mm)
-    per_mm = _relative_uncertainty(air, material, expansion_coefficient_ppm_per_K, sensors, wavelength_nm)
-    u = np.hypot(
-        np.abs(travel_mm) * 1e-3 * per_mm,
-        sensors.dead_path_mm * 1e3 * np.abs(index - index[first]) * (dead_path_mm > 0),
-    )
+    length_m = np.abs(travel_mm) * 1e-3
+    parts = {
+        "air_u": length_m * _air_ppm(air, sensors, wavelength_nm),
+        "material_u": length_m * _material_ppm(np.asarray(material), expansion_coefficient_ppm_per_K, sensors),
+        "dead_path_u": sensors.dead_path_mm * 1e3 * np.abs(index - index[first]) * (dead_path_mm > 0),
+    }
+    parts["compensation_u"] = np.sqrt(sum(np.square(one) for one in parts.values()))
     compensated = deviations.copy()
     dims = deviations["deviation"].dims
     attributes = deviations["deviation"].attrs
@@ -201,7 +204,8 @@ def compensate(
     )
     compensated["correction_scale"] = (dims, correction_scale, {"units": "um"})
     compensated["correction_dead_path"] = (dims, correction_dead_path, {"units": "um"})
-    compensated["compensation_u"] = (dims, u, {"units": "um"})
+    for name, u in parts.items():
+        compensated[name] = (dims, np.broadcast_to(u, index.shape), {"units": "um"})
     compensated["air_index"] = (dims, index, {"units": "1"})
     compensated.attrs["outside_environment"] = outside
     return compensated
@@ -222,7 +226,8 @@ def _conditions_at(deviations: xr.Dataset, environment: xr.Dataset) -> tuple[dic
     known = ~np.isnat(time)
     logged = environment["time"].values.astype("datetime64[ns]")
     at, log = time.astype("i8").astype("f8"), logged.astype("i8").astype("f8")
-    nearest = np.min(np.abs(at[known][:, None] - log[None, :]), axis=1) * 1e-9
+    after = np.clip(np.searchsorted(log, at[known]), 1, log.size - 1) if log.size > 1 else np.zeros(at[known].size, int)
+    nearest = np.minimum(np.abs(at[known] - log[after]), np.abs(at[known] - log[np.maximum(after - 1, 0)])) * 1e-9
     if nearest.max() > LONGEST_GAP_S:
         worst = time[known][int(np.argmax(nearest))]
         raise CompensationError(
@@ -240,10 +245,8 @@ def _interpolate_factor(deviations: xr.Dataset, applied_factor_um: tuple[float, 
     return applied_factor_um[0] + (applied_factor_um[1] - applied_factor_um[0]) * seconds / length
 
 
-def _relative_uncertainty(
-    air: dict[str, Array], material: Array, expansion_ppm_per_K: float, sensors: SensorUncertainty, wavelength_nm: float
-) -> Array:
-    """Return the standard uncertainty of the scale in ppm (um per m), by central differences of the index."""
+def _air_ppm(air: dict[str, Array], sensors: SensorUncertainty, wavelength_nm: float) -> float:
+    """Return the standard uncertainty of the index in ppm, by central differences at the mean conditions."""
     typical = [float(np.nanmean(air[name])) for name in ("air_temperature", "air_pressure", "relative_humidity")]
     squares = sensors.formula_ppm**2
     inputs = (sensors.air_temperature_K, sensors.air_pressure_hPa, sensors.relative_humidity_percent)
@@ -253,8 +256,14 @@ def _relative_uncertainty(
         low[at] -= u / 2
         difference = air_index(*high, wavelength_nm=wavelength_nm) - air_index(*low, wavelength_nm=wavelength_nm)
         squares += float(difference * 1e6) ** 2
+    return float(np.sqrt(squares))
+
+
+def _material_ppm(material_degC: Array, expansion_ppm_per_K: float, sensors: SensorUncertainty) -> Array:
+    """Return the standard uncertainty of the material's scale in ppm; none where no material is compensated."""
     if expansion_ppm_per_K == 0:
-        return np.full(material.shape, np.sqrt(squares))
-    squares += (expansion_ppm_per_K * sensors.material_temperature_K) ** 2
-    from_reference = material - REFERENCE_TEMPERATURE_DEGC
-    return np.sqrt(squares + (sensors.expansion_coefficient_ppm_per_K * from_reference) ** 2)
+        return np.zeros(material_degC.shape)
+    from_reference = material_degC - REFERENCE_TEMPERATURE_DEGC
+    return np.hypot(
+        expansion_ppm_per_K * sensors.material_temperature_K, sensors.expansion_coefficient_ppm_per_K * from_reference
+    )

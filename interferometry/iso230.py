@@ -142,7 +142,8 @@ def evaluate_windows(
 ) -> xr.Dataset:
     """Evaluate windows of a few cycles along a long test, and the whole test as the last window.
 
-    Within a window of the standard's length the drift is small; between windows it shows as the walk of the means, and
+    A test shorter than one window has the whole as its only window; windows without two readings of any target are not
+    listed. Within a window of the standard's length the drift is small; between windows it shows as the walk of the means, and
     in the last entry as the growth of R and A.
 
     Returns
@@ -153,18 +154,21 @@ def evaluate_windows(
     Raises
     ------
     ValueError
-        The test has fewer cycles than one window.
+        No target has two readings in the whole test.
     """
     numbers = deviations["cycle"].values.tolist()
-    if len(numbers) < length:
-        raise ValueError(f"{len(numbers)} cycles do not fill a window of {length}; choose a shorter window")
     windows = [numbers[at : at + length] for at in range(0, len(numbers) - length + 1, length)]
-    evaluated = [evaluate(deviations, cycles=window, budget=budget) for window in [*windows, numbers]]
+    windows = [window for window in windows if _can_be_evaluated(deviations.sel(cycle=window))] + [numbers]
+    evaluated = [evaluate(deviations, cycles=window, budget=budget) for window in windows]
     names = [one.attrs["window"] for one in evaluated]
     kept = [name for name in evaluated[0].data_vars if "target" not in evaluated[0][name].dims]
     joined = xr.concat([one[kept] for one in evaluated], dim="window", coords="minimal", compat="override")
-    middle = [float(np.mean(window)) for window in [*windows, numbers]]
+    middle = [float(np.mean(window)) for window in windows]
     return joined.assign_coords(window=names, middle_cycle=("window", middle)).assign_attrs(window="several")
+
+
+def _can_be_evaluated(deviations: xr.Dataset) -> bool:
+    return bool((deviations["deviation"].count("cycle") >= 2).any())
 
 
 def budget_table(deviations: xr.Dataset, quantity: str, *, budget: Iso230Budget) -> list[tuple[str, float]]:

@@ -151,12 +151,12 @@ def build_chart(
         Per direction and target, in um: chart; border_u, k times equation (6); border_s, k times the standard
         deviation of the differences; chart_u, the standard uncertainty of the chain from position 1 with the full
         covariance of its links. Positions 1 and 2 have the same borders, as the paper draws them. reference_cycle
-        (direction) says which cycle gave the value at position 1.
+        (direction) says which cycle gave the value at position 1; 0 where it was never read: there is no chart then.
 
     Raises
     ------
     ValueError
-        An unknown reference, or no reading at position 1 in a direction that was measured.
+        An unknown reference.
     """
     if reference not in ("time", "first_cycle"):
         raise ValueError(f"reference={reference!r} is neither 'time' nor 'first_cycle'")
@@ -322,10 +322,8 @@ def _reference_cycles(deviations: xr.Dataset, x: xr.DataArray, reference: str, r
     first = int(np.argmin(deviations["position"].values))
     times = deviations["time"].values[:, :, first]
     chosen = []
-    for direction, name in enumerate(x["direction"].values):
+    for direction in range(x.sizes["direction"]):
         usable = np.flatnonzero(np.isfinite(x.values[:, direction, 0]))
-        if usable.size == 0 and np.isfinite(x.values[:, direction]).any():
-            raise ValueError(f"no reading at position 1 in direction {name}: the chart has no reference value")
         late = np.empty(0, dtype=int)
         if reference == "time":
             since = (times[usable, direction] - np.nanmin(deviations["time"].values)) / np.timedelta64(1, "s")

@@ -175,6 +175,10 @@ def test_uncertainty_follows_the_sensitivities(campaign: tuple[xr.Dataset, xr.Da
     # 0.93 ppm/K at 1000 hPa and 23 degC, over 300 mm.
     assert u[..., -1].mean() == pytest.approx(0.93e-6 * 300e3, rel=0.02)
     assert u[..., 0].max() == 0.0
+    every = compensate(deviations, environment, dead_path_mm=100.0)
+    parts = [every[name] for name in ("air_u", "material_u", "dead_path_u")]
+    assert all(float(part.max()) > 0 for part in parts)
+    np.testing.assert_allclose(every["compensation_u"] ** 2, sum(part**2 for part in parts))
     with pytest.raises(CompensationError, match="formula_ppm=-1 is negative"):
         SensorUncertainty(formula_ppm=-1)
 

@@ -137,8 +137,14 @@ def test_windows_that_cannot_be_evaluated_are_refused(rng: np.random.Generator) 
         evaluate(test, cycles=[5, 6, 7])
     with pytest.raises(ValueError, match="no target has two readings in the window; widen it"):
         evaluate(test, cycles=[5])
-    with pytest.raises(ValueError, match="5 cycles do not fill a window of 8"):
-        evaluate_windows(test, length=8)
+
+
+def test_short_tests_and_empty_windows_have_the_windows_that_can_be_evaluated(rng: np.random.Generator) -> None:
+    short = evaluate_windows(test_made(rng.normal(0, 1, (4, 2, 4))))
+    assert short["window"].values.tolist() == ["cycles 1..4 (4 cycles, not the 5 of the standard's acceptance test)"]
+    x = rng.normal(0, 1, (15, 2, 4))
+    x[5:10] = np.nan
+    assert evaluate_windows(test_made(x))["window"].values[:2].tolist() == ["cycles 1..5", "cycles 11..15"]
 
 
 def test_windows_show_how_drift_enters_repeatability_and_accuracy(rng: np.random.Generator) -> None:

@@ -139,13 +139,14 @@ def test_a_short_test_takes_its_last_cycle_as_reference(rng: np.random.Generator
     assert build_chart(deviations)["reference_cycle"].values.tolist() == [10, 10]
 
 
-def test_chart_without_its_reference_is_refused(rng: np.random.Generator) -> None:
+def test_without_its_reference_there_is_no_chart(rng: np.random.Generator) -> None:
     deviations, _ = simulate(rng, cycles=5)
     with pytest.raises(ValueError, match="reference='middle' is neither"):
         build_chart(deviations, reference="middle")
     deviations["deviation"].values[:, 1, 0] = np.nan
-    with pytest.raises(ValueError, match="no reading at position 1 in direction negative"):
-        build_chart(deviations)
+    chart = build_chart(deviations)
+    assert chart["reference_cycle"].values.tolist() == [5, 0]
+    assert np.isnan(chart["chart"].sel(direction="negative")).all()
 
 
 def test_one_target_has_no_neighbour(rng: np.random.Generator) -> None:
