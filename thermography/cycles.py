@@ -112,6 +112,7 @@ class CyclePart:
     spread: Array = field(default_factory=lambda: np.empty(0))
     noise_variance: Array = field(default_factory=lambda: np.empty(0))
     fell_back: Array = field(default_factory=lambda: np.empty(0))
+    count: Array = field(default_factory=lambda: np.empty(0))
 
     def add(self, reduced: MeanTemperature, times: Array) -> None:
         """Add a block of frames taken at `times`."""
@@ -131,6 +132,7 @@ class CyclePart:
         self.spread = np.sqrt(weights.average(np.where(used, pixels.variance, 0.0)) * sample)
         self.noise_variance = weights.propagate(pixel_noise(pixels.mean, used) ** 2)
         self.fell_back = weights.average((pixels.bound_K > AVERAGING_LIMIT_K).astype(float)) > 0
+        self.count = np.where(np.isfinite(self.mean), self.frames, 0)
         self.pixels = None
 
 
@@ -153,7 +155,7 @@ def assemble(
     cycles: int,
     grid: PlanGrid,
     covariances: Sequence[Array],
-    weights: Sequence[PlanWeights],
+    coverages: Sequence[Array],
 ) -> xr.Dataset:
     """Put the cycles together: mean, rise, rate, spread, count, uncertainties and flags on the plan.
 
@@ -165,8 +167,8 @@ def assemble(
         How many cycles the campaign has, with frames or without.
     grid
         The plan.
-    covariances, weights
-        Of every registration: `position_covariance`, and the weights of the cells.
+    covariances, coverages
+        Of every registration: `position_covariance`, and the part of every cell that is seen unmasked.
     """
     shape = (cycles, *grid.shape)
     mean, spread, noise, place = (np.full(shape, np.nan) for _ in range(4))
@@ -181,11 +183,10 @@ def assemble(
         frames = np.array([part.frames for part in own], float)
         time[cycle] = own[0].first_time + np.timedelta64(_mean_nanoseconds(own), "ns")
         mean[cycle], spread[cycle], noise[cycle] = _together(own, frames)
-        seen = [np.isfinite(part.mean) for part in own]
-        count[cycle] = sum(part.frames * s for part, s in zip(own, seen, strict=True))
+        count[cycle] = sum(part.count for part in own)
         last = covariances[own[-1].span]
         place[cycle] = _gradient_variance(mean[cycle], last, grid)
-        coverage = np.max([weights[part.span].coverage for part in own], axis=0)
+        coverage = np.max([coverages[part.span] for part in own], axis=0)
         flags[cycle] |= np.where(coverage < PARTLY_SEEN_BELOW, FLAGS["partly_seen"], 0).astype(np.uint8)
         fell_back = np.any([part.fell_back for part in own], axis=0)
         flags[cycle] |= np.where(fell_back, FLAGS["calibrated_per_frame"], 0).astype(np.uint8)
@@ -213,7 +214,7 @@ def assemble(
             "quality_flag": (plan, flags),
             "cycle_time": ("cycle", time),
             "position_u": (("y", "x"), np.sqrt(np.trace(covariances[0], axis1=-2, axis2=-1)).astype(np.float32)),
-            "coverage": (("y", "x"), weights[0].coverage.astype(np.float32)),
+            "coverage": (("y", "x"), coverages[0].astype(np.float32)),
         },
         coords={"cycle": np.arange(1, cycles + 1, dtype=np.int32), "y": grid.y_mm, "x": grid.x_mm},
         attrs={"Conventions": "CF-1.11", "title": "Temperature fields on the table plan"},

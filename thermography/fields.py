@@ -21,7 +21,15 @@ from thermography.registration import Registration
 from thermography.resampling import plan_weights
 from thermography.scheduling import in_order, open_pool
 
-__all__ = ["FieldError", "RegisteredFrom", "check_bounds", "check_frames", "cycle_of", "reduce_frames"]
+__all__ = [
+    "FieldError",
+    "RegisteredFrom",
+    "check_bounds",
+    "check_correction",
+    "check_frames",
+    "cycle_of",
+    "reduce_frames",
+]
 
 Array = NDArray[Any]
 
@@ -90,7 +98,7 @@ def reduce_frames(
     _check_spans(spans)
     bounds = check_bounds(cycle_bounds)
     times = check_frames(references, spans[0].registration.shape)
-    correction = _check_correction(correction_K, len(references))
+    correction = check_correction(correction_K, len(references))
     cycles = cycle_of(times, bounds)
     if (cycles == NOT_NUMBERED).all():
         raise FieldError(
@@ -203,9 +211,9 @@ class _Reduction:
         if self.parts:
             self.parts[-1].finish(self.cameras[self.parts[-1].span].weights)
         covariances = [position_covariance(span.registration, self.grid) for span in self.spans]
-        weights = [camera.weights for camera in self.cameras]
+        coverages = [camera.weights.coverage for camera in self.cameras]
         blocks = self.blocks
-        fields = assemble(self.parts, len(bounds), self.grid, covariances, weights).assign(
+        fields = assemble(self.parts, len(bounds), self.grid, covariances, coverages).assign(
             frame_temperature=(("time", "y", "x"), np.stack(self.stack)),
             frame_cycle=("time", np.array([b.cycle + 1 for b in blocks], np.int32)),
             frame_count=("time", np.array([b.stop - b.first for b in blocks], np.int32)),
@@ -277,7 +285,8 @@ def _check_spans(spans: Sequence[RegisteredFrom]) -> None:
         raise FieldError(f"registrations start at frames {starts}; they must start at 0 and rise")
 
 
-def _check_correction(correction_K: Array | None, frames: int) -> Array:
+def check_correction(correction_K: Array | None, frames: int) -> Array:
+    """Correction of every frame, K; zeros where none is given."""
     if correction_K is None:
         return np.zeros(frames)
     correction = np.asarray(correction_K, float)

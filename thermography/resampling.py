@@ -104,7 +104,8 @@ def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float
     offset = np.stack([np.bincount(cell, areas * places[:, axis], ny * nx) for axis in (0, 1)], axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         offset = offset / area[:, None] - np.stack(np.meshgrid(grid.x_mm, grid.y_mm), axis=-1).reshape(-1, 2)
-    return PlanWeights(_centred(by_area, offset, coverage, grid), by_area, window, coverage, grid)
+    matrix = sparse.csr_array(by_area + centring(offset, coverage, grid) @ by_area)
+    return PlanWeights(matrix, by_area, window, coverage, grid)
 
 
 def _unmasked_parts(registration: Registration, grid: PlanGrid, margin_px: float) -> tuple[Array, Array, Array]:
@@ -139,8 +140,11 @@ def _outline(grid: PlanGrid) -> Array:
     return np.concatenate([np.stack(side, axis=-1) for side in sides]) * (grid.width_mm, grid.height_mm)
 
 
-def _centred(matrix: sparse.csr_array, offset: Array, coverage: Array, grid: PlanGrid) -> sparse.csr_array:
-    """Subtract from every partly seen cell its offset times the gradient of the cells around it; both are linear in the pixels."""
+def centring(offset: Array, coverage: Array, grid: PlanGrid) -> sparse.csr_array:
+    """What to add to the cells, (cells, cells), so that partly seen ones move from the centre of their seen area to their own.
+
+    That is minus their offset, (cells, 2) mm, times the gradient of the cells around them; both are linear in the cells.
+    """
     ny, nx = grid.shape
     rows, columns, weights = [], [], []
     seen = coverage.ravel() >= LEAST_COVERAGE
@@ -162,5 +166,4 @@ def _centred(matrix: sparse.csr_array, offset: Array, coverage: Array, grid: Pla
         rows.extend([cell] * len(around))
         columns.extend(around)
         weights.extend(-(offset[cell] @ gradient))
-    step = sparse.csr_array((weights, (rows, columns)), shape=(ny * nx, ny * nx))
-    return sparse.csr_array(matrix + step @ matrix)
+    return sparse.csr_array((weights, (rows, columns)), shape=(ny * nx, ny * nx))

@@ -64,7 +64,7 @@ class Scene:
     def to_plan(self, points_px):
         """True plan place of sensor points (n, 2)."""
         points = np.ascontiguousarray(points_px, float) - self.shift_px
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-7)
         ideal = (
             cv2.undistortPoints(
                 points.reshape(-1, 1, 2),

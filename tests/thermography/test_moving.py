@@ -1,0 +1,78 @@
+"""A table that travels through the view: its place in every frame, and the field that stays attached to it."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.thermography.plan_scene import DISCS, GRID, START, Scene, cell_truth, record
+from thermography.fields import FieldError
+from thermography.moving import reduce_moving_frames
+from thermography.registration import register
+
+DIRECTION = (-1, 0)
+PLACES_MM = np.array([0.0, 40.5, 121.3, 200.0, 299.7, 160.2, 60.0, 5.5])
+
+
+def edges(*seconds):
+    return START + np.array(seconds) * np.timedelta64(1, "s")
+
+
+@pytest.fixture(scope="module")
+def travel(tmp_path_factory):
+    """Eight frames of a table that moves 300 mm, seen by a lens of k1 = -1.2; registered where it stood first."""
+    rng = np.random.default_rng(7)
+    home = Scene(disc_K=-4.0, k1=-1.2, rays=3, corners_px=((60, 150), (460, 140), (475, 285), (55, 300)))
+    registration = register(home.render(rng), DISCS, grid=GRID)
+    # The plan point under the spindle moves along -x as the axis position grows, so the table moves along +x.
+    images = (replace(home, shift_mm=(float(p), 0.0)).render(rng) for p in PLACES_MM)
+    frames = record(tmp_path_factory.mktemp("travel") / "a.seq", images)
+    fields = reduce_moving_frames(frames, registration, GRID, edges(0, 4, 8), direction=DIRECTION)
+    return home, registration, frames, fields
+
+
+def test_place_of_the_table_is_known_in_every_frame(travel):
+    _, _, _, fields = travel
+    error = fields["table_position"].values - PLACES_MM
+    # The aim is 0.3 mm per frame; a pixel is 1.7 mm.
+    assert np.abs(error).max() < 0.1
+    assert np.abs(fields["table_across"].values).max() < 0.1
+    assert (np.abs(error) < 4 * fields["table_position_u"].values).all()
+    assert (fields["table_discs"] >= 6).all()
+
+
+def test_fields_of_frames_at_different_places_overlay(travel):
+    _, _, _, fields = travel
+    error = fields["temperature"].values - cell_truth()
+    # Four frames, 3 x 4 px of 50 mK per cell: 7 mK; a misplacement of 0.1 mm in the largest gradient is 2 mK.
+    assert np.sqrt(np.nanmean(error**2)) < 0.012
+    assert abs(np.nanmean(error)) < 0.002
+    inside = np.isfinite(fields["temperature"].values[0])
+    # The outermost row of cells lies within the lens blur of the edge.
+    assert inside.mean() > 0.85
+    assert fields["count"].values[0].max() == 4
+    # At 300 mm the far end of the table has left the view.
+    assert fields["count"].values[1][:, -8].max() < 4
+
+
+def test_stated_uncertainty_is_the_true_error(travel):
+    _, _, _, fields = travel
+    error = fields["temperature"].values - cell_truth()
+    ratio = np.sqrt(np.nanmean((error / fields["temperature_u"].values) ** 2))
+    # Neighbouring cells share pixels and misplacement, so that a few hundred values are independent.
+    assert 0.7 < ratio < 1.4
+
+
+def test_frames_without_the_table_are_named(travel, tmp_path):
+    home, registration, _, _ = travel
+    images = [home.render(), Scene(discs=(), field=lambda x, y: np.full_like(x, 22.5)).render()]
+    frames = record(tmp_path / "a.seq", images)
+    fields = reduce_moving_frames(frames, registration, GRID, edges(0, 2), direction=DIRECTION)
+    assert json.loads(fields.attrs["frames_unplaced"]) == ["a.seq#1"]
+    assert fields["table_discs"].values.tolist()[1] == 0
+    assert np.isnan(fields["table_position"].values[1])
+    with pytest.raises(FieldError, match="the table is found in no frame; check the fiducials"):
+        reduce_moving_frames(frames[1:], registration, GRID, edges(0, 2), direction=DIRECTION)
+    with pytest.raises(FieldError, match="no frame in which the table is found lies within a cycle"):
+        reduce_moving_frames(frames[:1], registration, GRID, edges(5, 7), direction=DIRECTION)

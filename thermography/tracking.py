@@ -1,0 +1,256 @@
+"""L2 - Where a moving table is in every frame: its discs found by the one registration, displaced."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from thermography.plan import PlanGrid
+from thermography.registration import Registration
+
+Array = NDArray[Any]
+
+#: Step of the coarse search along the axis, as part of the smallest disc's diameter.
+COARSE_STEP = 0.25
+#: Discs that disagree with the median by more than this (and by five times the median deviation) are left out, mm.
+ODD_MM = 0.5
+#: A disc needs this many times the noise of one pixel as contrast.
+LEAST_CONTRAST = 3.0
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """What the kernels need to know of plan, discs and lens, as plain arrays.
+
+    Attributes
+    ----------
+    discs
+        (n, 3): x, y, radius, mm.
+    lens
+        As `lens_array` gives it.
+    direction
+        Unit vector on the plan along which the table is displaced.
+    size_mm
+        Width and height of the plan.
+    reach_mm
+        How far the table may be displaced either way.
+    registration
+        Of the table where it stood when it was registered.
+    common_mm, common_u_mm
+        Displacements along the direction, and what the registration's own uncertainty adds there for all discs together.
+    """
+
+    discs: Array
+    lens: Array
+    direction: Array
+    size_mm: tuple[float, float]
+    reach_mm: float
+    registration: Registration
+    common_mm: Array
+    common_u_mm: Array
+
+
+@dataclass(frozen=True)
+class TablePlace:
+    """Displacement of the table in one frame, (x, y) mm on the plan, its standard uncertainty along both, and the discs used."""
+
+    shift_mm: Array
+    u_mm: float
+    discs: int
+
+
+def make_tracker(registration: Registration, grid: PlanGrid, direction: Array, *, reach_mm: float) -> Tracker:
+    """Prepare the tracking of a table that is displaced along `direction` (plan) by up to `reach_mm` from where it was registered."""
+    discs = np.array([(d.x_mm, d.y_mm, d.diameter_mm / 2) for d in registration.fiducials.values()])
+    unit = np.asarray(direction, float) / np.hypot(*direction)
+    along = np.linspace(-reach_mm, reach_mm, 31)
+    places = discs[:, :2] + (along[:, None] * unit)[:, None, :]
+    common = np.sqrt(np.mean(registration.position_u(places) ** 2, axis=1))
+    size = (grid.width_mm, grid.height_mm)
+    return Tracker(discs, lens_array(registration), unit, size, reach_mm, registration, along, common)
+
+
+def lens_array(registration: Registration) -> Array:
+    """The projection as one array for the kernels: 9 of the homography, focal length, centre, k1, k2, p1, p2."""
+    p = registration.projection
+    return np.concatenate([p.plan_to_sensor.ravel(), [p.focal_length_px], p.principal_point_px, p.distortion])
+
+
+def locate_table(counts: NDArray[np.uint16], tracker: Tracker, near_mm: Array | None = None) -> TablePlace | None:
+    """Locate the table in one frame of counts (row, column).
+
+    Parameters
+    ----------
+    counts
+        Uncalibrated: contrast and place of the discs need no temperature.
+    tracker
+        From `make_tracker`.
+    near_mm
+        Displacement of the frame before; without it, or where it does not hold any more, the whole reach is searched.
+
+    Returns
+    -------
+    TablePlace or None
+        None where fewer than two discs show.
+    """
+    if near_mm is not None:
+        place = _refined(counts, tracker, near_mm)
+        if place is not None and place.discs >= 3:
+            return place
+    step = COARSE_STEP * 2 * float(tracker.discs[:, 2].min())
+    along = np.arange(-tracker.reach_mm, tracker.reach_mm + step, step)
+    scores = _coarse(counts, tracker.discs, tracker.lens, tracker.direction, along)
+    for best in np.argsort(-scores)[:3]:
+        place = _refined(counts, tracker, along[best] * tracker.direction)
+        if place is not None:
+            return place
+    return None
+
+
+def _refined(counts: NDArray[np.uint16], tracker: Tracker, near_mm: Array) -> TablePlace | None:
+    found = _locate(counts, tracker.discs, tracker.lens, tracker.size_mm, np.asarray(near_mm, float), LEAST_CONTRAST)
+    seen = np.flatnonzero(found[:, 2] > 0)
+    if len(seen) < 2:
+        return None
+    centres, radii = tracker.discs[seen, :2], tracker.discs[seen, 2]
+    projection = tracker.registration.projection
+    moved = centres + near_mm
+    # Perspective shifts a disc's centroid from the image of its centre; near enough to the place to be corrected for there.
+    bias = projection.disc_centroids(moved, radii) - projection.to_sensor(moved)
+    shifts = projection.to_plan(found[seen, :2] - bias) - centres
+    median = np.median(shifts, axis=0)
+    distance = np.linalg.norm(shifts - median, axis=1)
+    kept = distance <= max(ODD_MM, 5 * float(np.median(distance)))
+    if kept.sum() < 2:
+        return None
+    mean = shifts[kept].mean(axis=0)
+    scatter = np.sqrt(((shifts[kept] - mean) ** 2).sum() / (2 * kept.sum() - 2))
+    common = np.interp(mean @ tracker.direction, tracker.common_mm, tracker.common_u_mm)
+    return TablePlace(mean, float(np.hypot(scatter / np.sqrt(kept.sum()), common)), int(kept.sum()))
+
+
+@numba.njit(cache=True, nogil=True)
+def projected(x: float, y: float, lens: Array) -> tuple[float, float]:
+    """Sensor column and row of a plan point."""
+    w = lens[6] * x + lens[7] * y + lens[8]
+    u = ((lens[0] * x + lens[1] * y + lens[2]) / w - lens[10]) / lens[9]
+    v = ((lens[3] * x + lens[4] * y + lens[5]) / w - lens[11]) / lens[9]
+    r2 = u * u + v * v
+    radial = 1 + r2 * (lens[12] + lens[13] * r2)
+    du = u * radial + 2 * lens[14] * u * v + lens[15] * (r2 + 2 * u * u)
+    dv = v * radial + lens[14] * (r2 + 2 * v * v) + 2 * lens[15] * u * v
+    return lens[10] + lens[9] * du, lens[11] + lens[9] * dv
+
+
+@numba.njit(cache=True, nogil=True)
+def _coarse(counts: Array, discs: Array, lens: Array, direction: Array, along: Array) -> Array:
+    """Contrast of the discs' insides to their rings, added with its sign over the discs in view, for every displacement."""
+    scores = np.zeros(len(along))
+    rows, columns = counts.shape
+    for k in range(len(along)):
+        total, seen = 0.0, 0
+        for d in range(len(discs)):
+            x, y, radius = discs[d, 0] + along[k] * direction[0], discs[d, 1] + along[k] * direction[1], discs[d, 2]
+            inside, ring, points = 0.0, 0.0, 0
+            for a in range(8):
+                angle = a * np.pi / 4
+                for share, sign in ((0.5, 1), (1.5, -1)):
+                    c, r = projected(x + share * radius * np.cos(angle), y + share * radius * np.sin(angle), lens)
+                    column, row = round(c), round(r)
+                    if 0 <= column < columns and 0 <= row < rows:
+                        points += 1
+                        if sign > 0:
+                            inside += counts[row, column]
+                        else:
+                            ring += counts[row, column]
+            if points == 16:
+                total += (inside - ring) / 8
+                seen += 1
+        if seen > 0:
+            scores[k] = abs(total) / np.sqrt(seen)
+    return scores
+
+
+@numba.njit(cache=True, nogil=True)
+def _locate(counts: Array, discs: Array, lens: Array, size: tuple[float, float], shift: Array, least: float) -> Array:
+    """Centroid (column, row) of every disc and whether it was found, (discs, 3); as `discs.locate_disc`, without its robust fits."""
+    found = np.zeros((len(discs), 3))
+    height, width = counts.shape
+    for d in range(len(discs)):
+        x, y, radius = discs[d, 0] + shift[0], discs[d, 1] + shift[1], discs[d, 2]
+        c0, r0 = projected(x, y, lens)
+        cx, rx = projected(x + 0.5, y, lens)
+        cy, ry = projected(x, y + 0.5, lens)
+        j00, j10, j01, j11 = 2 * (cx - c0), 2 * (rx - r0), 2 * (cy - c0), 2 * (ry - r0)
+        det = j00 * j11 - j01 * j10
+        blur = 1.5 * max(np.hypot(j11, j10), np.hypot(j01, j00)) / abs(det)
+        outer = 2.2 * radius + blur
+        half_c, half_r = int(outer * np.hypot(j00, j01)) + 2, int(outer * np.hypot(j10, j11)) + 2
+        column, row = c0, r0
+        for _ in range(8):
+            left, top = round(column) - half_c, round(row) - half_r
+            if left < 0 or top < 0 or left + 2 * half_c >= width or top + 2 * half_r >= height:
+                found[d, 2] = 0
+                break
+            normal = np.zeros((3, 3))
+            right = np.zeros(3)
+            inner_sum, inner_c, inner_r, inner_n, ring_n, squares = 0.0, 0.0, 0.0, 0, 0, 0.0
+            cut = max(radius - blur, 0.45 * radius)
+            for i in range(top, top + 2 * half_r + 1):
+                for j in range(left, left + 2 * half_c + 1):
+                    u, v = j - column, i - row
+                    px, py = (j11 * u - j01 * v) / det, (j00 * v - j10 * u) / det
+                    distance = np.hypot(px, py)
+                    value = float(counts[i, j])
+                    if distance < cut:
+                        inner_sum += value
+                        inner_c += u
+                        inner_r += v
+                        inner_n += 1
+                    elif radius + blur < distance < outer:
+                        tx, ty = discs[d, 0] + px, discs[d, 1] + py
+                        if blur < tx < size[0] - blur and blur < ty < size[1] - blur:
+                            basis = (1.0, u, v)
+                            for a in range(3):
+                                right[a] += basis[a] * value
+                                for b in range(3):
+                                    normal[a, b] += basis[a] * basis[b]
+                            ring_n += 1
+                            squares += value * value
+            if ring_n < 12 or inner_n < 3:
+                found[d, 2] = 0
+                break
+            plane = np.linalg.solve(normal, right)
+            noise = np.sqrt(np.maximum(squares - plane @ right, 0.0) / (ring_n - 3))
+            contrast = inner_sum / inner_n - (plane[0] + plane[1] * inner_c / inner_n + plane[2] * inner_r / inner_n)
+            if abs(contrast) <= least * noise:
+                found[d, 2] = 0
+                break
+            total, moment_c, moment_r = 0.0, 0.0, 0.0
+            for i in range(top, top + 2 * half_r + 1):
+                for j in range(left, left + 2 * half_c + 1):
+                    u, v = j - column, i - row
+                    px, py = (j11 * u - j01 * v) / det, (j00 * v - j10 * u) / det
+                    if np.hypot(px, py) < radius + blur:
+                        part = (counts[i, j] - plane[0] - plane[1] * u - plane[2] * v) / contrast
+                        # The disc has one temperature; the table around it a slope. Coverage is taken against their difference.
+                        part /= 1 - (plane[1] * u + plane[2] * v) / contrast
+                        total += part
+                        moment_c += part * u
+                        moment_r += part * v
+            area = np.pi * radius * radius * abs(det)
+            if not 0.6 * area < total < 1.4 * area:
+                found[d, 2] = 0
+                break
+            column += moment_c / total
+            row += moment_r / total
+            found[d, 0], found[d, 1], found[d, 2] = column, row, 1
+            if abs(moment_c / total) + abs(moment_r / total) < 2e-3:
+                break
+        if abs(column - c0) + abs(row - r0) > 2.5 * radius * np.sqrt(abs(det)):
+            found[d, 2] = 0
+    return found
