@@ -109,7 +109,8 @@ def describe(deviations: xr.Dataset, joint: JointFit, *, state: str | float = "m
     targets = deviations.sizes["target"]
     pooled_freedom = np.bincount(target, freedom, minlength=targets)
     pooled = np.sqrt(
-        np.bincount(target, freedom * scatter**2, minlength=targets) / np.where(pooled_freedom, pooled_freedom, np.nan)
+        np.bincount(target, freedom * np.nan_to_num(scatter) ** 2, minlength=targets)
+        / np.where(pooled_freedom, pooled_freedom, np.nan)
     )
     result = result.assign(
         {
