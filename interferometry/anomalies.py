@@ -124,7 +124,7 @@ def _scatter_anomalies(
     scatter = estimated["scatter_position"].values
     usable = np.flatnonzero(np.isfinite(scatter) & (scatter > 0))
     stands_out = np.zeros(scatter.size, dtype=bool)
-    stands_out[usable] = generalised_esd(np.log(scatter[usable]), most=MOST_ANOMALIES)
+    stands_out[usable] = generalised_esd(np.log(scatter[usable]), most=MOST_ANOMALIES, high_only=True)
     found: list[Anomaly] = []
     remaining = usable
     while remaining.size > 3 and len(found) < MOST_ANOMALIES:

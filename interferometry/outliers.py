@@ -9,7 +9,7 @@ from scipy import stats
 Array = NDArray[np.float64]
 
 
-def generalised_esd(values: Array, *, most: int, level: float = 0.05) -> NDArray[np.bool_]:
+def generalised_esd(values: Array, *, most: int, level: float = 0.05, high_only: bool = False) -> NDArray[np.bool_]:
     """Mark outliers by the generalised extreme Studentized deviate test (Rosner 1983).
 
     Parameters
@@ -18,6 +18,8 @@ def generalised_esd(values: Array, *, most: int, level: float = 0.05) -> NDArray
     most : int
         Largest number of outliers looked for.
     level : float
+    high_only : bool
+        Look for values that are too large only, and give the whole error probability to that side.
 
     Returns
     -------
@@ -31,9 +33,11 @@ def generalised_esd(values: Array, *, most: int, level: float = 0.05) -> NDArray
         centre, spread = values[left].mean(), values[left].std(ddof=1)
         if spread == 0:
             break
-        deviation = np.where(left, np.abs(values - centre) / spread, -1.0)
+        deviation = np.where(
+            left, (values - centre) / spread if high_only else np.abs(values - centre) / spread, -np.inf
+        )
         at = int(np.argmax(deviation))
-        p = 1 - level / (2 * (n - i + 1))
+        p = 1 - level / ((1 if high_only else 2) * (n - i + 1))
         t = stats.t.ppf(p, n - i - 1)
         if deviation[at] > (n - i) * t / np.sqrt((n - i - 1 + t**2) * (n - i + 1)):
             outliers = i

@@ -113,5 +113,11 @@ def test_generalised_esd_on_rosners_example() -> None:
     assert sorted(numbers[marked]) == [5.34, 5.42, 6.01]
 
 
+def test_generalised_esd_of_one_side_leaves_the_other_alone(rng: np.random.Generator) -> None:
+    numbers = np.append(rng.standard_normal(40), [-9.0, 9.0])
+    assert numbers[generalised_esd(numbers, most=5)].tolist() == [-9.0, 9.0]
+    assert numbers[generalised_esd(numbers, most=5, high_only=True)].tolist() == [9.0]
+
+
 def test_generalised_esd_without_spread() -> None:
     assert not generalised_esd(np.full(8, 2.0), most=3).any()
