@@ -13,6 +13,8 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from fusion.patches import find_switching_patch
+
 Array = NDArray[np.float64]
 DIMS = ("cycle", "direction", "target")
 #: Half the width over which a line or point average is taken, in plan cells: enough to halve the noise of a single cell.
@@ -137,11 +139,15 @@ _ATTRIBUTES: dict[str, dict[str, str]] = {
     "mean_rise": {"units": "K", "long_name": "mean temperature rise of the seen table", **_DIFFERENCE},
     "axis_integral": {"units": "K mm", "long_name": "integral of the seen rise from axis position 0 to the target"},
     "local_rise": {"units": "K", "long_name": "temperature rise of the table at the target", **_DIFFERENCE},
+    "patch_mean_rise": {"units": "K", "long_name": "share of a switching patch in the mean rise", **_DIFFERENCE},
+    "patch_axis_integral": {"units": "K mm", "long_name": "share of a switching patch in the axis integral"},
 }
 
 
 def field_series(fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -> dict[str, Array]:
     """Reduce the frames on the plan to what moves a reading: mean rise (time,), integral and local rise (time, target).
+
+    Where a patch of the field switches like a reflection, its shares in the mean rise and in the integral are given beside them.
 
     The rise counts from the first frame; cells that frame does not see are left out of the mean.
     """
@@ -151,64 +157,72 @@ def field_series(fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -> 
     if not seen.any():
         raise AlignmentError("no plan cell is seen by every frame; check the registration and the plan's size")
     mean_rise = rise[:, seen].mean(axis=1)
-    samples, along_mm = _line_samples(fields, axis, position_mm, rise)
-    integral = np.concatenate(
-        [
-            np.zeros((rise.shape[0], 1)),
-            np.cumsum(0.5 * (samples[:, 1:] + samples[:, :-1]) * np.diff(along_mm), axis=1),
-        ],
-        axis=1,
-    )
-    zero = int(np.argmin(np.abs(along_mm)))
-    integral -= integral[:, [zero]]
-    nearest = np.abs(along_mm[None, :] - position_mm[:, None]).argmin(axis=1)
-    cell = _cell_size(fields)
-    reach = max(1, round(_HALF_WIDTH_CELLS * cell / np.median(np.diff(along_mm))))
-    local = np.stack([samples[:, max(0, k - reach) : k + reach + 1].mean(axis=1) for k in nearest], axis=1)
-    return {"mean_rise": mean_rise, "axis_integral": integral[:, nearest], "local_rise": local}
+    line = _MeasuredLine(fields, axis, position_mm)
+    samples = line.sample(rise)
+    reach = line.reach
+    local = np.stack([samples[:, max(0, k - reach) : k + reach + 1].mean(axis=1) for k in line.nearest], axis=1)
+    series = {"mean_rise": mean_rise, "axis_integral": line.integrate(samples), "local_rise": local}
+    patch = find_switching_patch(rise)
+    if patch is not None:
+        pattern = line.integrate(line.sample(patch.pattern[None]))[0]
+        series["patch_mean_rise"] = patch.course * patch.pattern[seen].mean()
+        series["patch_axis_integral"] = patch.course[:, None] * pattern
+    return series
 
 
 def _cell_size(fields: xr.Dataset) -> float:
     return float(np.median(np.diff(fields["x"].values)))
 
 
-def _line_samples(fields: xr.Dataset, axis: AxisGeometry, position_mm: Array, rise: Array) -> tuple[Array, Array]:
-    """Rise along the measured line (time, sample), averaged across its width, and the samples' axis positions (mm)."""
-    cell = _cell_size(fields)
-    low, high = min(0.0, float(position_mm.min())), max(0.0, float(position_mm.max()))
-    count = max(2, int(np.ceil((high - low) / (cell / 4.0))) + 1)
-    # Position 0 and every target are samples themselves, so that no interval has to be cut.
-    along = np.unique(np.round(np.concatenate([np.linspace(low, high, count), position_mm, [0.0]]), 9))
-    x0, y0 = axis.points(along)
-    sideways = np.linspace(-_HALF_WIDTH_CELLS, _HALF_WIDTH_CELLS, 5) * cell
-    across = axis.across()
-    x, y = fields["x"].values, fields["y"].values
-    column = (x0[None, :] + sideways[:, None] * across[0] - x[0]) / cell
-    row = (y0[None, :] + sideways[:, None] * across[1] - y[0]) / cell
-    outside = (column < -0.5) | (column > x.size - 0.5) | (row < -0.5) | (row > y.size - 0.5)
-    if outside.all(axis=0).any():
-        k = int(np.flatnonzero(outside.all(axis=0))[0])
-        raise AlignmentError(
-            f"the measured line leaves the plan: axis position {along[k]:.1f} mm lies at x = {x0[k]:.1f} mm, y = {y0[k]:.1f} mm; "
-            "check [plan.axis] origin and direction, and [plan] size"
-        )
-    samples = np.stack(
-        [ndimage.map_coordinates(frame, [row, column], order=1, mode="nearest", cval=np.nan) for frame in rise]
-    )
-    samples[:, outside] = np.nan
-    valid = np.isfinite(samples)
-    total = np.where(valid, samples, 0.0).sum(axis=1)
-    number = valid.sum(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        line = total / number
-    for frame in line:
-        known = np.isfinite(frame)
-        if not known.any():
+class _MeasuredLine:
+    """The measured line on the plan, sampled four times per cell, and averaged across its width."""
+
+    def __init__(self, fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -> None:
+        cell = _cell_size(fields)
+        low, high = min(0.0, float(position_mm.min())), max(0.0, float(position_mm.max()))
+        count = max(2, int(np.ceil((high - low) / (cell / 4.0))) + 1)
+        # Position 0 and every target are samples themselves, so that no interval has to be cut.
+        self.along_mm = np.unique(np.round(np.concatenate([np.linspace(low, high, count), position_mm, [0.0]]), 9))
+        self.nearest = np.abs(self.along_mm[None, :] - position_mm[:, None]).argmin(axis=1)
+        self.reach = max(1, round(_HALF_WIDTH_CELLS * cell / float(np.median(np.diff(self.along_mm)))))
+        x0, y0 = axis.points(self.along_mm)
+        sideways = np.linspace(-_HALF_WIDTH_CELLS, _HALF_WIDTH_CELLS, 5) * cell
+        across = axis.across()
+        x, y = fields["x"].values, fields["y"].values
+        self._column = (x0[None, :] + sideways[:, None] * across[0] - x[0]) / cell
+        self._row = (y0[None, :] + sideways[:, None] * across[1] - y[0]) / cell
+        beside = (self._column < -0.5) | (self._column > x.size - 0.5)
+        self._outside = beside | (self._row < -0.5) | (self._row > y.size - 0.5)
+        lost = np.flatnonzero(self._outside.all(axis=0))
+        if lost.size:
+            k = int(lost[0])
             raise AlignmentError(
-                "no part of the measured line is seen by the camera; check [plan.axis] and the fiducials"
+                f"the measured line leaves the plan: axis position {self.along_mm[k]:.1f} mm lies at x = {x0[k]:.1f} mm, "
+                f"y = {y0[k]:.1f} mm; check [plan.axis] origin and direction, and [plan] size"
             )
-        frame[~known] = np.interp(along[~known], along[known], frame[known])
-    return line, along
+
+    def sample(self, frames: Array) -> Array:
+        """Frames (time, y, x) along the line (time, sample); gaps are bridged along the line."""
+        place = [self._row, self._column]
+        samples = np.stack([ndimage.map_coordinates(frame, place, order=1, mode="nearest") for frame in frames])
+        samples[:, self._outside] = np.nan
+        valid = np.isfinite(samples)
+        number = valid.sum(axis=1)
+        line = np.where(valid, samples, 0.0).sum(axis=1) / np.maximum(number, 1)
+        for values, known in zip(line, number > 0, strict=True):
+            if not known.any():
+                raise AlignmentError(
+                    "no part of the measured line is seen by the camera; check [plan.axis] and the fiducials"
+                )
+            values[~known] = np.interp(self.along_mm[~known], self.along_mm[known], values[known])
+        return line
+
+    def integrate(self, samples: Array) -> Array:
+        """Integral from axis position 0 to every target, (time, target)."""
+        steps = 0.5 * (samples[:, 1:] + samples[:, :-1]) * np.diff(self.along_mm)
+        integral = np.concatenate([np.zeros((samples.shape[0], 1)), np.cumsum(steps, axis=1)], axis=1)
+        zero = int(np.argmin(np.abs(self.along_mm)))
+        return (integral - integral[:, [zero]])[:, self.nearest]
 
 
 def _check_overlap(reading_time: NDArray[np.datetime64], frame_time: NDArray[np.datetime64]) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.episodes import cycle_starts, event_instants, instants_near, jumps, sensor_jumps, stuck_sensors
-from fusion.readings import Readings, Series
+from fusion.readings import Readings
 from interferometry.compensation import air_index
 
 Array = NDArray[np.float64]
@@ -317,21 +317,16 @@ def _needs_jump(readings: Readings) -> str | None:
 
 
 def _reflected_source(readings: Readings, coefficients: Mapping[str, float], near: Member | None) -> Iterator[Member]:
-    patterns = readings.series["pattern_mean_rise"]
-    lines = readings.series["pattern_axis_integral"]
-    count = patterns.values.shape[1]
-    per_target = lines.values.reshape(lines.seconds.size, count, -1)
-    for k in range(count):
-        offset = readings.at(Series(patterns.seconds, patterns.values[:, k], "K"))
-        axis = readings.at(Series(lines.seconds, per_target[:, k], "K mm"))
-        false_part = (
-            coefficients.get("table_offset", 0.0) * offset + coefficients.get("axis_expansion", 0.0) * axis * 1e-3
-        )
-        yield Member(_column(-false_part), {"pattern": float(k + 1)}, ("1",))
+    false_rise = readings.at(readings.series["patch_mean_rise"])
+    false_integral = readings.at(readings.series["patch_axis_integral"]) * 1e-3
+    wrong = (
+        coefficients.get("table_offset", 0.0) * false_rise + coefficients.get("axis_expansion", 0.0) * false_integral
+    )
+    yield Member(_column(-wrong), {}, ("1",))
 
 
-def _needs_patterns(readings: Readings) -> str | None:
-    if "pattern_mean_rise" not in readings.series:
+def _needs_patch(readings: Readings) -> str | None:
+    if "patch_mean_rise" not in readings.series:
         return "no patch of the field switches faster than heat can flow"
     return None
 
@@ -449,7 +444,7 @@ LIBRARY: tuple[Effect, ...] = (
         "A warm body mirrors in the table: a patch of the field changes faster than heat can flow, and the readings do not follow.",
         "reflection of (1 - emissivity) of the surroundings",
         _reflected_source,
-        _needs_patterns,
+        _needs_patch,
     ),
     Effect(
         "laser_warm_up",
