@@ -80,6 +80,10 @@ def read_deviations(
     """
     path = Path(path)
     start = path.read_bytes()[:4096]
+    if b"HEADER::" in start and b"\nData:" in start:
+        raise LaserFormatError(
+            f"{path}: a dynamic capture has no targets; read it with interferometry.renishaw.read_rtx"
+        )
     if b"HEADER::" in start:
         return read_rtl(path, feed_mm_per_min=feed_mm_per_min, dwell_s=dwell_s)
     if is_ecmc_log(start):

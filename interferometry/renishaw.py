@@ -61,9 +61,14 @@ def read_rtl(
     Raises
     ------
     LaserFormatError
-        The file is cut short, or breaks what its own header says.
+        The file is cut short, is not a linear test, or breaks what its own header says.
     """
     sections = _split_sections(path, path.read_bytes().decode(encoding))
+    kind = _keyed(sections.get("HEADER", [])).get("filetype", "rtl")
+    if kind.lower() != "rtl":
+        raise LaserFormatError(
+            f"{path}: File type is {kind}, not rtl; only linear tests hold positioning deviations in um"
+        )
     targets = _parse_targets(path, sections)
     runs, left_out = _parse_runs(path, sections, len(targets))
     directions = [_direction(run, targets) for run in runs]

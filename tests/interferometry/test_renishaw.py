@@ -121,6 +121,7 @@ def test_feed_and_dwell_place_readings_within_their_run(tmp_path: Path) -> None:
         ("Target-count: 3", "Target-count: 4", "Target-count is 4, but 3 target positions follow"),
         ("10.000000 \nFlags", "ten\nFlags", r"line 9: 'ten' is not a row of target positions"),
         ("Run-count:4", "Run-count:2", r"Run-count is 2, but DEVIATIONS holds runs \[1, 2, 3, 4\]"),
+        (": rtl", ": rta", "File type is rta, not rtl; only linear tests"),
         ("EOF::", "", "no section EOF::; the file is cut short"),
         ("DEVIATIONS::", "DEVIATIONS", "no section DEVIATIONS::"),
     ],
@@ -206,6 +207,11 @@ def test_rtx_gives_displacement_and_seconds(tmp_path: Path) -> None:
     capture = read_rtx(rtx(tmp_path, 5, 5))
     assert capture["displacement"].values.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     assert capture["seconds"].values[-1] == pytest.approx(0.04)
+
+
+def test_rtx_is_not_a_test_of_targets(tmp_path: Path) -> None:
+    with pytest.raises(LaserFormatError, match="a dynamic capture has no targets; read it with"):
+        read_deviations(rtx(tmp_path, 5, 5))
 
 
 def test_rtx_that_breaks_its_promises_is_refused(tmp_path: Path) -> None:
