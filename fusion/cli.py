@@ -74,12 +74,22 @@ def run(
     from fusion.progress import Reporter
     from fusion.summary import summary_table
 
+    if len(campaigns) > 2:
+        errors.print("thermofuse: one campaign, or two of one machine, can be analysed at a time", highlight=False)
+        raise typer.Exit(BAD_INPUT)
+
     with _answering():
-        for campaign, folder in _folders(campaigns, out):
+        folders = _folders(campaigns, out)
+        for campaign, folder in folders:
             with Reporter(console) as report:
                 results = run_campaign(campaign, folder, resume=resume, scheduler=scheduler, report=report)
             console.print(summary_table(results))
             console.print(f"report: {(folder / 'report.html').resolve()}", soft_wrap=True, highlight=False)
+        if len(folders) == 2:
+            from fusion.joint import join_campaigns
+
+            for name, text in join_campaigns([folder for _, folder in folders], folders[0][1].parent):
+                console.print(f"both campaigns, {name}: {text}", soft_wrap=True, highlight=False)
 
 
 def _folders(campaigns: list[Path], out: Path | None) -> list[tuple[Path, Path]]:

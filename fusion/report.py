@@ -26,7 +26,13 @@ _MISSING = -32768
 _LAYERS = (("rise", "temperature_rise", "K"), ("temperature", "temperature", "°C"))
 
 
-def render_report(results: Mapping[str, Any], provenance: Mapping[str, Any], datasets: Mapping[str, xr.Dataset]) -> str:
+def render_report(
+    results: Mapping[str, Any],
+    provenance: Mapping[str, Any],
+    datasets: Mapping[str, xr.Dataset],
+    *,
+    joint: Mapping[str, Any] | None = None,
+) -> str:
     """Return the report as HTML text.
 
     Parameters
@@ -35,6 +41,8 @@ def render_report(results: Mapping[str, Any], provenance: Mapping[str, Any], dat
         Content of results.json and provenance.json.
     datasets : mapping
         ``fields``, ``deviations``, ``fusion`` as they were written; those that a campaign does not have may be missing.
+    joint : mapping, optional
+        What this campaign and another one of the machine agree on: ``other``, its title, and ``rows`` of name and text.
     """
     loader = jinja2.FileSystemLoader(str(resources.files("fusion") / "templates"))
     environment = jinja2.Environment(
@@ -51,7 +59,7 @@ def render_report(results: Mapping[str, Any], provenance: Mapping[str, Any], dat
     return environment.get_template("report.html.j2").render(
         results={name: results.get(name) for name in (*results, *_OPTIONAL)},
         provenance=provenance,
-        summary=report_text.describe(results, provenance, datasets),
+        summary=report_text.describe(results, provenance, datasets, joint),
         figures=draw_figures(results, datasets),
         maps=embed_maps(datasets["fields"], datasets["fusion"], results) if "fields" in datasets else None,
     )

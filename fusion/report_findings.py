@@ -32,8 +32,26 @@ def describe_correlation(fused: xr.Dataset) -> dict[str, Any] | None:
     rate = float(maps["false_alarm_rate"])
     rows.append(("Chance of a false find", f"{rate:.2f}, measured on data simulated without any link"))
     rows.append(("Excitation", str(fused.attrs.get("correlation_excitation", ""))))
+    clusters = group(maps, "clusters")
+    rows.append(
+        (
+            "Courses of temperature",
+            f"{int(clusters['cluster'].max())} groups of cells that warm alike; inside a group these data cannot tell places apart "
+            f"(condition of the thermal modes {number(float(clusters['condition']), 2)})",
+        )
+    )
     verdict = str(fused.attrs.get("correlation_verdict", ""))
-    return {"headline": _CORRELATION.get(verdict, verdict), "rows": rows}
+    return {"headline": _CORRELATION.get(verdict, verdict), "rows": rows, "sensors": _sensors(group(maps, "sensors"))}
+
+
+def _sensors(sensors: xr.Dataset) -> list[list[str]]:
+    """Return one row per number of contact sensors: the place that is added, the drift left, the loss beside the camera."""
+    rows = []
+    for at in range(sensors.sizes["sensor"]):
+        one = sensors.isel(sensor=at)
+        place = f"x {float(one['x']):.0f} mm, y {float(one['y']):.0f} mm"
+        rows.append([str(at + 1), place, number(float(one["rms"]), 2), number(float(one["loss"]), 2)])
+    return rows
 
 
 def _channel(maps: xr.Dataset) -> str:

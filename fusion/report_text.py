@@ -58,7 +58,10 @@ SECTIONS = (
 
 
 def describe(
-    results: Mapping[str, Any], provenance: Mapping[str, Any], datasets: Mapping[str, xr.Dataset]
+    results: Mapping[str, Any],
+    provenance: Mapping[str, Any],
+    datasets: Mapping[str, xr.Dataset],
+    joint: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
     """Return everything the template says in words and tables."""
     deviations, fields, fused = (datasets.get(name) for name in ("deviations", "fields", "fusion"))
@@ -87,6 +90,8 @@ def describe(
         "anomaly_advice": [wording.CAUSES[item["cause"]][1] for item in anomalies],
         "evidence": [evidence(item["evidence"]) for item in anomalies],
         "correlation": correlation,
+        "camera_rms": float(fused["correlation_sensors_camera_rms"]) if correlation and fused is not None else None,
+        "joint": joint,
         "model": describe_model(loop) if loop else [],
         "loop_numbers": wording.verdict_numbers(loop) if loop else "",
         "parameters": [parameters(step["parameters"]) for step in loop["steps"]] if loop else [],

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.alignment import align
+from fusion.collinearity import cluster_cells, evidence_at
 from fusion.correlation import correlate
 from fusion.diagnosis import Diagnosis, diagnose
 from fusion.effects import library
@@ -19,6 +20,7 @@ from fusion.outcome import Outcome
 from fusion.progress import Report
 from fusion.readings import Readings, read_fused
 from fusion.results import Notice
+from fusion.sensors import SensorSet, choose_sensors
 from fusion.sources import Source, counted, listed
 from interferometry import iso230, neighbours
 from interferometry.anomalies import Anomaly, detect_anomalies
@@ -101,7 +103,31 @@ def correlate_field(fields: xr.Dataset, fused: xr.Dataset, *, report: Report) ->
     film = fields["frame_temperature"].coarsen(x=block, y=block, boundary="trim").mean()
     report("correlation", 0, 100)
     maps = correlate(fused, film, progress=lambda part: report("correlation", round(100 * part), 100))
+    report("correlation", 100, 100)
+    report("sensor places", 0, 1)
+    maps = joined(maps, clusters=cluster_cells(film), sensors=sensor_variables(choose_sensors(fused, film)))
+    report("sensor places", 1, 1)
     return Outcome(maps, {"hotspots": hotspot_part(fields, maps)})
+
+
+def sensor_variables(sets: Sequence[SensorSet]) -> xr.Dataset:
+    """Return the best places of contact sensors and what each number of them costs beside the camera."""
+    places = np.array(sets[-1].places_mm).reshape(-1, 2)
+    um, mm = {"units": "um"}, {"units": "mm"}
+    return xr.Dataset(
+        {
+            "x": ("sensor", places[:, 0], mm),
+            "y": ("sensor", places[:, 1], mm),
+            "rms": (
+                "sensor",
+                [one.rms_um for one in sets],
+                {**um, "long_name": "held-out drift left with 1..n sensors"},
+            ),
+            "loss": ("sensor", [one.loss_um for one in sets], {**um, "long_name": "missed beside the camera"}),
+            "camera_rms": ((), sets[-1].camera_rms_um, um),
+        },
+        coords={"sensor": np.arange(1, len(sets) + 1)},
+    )
 
 
 def model_drift(source: Source, fused: xr.Dataset, deviations: xr.Dataset, *, report: Report) -> Outcome:
@@ -225,19 +251,17 @@ def centred(fit: ModelFit) -> np.ndarray:
 
 
 def hotspot_part(fields: xr.Dataset, maps: xr.Dataset) -> list[dict[str, Any]]:
-    """Return the hotspots of the last cycle with the smallest family-wise p of their cells and its lag."""
+    """Return the hotspots of the last cycle with what the correlation says of their place."""
     return [_hotspot(spot, maps) for spot in detect_hotspots(fields["temperature_rise"].isel(cycle=-1))]
 
 
 def _hotspot(spot: Hotspot, maps: xr.Dataset) -> dict[str, Any]:
-    here = maps.sel(x=spot.x_mm, y=spot.y_mm, method="nearest")
-    p = here["p_value"].fillna(1.0)
-    at = int(np.argmin(p.values))
+    evidence = evidence_at(maps, spot.x_mm, spot.y_mm)
     return {
         "x_mm": spot.x_mm,
         "y_mm": spot.y_mm,
         "peak_rise_K": spot.peak_rise_K,
         "targets": [],
-        "p_value": float(p[at]),
-        "lag_s": float(here["lag"][at]),
+        "p_value": evidence["p_value"],
+        "lag_s": evidence["lag_s"],
     }

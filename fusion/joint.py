@@ -1,0 +1,86 @@
+"""around - Two campaigns of one machine: run apart, then asked where they agree."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from fusion.conjunction import Common, agree
+from fusion.groups import group
+from fusion.plots_fusion import CHANNELS
+from fusion.products import read_dataset, write_dataset, write_json, write_text
+from fusion.report import render_report
+from fusion.report_findings import readable
+from fusion.wording import number, p_value
+
+PRODUCTS = ("fields", "deviations", "fusion")
+
+
+def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
+    """Compare the correlation of two finished runs and tell it in both reports.
+
+    Parameters
+    ----------
+    folders : sequence of Path
+        Results folders of two campaigns of one machine, on the same plan grid.
+    out : Path
+        Folder for ``joint.json`` and ``joint.nc``.
+
+    Returns
+    -------
+    list of (str, str)
+        Name and finding per part of the drift, for the terminal.
+
+    Raises
+    ------
+    ConjunctionError
+        If the campaigns cannot be compared.
+    """
+    datasets = [{name: read_dataset(folder / f"{name}.nc") for name in PRODUCTS} for folder in folders]
+    maps, found = agree(*(correlation_of(one["fusion"]) for one in datasets))
+    write_dataset(out / "joint.nc", maps)
+    write_json(
+        out / "joint.json",
+        {"campaigns": [_title(folder) for folder in folders], "sources": [asdict(one) for one in found]},
+    )
+    rows = [(CHANNELS.get(one.channel, one.channel), in_words(one)) for one in found]
+    for at, folder in enumerate(folders):
+        joint = {"other": _title(folders[1 - at]), "rows": rows}
+        write_text(
+            folder / "report.html",
+            render_report(_json(folder, "results"), _json(folder, "provenance"), datasets[at], joint=joint),
+        )
+    return rows
+
+
+def correlation_of(fusion: xr.Dataset) -> xr.Dataset:
+    """Return the correlation maps of fusion.nc as `fusion.correlation.correlate` gave them."""
+    maps = group(fusion, "correlation")
+    attrs = {
+        str(name).removeprefix("correlation_"): value
+        for name, value in fusion.attrs.items()
+        if str(name).startswith("correlation_")
+    }
+    return maps.assign_attrs(attrs)
+
+
+def in_words(found: Common) -> str:
+    """Return one verdict of two sessions as a sentence."""
+    first, second = (number(value, 2) for value in found.sensitivity_um_per_K)
+    return readable(
+        f"{found.verdict}: {found.reason}; x {found.x_mm:.0f} mm, y {found.y_mm:.0f} mm, larger p of both {p_value(found.p_value)}, "
+        f"{first} and {second} um/K"
+    )
+
+
+def _title(folder: Path) -> str:
+    return str(_json(folder, "results")["campaign"])
+
+
+def _json(folder: Path, name: str) -> Mapping[str, Any]:
+    return json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
