@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy import stats
 
 from interferometry import flags
 from interferometry.deviations import DIMS
@@ -36,6 +37,8 @@ __all__ = [
 #: Deletion residual, in standard deviations, from which a reading is flagged as an outlier: among 10,000 normal
 #: readings the chance of one is 0.07.
 OUTLIER_LIMIT = 4.5
+#: A cell's own scatter replaces the common one in its uncertainty where it exceeds that at this level.
+EXCESS_LEVEL = 1e-3
 
 
 def estimate_drift(
@@ -100,10 +103,11 @@ def describe(deviations: xr.Dataset, joint: JointFit, *, state: str | float = "m
     at_position_u = np.sqrt(np.maximum(np.einsum("kc,kce,ke->k", loadings, covariance, loadings), 0.0))
     component_u = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
     noise = fit.system.variance * (u[:, 0] - u[:, 1:] @ fit.coefficients)
-    result = _describe_profile(deviations, joint, at_state)
-    scatter, freedom = _scatter(joint, u, d)
+    deletion = fit.deletion_residuals()
+    scatter, freedom = _scatter(joint, u, d, deletion)
+    result = _describe_profile(deviations, joint, at_state, _excess_variance(scatter, freedom, joint))
     grid = _Grid(deviations, joint)
-    standardised = grid.per_reading(fit.deletion_residuals())
+    standardised = grid.per_reading(deletion)
     standardised[grid.is_left_out(deviations)] = np.inf
     target = joint.cells[:, 1]
     targets = deviations.sizes["target"]
@@ -252,7 +256,9 @@ def _with_start_rates(levels: Array, hours: Array, joint: JointFit) -> tuple[Arr
     return levels[:, :, 0] + through @ joint.fit.coefficients, through
 
 
-def _describe_profile(deviations: xr.Dataset, joint: JointFit, at_state: _StateDrift) -> xr.Dataset:
+def _describe_profile(
+    deviations: xr.Dataset, joint: JointFit, at_state: _StateDrift, excess_variance: Array
+) -> xr.Dataset:
     fit = joint.fit
     sign = np.where(joint.cells[:, 0] == 0, 1.0, -1.0)
     position = deviations["position"].values[joint.cells[:, 1]]
@@ -261,7 +267,7 @@ def _describe_profile(deviations: xr.Dataset, joint: JointFit, at_state: _StateD
     to_profile = np.eye(cells, fit.coefficients.size) + loadings @ at_state.through
     profile = fit.coefficients[:cells] + loadings @ at_state.drift
     covariance = to_profile @ fit.covariance @ to_profile.T
-    covariance += fit.sigma**2 * loadings @ at_state.covariance @ loadings.T
+    covariance += fit.sigma**2 * loadings @ at_state.covariance @ loadings.T + np.diag(excess_variance)
     grid = _Grid(deviations, joint)
     first = {direction: at for at, (direction, target) in reversed(list(enumerate(joint.cells)))}
     reference = np.array([first[direction] for direction in joint.cells[:, 0]])
@@ -295,22 +301,39 @@ def _pairs(cells: NDArray[np.int64]) -> dict[int, tuple[int, int]]:
     return {target: (at[0, target], at[1, target]) for direction, target in at if direction == 0 and (1, target) in at}
 
 
-def _scatter(joint: JointFit, u: Array, d: Array) -> tuple[Array, Array]:
+def _scatter(joint: JointFit, u: Array, d: Array, standardised: Array) -> tuple[Array, Array]:
     """Return the random standard deviation of each cell and its degrees of freedom.
 
-    The noise estimates of a cell are divided by what their squares are expected to be for a unit variance, the estimated
-    coefficients taken into account; readings that lost their weight count with the weight they kept.
+    A reading's deviation from its prediction by all others has the variance of the reading plus that of the prediction;
+    the latter is taken off, and what the estimated coefficients took is put back. Readings beyond OUTLIER_LIMIT of their
+    own cell do not count; wide scatter of a whole cell does.
     """
     fit = joint.fit
-    weighted = fit.system.variance
-    residual = u[:, 0] - u[:, 1:] @ fit.coefficients
-    unit = fit.covariance / fit.sigma**2
-    expected = np.maximum(d - np.einsum("kp,pq,kq->k", u[:, 1:], unit, u[:, 1:], optimize=True), 0.0)
     cells = len(joint.cells)
-    squares = np.bincount(joint.cell, weighted * residual**2, minlength=cells).astype(float)
-    freedom = np.bincount(joint.cell, weighted * expected, minlength=cells).astype(float)
-    known = np.where(freedom > 0.5, freedom, np.nan)
-    return np.sqrt(squares / known), np.where(freedom > 0.5, freedom, 0.0)
+    unit = fit.covariance / fit.sigma**2
+    expected = d - np.einsum("kp,pq,kq->k", u[:, 1:], unit, u[:, 1:], optimize=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        left = expected / d
+        from_others = (u[:, 0] - u[:, 1:] @ fit.coefficients) / d
+        square = from_others**2 / left - fit.sigma**2 * (1.0 / d - fit.system.variance)
+    usual = np.array([1.4826 * np.median(np.abs(standardised[joint.cell == cell])) for cell in range(cells)])
+    kept = (np.abs(standardised) <= OUTLIER_LIMIT * np.maximum(usual, 1.0)[joint.cell]) & (left > 1e-6)
+    count = np.bincount(joint.cell[kept], minlength=cells)
+    squares = np.bincount(joint.cell[kept], square[kept], minlength=cells)
+    freedom = np.bincount(
+        joint.cell[kept], left[kept] * np.minimum(d * fit.system.variance, 1.0)[kept], minlength=cells
+    )
+    usable = freedom > 0.5
+    variance = np.where(usable, np.maximum(squares, 0.0) / np.maximum(count, 1), np.nan)
+    return np.sqrt(variance), np.where(usable, freedom, 0.0)
+
+
+def _excess_variance(scatter: Array, freedom: Array, joint: JointFit) -> Array:
+    """Return what cells that scatter clearly more than the common sigma add to the variance of their profile value."""
+    ratio = np.nan_to_num(scatter / joint.fit.sigma) ** 2
+    clear = stats.chi2.sf(ratio * freedom, np.maximum(freedom, 1.0)) < EXCESS_LEVEL
+    readings = np.bincount(joint.cell, minlength=len(joint.cells))
+    return np.where(clear, (ratio - 1.0) * joint.fit.sigma**2 / readings, 0.0)
 
 
 class _Grid:

@@ -124,6 +124,16 @@ def test_a_reversal_that_stays_is_reported_constant(rng: np.random.Generator) ->
     assert float(history["reversal"].std("cycle").max()) < 1e-12
 
 
+def test_a_position_that_scatters_more_is_known_less_well(rng: np.random.Generator) -> None:
+    made = rng.normal(0, SIGMA_UM, (100, 2, 16))
+    made[:, :, 2] *= 3.0
+    estimated = estimate_drift(simulate(rng, noise=made)[0])
+    u = estimated["profile_u"].values
+    # Its own 100 readings of 1.2 um in each direction, less the weight that wild readings lost.
+    assert u[:, 2] == pytest.approx(0.12, rel=0.2)
+    assert np.delete(u, 2, axis=1).max() < 0.06
+
+
 def test_gross_outliers_are_flagged_and_lose_their_weight(rng: np.random.Generator) -> None:
     deviations, truth = simulate(rng)
     deviations["deviation"].values[20, 0, 4] += 40.0
