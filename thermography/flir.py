@@ -84,9 +84,12 @@ class FrameReference(FrameHeader):
     def read(self) -> Frame:
         """Read the frame with its pixels."""
         with self.path.open("rb", buffering=0) as file:
-            source = FffSource(file, self.path, self.segments)
-            _, info = read_header(source, read_directory(source))
-            counts = read_counts(source, self.samples)
+            return self._read_from(file)
+
+    def _read_from(self, file: BinaryIO) -> Frame:
+        source = FffSource(file, self.path, self.segments)
+        _, info = read_header(source, read_directory(source))
+        counts = read_counts(source, self.samples)
         header = {each.name: getattr(self, each.name) for each in fields(FrameHeader)}
         return Frame(**header, counts=counts, source=str(self.path), index=self.index, camera_info=info)
 
@@ -128,11 +131,11 @@ def read_frame(path: str | os.PathLike[str]) -> Frame:
         Where the file is not radiometric or its first frame is damaged.
     """
     path = Path(path)
-    for found in _walk(path):
-        if isinstance(found, Rejected):
-            raise FlirFormatError(found.reason)
-        return found.read()
-    raise FlirFormatError(f"{path}: at 0x0: expected a FLIR frame, found an empty file")
+    with path.open("rb", buffering=0) as file:
+        first = next(_walk(file, path))
+        if isinstance(first, Rejected):
+            raise FlirFormatError(first.reason)
+        return first._read_from(file)
 
 
 def index_frames(paths: Iterable[str | os.PathLike[str]]) -> tuple[list[FrameReference], list[Rejected]]:
@@ -153,8 +156,9 @@ def index_frames(paths: Iterable[str | os.PathLike[str]]) -> tuple[list[FrameRef
     rejected: list[Rejected] = []
     for path in map(Path, paths):
         try:
-            for found in _walk(path):
-                (rejected if isinstance(found, Rejected) else frames).append(found)  # type: ignore[arg-type]
+            with path.open("rb", buffering=0) as file:
+                for found in _walk(file, path):
+                    (rejected if isinstance(found, Rejected) else frames).append(found)  # type: ignore[arg-type]
         except (OSError, FlirFormatError) as error:
             rejected.append(Rejected(path, 0, str(error)))
     frames.sort(key=lambda frame: (np.isnat(frame.time), frame.time, str(frame.path), frame.index))
@@ -168,20 +172,17 @@ def index_frames(paths: Iterable[str | os.PathLike[str]]) -> tuple[list[FrameRef
     return kept, rejected
 
 
-def _walk(path: Path) -> Iterator[FrameReference | Rejected]:
+def _walk(file: BinaryIO, path: Path) -> Iterator[FrameReference | Rejected]:
     """Yield the frames of one file in their order; damaged ones as `Rejected`."""
-    with path.open("rb", buffering=0) as file:
-        start = file.read(4)
-        if start[:2] == b"\xff\xd8":
-            source = FffSource(file, path, _jpeg_segments(file, path))
-            yield _reference(source, read_directory(source), 0)
-        elif start == MAGIC:
-            yield from _walk_sequence(file, path)
-        else:
-            found = start.hex(" ") or "an empty file"
-            raise FlirFormatError(
-                f"{path}: at 0x0: expected a JPEG (FF D8) or an FFF record (46 46 46 00), found {found}"
-            )
+    start = file.read(4)
+    if start[:2] == b"\xff\xd8":
+        source = FffSource(file, path, _jpeg_segments(file, path))
+        yield _reference(source, read_directory(source), 0)
+    elif start == MAGIC:
+        yield from _walk_sequence(file, path)
+    else:
+        found = start.hex(" ") or "an empty file"
+        raise FlirFormatError(f"{path}: at 0x0: expected a JPEG (FF D8) or an FFF record (46 46 46 00), found {found}")
 
 
 def _reference(source: FffSource, directory: Directory, index: int) -> FrameReference:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import struct
 from typing import cast
 
-import cv2
 import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
 from thermography.flir_frame import Encoding, Samples
+from thermography.flir_png import SIGNATURE, PngError, decode_png
 from thermography.flir_record import Directory, FffSource, find_record
 
 RAW_RECORD = 0x01
@@ -36,7 +36,7 @@ def read_sample_place(source: FffSource, directory: Directory) -> Samples:
     if not 0 < rows * columns <= MAX_PIXELS:
         raise source.error(offset + 2, f"1 to {MAX_PIXELS} pixels", f"{columns} x {rows}")
     encoding: Encoding = "raw"
-    if head[RAW_HEADER_SIZE:] == b"\x89PNG\r\n\x1a\n":
+    if head[RAW_HEADER_SIZE:] == SIGNATURE:
         encoding = "png"
     elif head[RAW_HEADER_SIZE : RAW_HEADER_SIZE + 4] == b"\xff\xd8\xff\xf7":
         encoding = "jpegls"
@@ -63,46 +63,27 @@ def read_counts(source: FffSource, samples: Samples) -> NDArray[np.uint16]:
         return counts if counts.dtype.isnative else counts.astype(np.uint16)
     # Rounded up to 8 bytes by the writers; the padding after the last frame's stream may be missing.
     data = source.read(samples.offset, min(samples.length, 2 * MAX_PIXELS))
-    _check_stream(source, samples, data)
-    decoded = _decode_png(data) if samples.encoding == "png" else _decode_jpegls(data)
-    if decoded is None:
-        raise source.error(samples.offset, f"a {samples.encoding} stream that decodes", "damaged data")
-    if decoded.shape != samples.shape or decoded.dtype != np.uint16:
-        raise source.error(
-            samples.offset, f"{columns} x {rows} samples of 16 bit", f"shape {decoded.shape} of {decoded.dtype}"
-        )
-    if samples.encoding == "png" and samples.little_endian:
-        return decoded.byteswap()
-    return decoded
-
-
-def _decode_png(data: bytes) -> NDArray[np.uint16] | None:
-    # imagecodecs (2026.3) loses a reference to None with every damaged PNG, and some ten thousand of them end the interpreter.
-    return cast("NDArray[np.uint16] | None", cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))
-
-
-def _decode_jpegls(data: bytes) -> NDArray[np.uint16] | None:
-    try:
-        return cast("NDArray[np.uint16]", imagecodecs.jpegls_decode(data))
-    except imagecodecs.JpeglsError:
-        return None
-
-
-def _check_stream(source: FffSource, samples: Samples, data: bytes) -> None:
-    """Compare the size a compressed stream claims with the record's, before a decoder allocates for it."""
     if samples.encoding == "png":
-        claim = struct.unpack_from(">2I2B", data, 16) if len(data) >= 33 and data[12:16] == b"IHDR" else None
-        expected = (samples.shape[1], samples.shape[0], 16, 0)
-        if claim != expected:
-            raise source.error(samples.offset, f"a PNG of (width, height, bits, grey) {expected}", str(claim))
-        if b"IEND" not in data[-64:]:
-            raise source.error(samples.offset, "a PNG that ends with IEND", f"{len(data)} bytes without it")
-        return
+        try:
+            counts = decode_png(data, samples.shape)
+        except PngError as error:
+            raise source.error(samples.offset, *error.args) from error
+        return counts.byteswap() if samples.little_endian else counts
+    return _decode_jpegls(source, samples, data)
+
+
+def _decode_jpegls(source: FffSource, samples: Samples, data: bytes) -> NDArray[np.uint16]:
+    """Decode a JPEG-LS stream after comparing the size it claims with the record's, before the decoder allocates for it."""
     claim = struct.unpack_from(">B2HB", data, 6) if len(data) >= 12 else None
-    expected = (16, samples.shape[0], samples.shape[1], 1)
+    expected = (16, *samples.shape, 1)
     if claim is None or claim[1:] != expected[1:] or not 8 < claim[0] <= 16:
-        raise source.error(
-            samples.offset, f"a JPEG-LS stream of (bits, height, width, components) {expected}", str(claim)
-        )
+        raise source.error(samples.offset, f"JPEG-LS of (bits, height, width, components) {expected}", str(claim))
     if b"\xff\xd9" not in data[-16:]:
         raise source.error(samples.offset, "a JPEG-LS stream that ends with FF D9", f"{len(data)} bytes without it")
+    try:
+        counts = imagecodecs.jpegls_decode(data)
+    except imagecodecs.JpeglsError as error:
+        raise source.error(samples.offset, "a JPEG-LS stream that decodes", str(error)) from error
+    if counts.shape != samples.shape or counts.dtype != np.uint16:
+        raise source.error(samples.offset, f"JPEG-LS samples {samples.shape}", f"{counts.shape} of {counts.dtype}")
+    return cast("NDArray[np.uint16]", counts)

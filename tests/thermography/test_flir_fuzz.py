@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tracemalloc
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -49,17 +49,17 @@ def _fuzz(folder: Path, inputs: int, seed: int) -> tuple[int, int]:
 
 
 def test_damaged_files_are_refused_or_read_but_never_crash(tmp_path: Path) -> None:
-    read, refused = _fuzz(tmp_path, 3000, seed=11)
-    assert read > 1000 and refused > 1000
+    read, refused = _fuzz(tmp_path, 2000, seed=11)
+    assert read > 700 and refused > 700
 
 
 @pytest.mark.slow
 def test_two_hundred_thousand_damaged_files(tmp_path: Path) -> None:
-    tracemalloc.start()
+    _fuzz(tmp_path, 1000, seed=13)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     read, refused = _fuzz(tmp_path, 200_000, seed=12)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    print(f"200000 inputs: {read} frames read, {refused} refused, peak {peak / 1e6:.1f} MB")
+    growth = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    print(f"200000 inputs: {read} frames read, {refused} refused, memory peak grew by {growth:.1f} MB")
     assert read > 50_000 and refused > 50_000
     # The reader refuses more than 2**24 pixels (34 MB) before it reads them; no small file may cost more.
-    assert peak < 70e6
+    assert growth < 70

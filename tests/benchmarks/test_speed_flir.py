@@ -1,0 +1,112 @@
+"""Speeds of reading and calibrating, as ratios to named readers measured in the same run, on one core."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import flyr
+import numpy as np
+import pytest
+import xarray as xr
+from flirpy.io.seq import Seq
+
+from tests.thermography.flir_mutations import frame
+from thermography.backend import FlirBackendEntrypoint
+from thermography.flir import index_frames, read_frame, write_jpeg, write_sequence
+from thermography.radiometry import calibrate
+
+pytestmark = pytest.mark.slow
+
+SC660 = "gtatters__Thermimage/inst/extdata/IR_2412.jpg"
+C3X = "frkatona__ThermalImageFitter/Nov19/FLIR2167.jpg"
+
+
+@pytest.fixture(autouse=True)
+def one_core():
+    import cv2
+
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    yield
+    cv2.setNumThreads(threads)
+
+
+def _seconds(work: Callable[[], object], repeats: int) -> float:
+    """Return the time of one call, from a few calls in a row."""
+    start = time.perf_counter()
+    for _ in range(repeats):
+        work()
+    return (time.perf_counter() - start) / repeats
+
+
+def _compare(
+    what: str, ours: Callable[[], object], theirs: Callable[[], object], *, peer: str, repeats: int = 1, frames: int = 1
+) -> None:
+    """Print frames per second and their ratio: the median over rounds in which both take turns, for the machine may be shared."""
+    times = np.array([(_seconds(ours, repeats), _seconds(theirs, 1)) for _ in range(9)]) / frames
+    ratio = np.median(times[:, 1] / times[:, 0])
+    a, b = 1 / np.median(times, axis=0)
+    print(f"\n{what}: {a:.0f} frames/s, {peer} {b:.1f} frames/s, ratio {ratio:.1f}")
+
+
+def _ours(path: Path) -> np.ndarray:
+    read = read_frame(path)
+    return calibrate(read.counts, read.parameters)
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("payload", ["raw", "png 640 x 480", "png 128 x 96"])
+def test_jpeg_to_temperature_against_flyr(real_file, tmp_path: Path, payload: str) -> None:
+    path = real_file(C3X if payload.endswith("96") else SC660)
+    if payload == "png 640 x 480":
+        original = read_frame(path)
+        path = tmp_path / "a.jpg"
+        write_jpeg(path, original.counts, original.parameters, original.time, encoding="png")
+    # The two agree to what the half-path formula errs, 0.1 K near ambient and 0.2 K at 97 degC: both do the whole work.
+    np.testing.assert_allclose(_ours(path), flyr.unpack(str(path)).celsius, atol=0.1, rtol=0.003)
+    _compare(f"R-JPEG {payload}", lambda: _ours(path), lambda: flyr.unpack(str(path)).celsius, peer="flyr", repeats=30)
+
+
+def test_sequence_to_temperature_against_flirpy(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    write_sequence(path, (frame(480, 640, seconds=second) for second in range(40)))
+    references, _ = index_frames([path])
+    theirs_open = Seq(str(path))
+
+    def ours() -> None:
+        for each in references:
+            calibrate(each.read_counts(), each.parameters)
+
+    def theirs() -> None:
+        for index in range(len(theirs_open)):
+            theirs_open[index].get_radiometric_image()
+
+    _compare("SEQ to temperature", ours, theirs, peer="flirpy", frames=40)
+
+
+def test_opening_ten_thousand_frames_against_flirpy(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    small = frame(48, 64)
+    write_sequence(path, (replace(small, time=small.time + np.timedelta64(second, "s")) for second in range(10_000)))
+    rounds = [(_seconds(lambda: _open(path), 1), _seconds(lambda: Seq(str(path)), 1)) for _ in range(5)]
+    ours, theirs = np.median(rounds, axis=0)
+    print(f"\nopening 10,000 frames: {ours:.2f} s with all headers, flirpy {theirs:.2f} s with positions only")
+
+
+def _open(path: Path) -> xr.Dataset:
+    return xr.open_dataset(path, engine=FlirBackendEntrypoint)
+
+
+def test_calibration_against_reading_the_counts() -> None:
+    counts = frame(480, 640).counts
+    parameters = frame(1, 1).parameters
+    _compare(
+        "counts to temperature",
+        lambda: calibrate(counts, parameters),
+        counts.copy,
+        peer="copy of the counts",
+        repeats=20,
+    )
