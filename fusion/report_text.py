@@ -82,7 +82,7 @@ def describe(
             ("glossary", "Glossary"),
             ("provenance", "Provenance"),
         ],
-        "data": _data_rows(provenance, deviations, fields),
+        "data": _data_rows(results, provenance, deviations, fields),
         "fiducials": _fiducial_rows(fields),
         "field_uncertainty": _field_uncertainty(fields),
         "positions": _position_rows(deviations),
@@ -164,7 +164,7 @@ def _numbers(
 
 
 def _data_rows(
-    provenance: Mapping[str, Any], deviations: xr.Dataset | None, fields: xr.Dataset | None
+    results: Mapping[str, Any], provenance: Mapping[str, Any], deviations: xr.Dataset | None, fields: xr.Dataset | None
 ) -> list[tuple[str, str]]:
     rows = []
     if deviations is not None:
@@ -184,6 +184,10 @@ def _data_rows(
         rows.append(("Plan", f"{fields.sizes['x']} × {fields.sizes['y']} cells of {cell:g} mm"))
         seen = float(np.isfinite(fields["temperature_rise"].isel(cycle=-1)).mean())
         rows.append(("Seen", f"{seen:.0%} of the plan; the rest is masked (fiducials, edges) or out of the picture"))
+    offset = results.get("alignment", {}).get("clock_offset_s")
+    if offset is not None:
+        source = "assumed" if offset["u"] is None else "as given" if offset["u"] == 0 else "from the table's motion"
+        rows.append(("Clock offset", f"{measured(offset['value'], offset['u'], 's')}, camera minus laser, {source}"))
     rows.append(("Input files", f"{len(provenance['inputs'])}, listed with their SHA-256 under Provenance"))
     return rows
 

@@ -206,8 +206,8 @@ def outside_notices(fused: xr.Dataset) -> list[Notice]:
     return [
         Notice(
             "readings_outside_frames",
-            f"{int(outside.sum())} readings lie outside the frames' time, in {counted(len(cycles), 'cycle')} ({listed(cycles)}); "
-            "they are evaluated, but take no part in what joins drift and field.",
+            f"{counted(int(outside.sum()), 'reading')} outside the frames' time, in {counted(len(cycles), 'cycle')} ({listed(cycles)}); "
+            "evaluated, but without a part in what joins drift and field.",
             "Start the camera before the first cycle and stop it after the last one.",
         )
     ]

@@ -18,9 +18,11 @@ from fusion.progress import Report
 from fusion.results import Notice
 from fusion.sources import Source, counted, listed
 from thermography.camera import find_repeats, find_steps, read_levels
+from thermography.clock import estimate_clock_offset
 from thermography.contract import FIELDS
 from thermography.exr import write_maps
 from thermography.fields import reduce_frames
+from thermography.moving import reduce_moving_frames
 from thermography.overrides import Overrides
 from thermography.radiometry import calibrate
 from thermography.registration import Registration, register
@@ -36,13 +38,75 @@ def reduce_thermography(source: Source, *, scheduler: str | None, report: Report
     """Check the camera, register the plan on the first frames, and reduce all frames to one field per cycle."""
     override = Overrides(campaign_constants(source))
     notices = camera_notices(source, override, report=report)
-    first = [frame.read() for frame in source.frames[:_REGISTRATION_FRAMES]]
-    reference = np.mean([calibrate(frame.counts, override(frame)) for frame in first], axis=0)
     report("registration", 0, 1)
+    # A moving table is somewhere else in the next frame, so its plan is registered on one frame alone.
+    first = source.frames[: 1 if source.thermography.table == "moving" else _REGISTRATION_FRAMES]
+    reference = np.mean([calibrate(frame.read_counts(), override(frame)) for frame in first], axis=0)
     registration = register(reference, source.fiducials, grid=source.grid)
     report("registration", 1, 1)
-    offset = source.thermography.clock_offset_s or 0.0
-    bounds = cycle_bounds(source.deviations) + np.timedelta64(round(offset * 1e9), "ns")
+    fields, clock, found = _reduce_on_clock(source, registration, override, scheduler=scheduler, report=report)
+    check(fields, FIELDS, name="the fields")
+    notices += [*found, *registration_notices(registration), *frame_notices(fields)]
+    fields = fields.assign_coords(cycle=source.deviations["cycle"].values)
+    for name in ("time", "cycle_time", "frame_time"):
+        if name in fields.variables:
+            moved = camera_on_laser_clock(fields[name].values, clock["value"])
+            fields[name] = (fields[name].dims, moved, fields[name].attrs)
+    fields = fields.assign(registration_variables(registration, reference)).assign(target_places(source))
+    parts = {
+        "registration": {
+            "rms_mm": registration.rms_mm,
+            "leave_one_out_mm": registration.leave_one_out_mm,
+            "frames_rejected": source.frames_rejected,
+        },
+        "alignment": {"clock_offset_s": clock},
+    }
+    return Outcome(fields, parts, tuple(notices))
+
+
+def _reduce_on_clock(
+    source: Source, registration: Registration, override: Overrides, *, scheduler: str | None, report: Report
+) -> tuple[xr.Dataset, dict[str, Any], list[Notice]]:
+    """Reduce the frames with the clock offset that the campaign gives, that the moving table shows, or that is assumed."""
+    given = source.thermography.clock_offset_s
+    fields = _reduce(source, registration, override, given or 0.0, scheduler=scheduler, report=report)
+    if given is not None:
+        return fields, {"value": given, "u": 0.0}, []
+    if source.thermography.table == "still":
+        return fields, {"value": 0.0, "u": None}, [_ASSUMED_CLOCK]
+    report("clock offset", 0, 1)
+    clock = estimate_clock_offset(
+        fields["frame_time"].values,
+        fields["table_position"].values,
+        fields["table_position_u"].values,
+        source.deviations["time"].values,
+        source.deviations["position"].broadcast_like(source.deviations["time"]).values.ravel(),
+        feed_mm_per_min=source.interferometry.feed_mm_per_min,
+    )
+    report("clock offset", 1, 1)
+    # Frames belong to cycles by the laser's clock, so they are sorted into them again.
+    fields = _reduce(source, registration, override, clock.offset_s, scheduler=scheduler, report=report)
+    return fields, {"value": clock.offset_s, "u": clock.offset_u_s}, []
+
+
+_ASSUMED_CLOCK = Notice(
+    "clock_offset_assumed",
+    "The clock offset is not given and frames of a still table cannot show it: 0 s was taken.",
+    'Write thermography.clock_offset = "0 s" if both clocks were set by the same time server, or the offset that was noted.',
+)
+
+
+def _reduce(
+    source: Source,
+    registration: Registration,
+    override: Overrides,
+    offset_s: float,
+    *,
+    scheduler: str | None,
+    report: Report,
+) -> xr.Dataset:
+    """Reduce the frames of a still or moving table, its cycles brought to the camera's clock."""
+    bounds = cycle_bounds(source.deviations) + np.timedelta64(round(offset_s * 1e9), "ns")
     total, done = len(source.frames), 0
 
     def count(more: int) -> None:
@@ -51,26 +115,11 @@ def reduce_thermography(source: Source, *, scheduler: str | None, report: Report
         report("frames", done, total)
 
     report("frames", 0, total)
-    fields = reduce_frames(
-        source.frames, registration, source.grid, bounds, override=override, scheduler=scheduler, progress=count
-    )
-    check(fields, FIELDS, name="the fields")
-    notices += [*registration_notices(registration), *frame_notices(fields)]
-    fields = fields.assign_coords(cycle=source.deviations["cycle"].values)
-    for name in ("time", "cycle_time"):
-        fields[name] = (fields[name].dims, camera_on_laser_clock(fields[name].values, offset), fields[name].attrs)
-    fields = fields.assign(registration_variables(registration, reference)).assign(target_places(source))
-    parts = {
-        "registration": {
-            "rms_mm": registration.rms_mm,
-            "leave_one_out_mm": registration.leave_one_out_mm,
-            "frames_rejected": source.frames_rejected,
-        },
-        "alignment": {
-            "clock_offset_s": {"value": offset, "u": 0.0 if source.thermography.clock_offset_s is not None else None}
-        },
-    }
-    return Outcome(fields, parts, tuple(notices))
+    common: dict[str, Any] = {"override": override, "scheduler": scheduler, "progress": count}
+    if source.thermography.table == "moving":
+        direction = source.plan.axis.direction
+        return reduce_moving_frames(source.frames, registration, source.grid, bounds, direction=direction, **common)
+    return reduce_frames(source.frames, registration, source.grid, bounds, **common)
 
 
 def campaign_constants(source: Source) -> dict[str, float]:
@@ -154,6 +203,10 @@ _FRAME_ATTRIBUTES = {
         "Fasten camera and table, and check what happened at that time.",
     ),
     "frames_shaken": ("were shaken for this one frame", "Shield the camera from vibration."),
+    "frames_unplaced": (
+        "do not show where the table is and were left out",
+        "Keep at least three fiducials in view at every axis position.",
+    ),
     "frames_unchecked": (
         "have too little contrast to check the registration",
         "Nothing has to be done while neither camera nor table are touched.",

@@ -16,8 +16,11 @@ from fusion.config import load_campaign
 from fusion.contracts import check
 from fusion.pipeline import run_campaign
 from fusion.products import OutputError, file_sha256, read_dataset
+from fusion.progress import silent
 from fusion.results import results_schema
 from fusion.sources import SourceError, read_source
+from fusion.stages_thermal import reduce_thermography
+from fusion.twin import simulate_campaign
 from thermography.contract import FIELDS
 from thermography.exr import read_maps
 
@@ -87,7 +90,7 @@ def test_readings_outside_the_frames_are_counted_and_not_extrapolated(results_fo
     warnings = {
         item["code"]: item["message"] for item in json.loads((results_folder / "results.json").read_text())["warnings"]
     }
-    assert warnings["readings_outside_frames"].startswith(f"{int(outside.sum())} readings lie outside the frames' time")
+    assert warnings["readings_outside_frames"].startswith(f"{int(outside.sum())} readings outside the frames' time")
     assert fusion["mean_rise"].where(outside).isnull().all()
 
 
@@ -181,3 +184,19 @@ def test_residuals_lie_at_their_own_reading(results_folder: Path) -> None:
         xr.testing.assert_equal(both, fusion["inside_frames"].astype(bool) & fusion["deviation"].notnull())
     odd = fusion["loop_contribution"].sel(effect="reversal_drift")
     assert float(abs(odd.sel(direction="positive") + odd.sel(direction="negative")).max()) < 0.2 * float(abs(odd).max())
+
+
+def test_the_clock_of_a_camera_that_sees_the_table_move_is_found(tmp_path: Path) -> None:
+    """The camera's clock is 37 s ahead and nobody says so; 0.2 s is a tenth of the dwell at a target."""
+    (tmp_path / "recipe.toml").write_text(
+        "[campaign]\nseed = 3\n[test]\ncycles = 4\ntargets = 7\nspacing_mm = 40\nperiod_s = 200\n"
+        '[camera]\ntable = "moving"\nfile = "seq"\ncolumns = 320\nrows = 240\nfocal_px = 600.0\ndistance_mm = 1900.0\n'
+        "clock_offset_s = 37.0\nstate_clock_offset = false\n"
+    )
+    campaign = simulate_campaign(tmp_path / "recipe.toml", tmp_path / "campaign")
+    campaign.write_text(campaign.read_text().replace('cell_size = "5 mm"', 'cell_size = "20 mm"'))
+    outcome = reduce_thermography(read_source(load_campaign(campaign)), scheduler=None, report=silent)
+    assert outcome.parts["alignment"]["clock_offset_s"]["value"] == pytest.approx(37.0, abs=0.2)
+    place = outcome.dataset["table_position"]
+    assert float(place.max() - place.min()) == pytest.approx(240.0, abs=0.5)
+    assert {"time", "frame_time"} <= set(outcome.dataset.coords)
