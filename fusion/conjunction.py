@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from fusion.attribution import LEVEL
 from fusion.channels import Array
@@ -81,19 +80,17 @@ def agree(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, list[Commo
         raise ConjunctionError("the two campaigns share no drift channel; both need readings at several targets")
     cell = float(np.median(np.diff(first["x"].values)))
     reach = max(1, round(SAME_PLACE_MM / cell))
-    disc = np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1]) <= reach
-    separable = [one.attrs["excitation"] != "warm-up only" for one in (first, second)]
+    separable = any(one.attrs["excitation"] != "warm-up only" for one in (first, second))
     maps, verdicts, found = [], [], []
     for channel in channels:
         sessions = [one.sel(channel=channel) for one in (first, second)]
-        joint_p = np.maximum(*[_nearby_p(one, disc) for one in sessions])
-        consistent = _consistent(*sessions)
-        verdict = np.where((joint_p <= LEVEL) & consistent, ATTRIBUTABLE, NOT_ATTRIBUTABLE)
-        if not any(separable):
-            verdict[:] = NOT_SEPARABLE
+        places = [_strongest_nearby(one, reach) for one in sessions]
+        joint_p = np.maximum(places[0]["p_value"], places[1]["p_value"])
+        verdict = np.where((joint_p <= LEVEL) & _consistent(*places), ATTRIBUTABLE, NOT_ATTRIBUTABLE)
         maps.append(joint_p)
-        verdicts.append(verdict)
-        found.append(_conclude(channel, sessions, joint_p, consistent, any(separable)))
+        verdicts.append(verdict if separable else np.full_like(verdict, NOT_SEPARABLE))
+        limits = (float(sessions[0]["threshold"]), float(sessions[1]["threshold"]))
+        found.append(_conclude(channel, first, places, limits, separable))
     dims = ("channel", "y", "x")
     joined = xr.Dataset(
         {
@@ -109,27 +106,47 @@ def agree(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, list[Commo
     return joined, found
 
 
-def _nearby_p(session: xr.Dataset, disc: Mask) -> Array:
-    """Smallest family-wise p within the same place of every cell, (y, x)."""
-    p_value = np.nan_to_num(session["p_value"].values, nan=1.0)
-    return np.asarray(ndimage.minimum_filter(p_value, footprint=disc, mode="nearest"), float)
+def _strongest_nearby(session: xr.Dataset, reach: int) -> dict[str, Array]:
+    """Quantities of the strongest place within reach (cells) of every cell: p value, statistic, sensitivity, u, lag, each (y, x)."""
+    names = ("statistic", "p_value", "sensitivity", "sensitivity_u", "lag")
+    blank = (-1.0, 1.0, 0.0, np.inf, 0.0)
+    values = {name: np.nan_to_num(session[name].values, nan=none) for name, none in zip(names, blank, strict=True)}
+    rows, columns = values["statistic"].shape
+    padded = {name: np.pad(values[name], reach, constant_values=none) for name, none in zip(names, blank, strict=True)}
+    best = {name: field.copy() for name, field in values.items()}
+    for down in range(-reach, reach + 1):
+        for right in range(-reach, reach + 1):
+            if np.hypot(down, right) > reach:
+                continue
+            part = (slice(reach + down, reach + down + rows), slice(reach + right, reach + right + columns))
+            stronger = padded["statistic"][part] > best["statistic"]
+            for name in names:
+                best[name] = np.where(stronger, padded[name][part], best[name])
+    return best
 
 
-def _consistent(first: xr.Dataset, second: xr.Dataset) -> Mask:
-    """Where both sessions' sensitivities have one sign and agree within their uncertainty, (y, x)."""
-    a, b = first["sensitivity"].values, second["sensitivity"].values
-    u = np.hypot(first["sensitivity_u"].values, second["sensitivity_u"].values)
-    with np.errstate(invalid="ignore"):
-        return np.asarray((a * b > 0) & (np.abs(a - b) <= _DISAGREEMENT * u), bool)
+def _consistent(first: dict[str, Array], second: dict[str, Array]) -> Mask:
+    """Where both sessions' strongest places nearby have sensitivities of one sign that agree within their uncertainty, (y, x)."""
+    a, b = first["sensitivity"], second["sensitivity"]
+    u = np.hypot(first["sensitivity_u"], second["sensitivity_u"])
+    return np.asarray((a * b > 0) & (np.abs(a - b) <= _DISAGREEMENT * u), bool)
 
 
-def _conclude(channel: str, sessions: list[xr.Dataset], joint_p: Array, consistent: Mask, separable: bool) -> Common:
-    weaker = np.minimum(*[np.nan_to_num((one["statistic"] / one["threshold"]).values, nan=-1.0) for one in sessions])
+def _conclude(
+    channel: str,
+    attribution: xr.Dataset,
+    places: list[dict[str, Array]],
+    thresholds: tuple[float, float],
+    separable: bool,
+) -> Common:
+    """Verdict on one channel from the strongest places (per session) near every cell."""
+    joint_p = np.maximum(places[0]["p_value"], places[1]["p_value"])
+    consistent = _consistent(*places)
+    weaker = np.minimum(*[one["statistic"] / limit for one, limit in zip(places, thresholds, strict=True)])
     candidates = (joint_p <= LEVEL) & consistent
     row, column = np.unravel_index(int(np.where(candidates, weaker + 1e6, weaker).argmax()), weaker.shape)
-    at = {"x": column, "y": row}
     p_value = float(joint_p[row, column])
-    sensitivity = (float(sessions[0]["sensitivity"][at]), float(sessions[1]["sensitivity"][at]))
+    sensitivity = (float(places[0]["sensitivity"][row, column]), float(places[1]["sensitivity"][row, column]))
     if not separable:
         verdict, reason = "not separable", "both sessions are one warm-up each: switch the heat sources at random times"
     elif candidates.any():
@@ -142,10 +159,10 @@ def _conclude(channel: str, sessions: list[xr.Dataset], joint_p: Array, consiste
     return Common(
         channel=channel,
         verdict=verdict,
-        x_mm=float(sessions[0]["x"][column]),
-        y_mm=float(sessions[0]["y"][row]),
+        x_mm=float(attribution["x"][column]),
+        y_mm=float(attribution["y"][row]),
         p_value=p_value,
         sensitivity_um_per_K=sensitivity,
-        lag_s=(float(sessions[0]["lag"][at]), float(sessions[1]["lag"][at])),
+        lag_s=(float(places[0]["lag"][row, column]), float(places[1]["lag"][row, column])),
         reason=reason,
     )

@@ -36,10 +36,10 @@ from fusion.explanations import (
 Cause = Literal["structural", "local_temperature", "stick_slip", "step", "undetermined"]
 
 #: Least probability of each cause. tests/fusion/test_diagnosis_thresholds.py sets and checks them on simulated campaigns.
-THRESHOLDS: dict[str, float] = {"structural": 0.4, "local_temperature": 0.8, "stick_slip": 0.5, "step": 0.6}
+THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "stick_slip": 0.4, "step": 0.6}
 #: An effect bound to the approach must explain scatter better than equal scatter in both directions by this much (nats); plain
-#: scatter does so by chance in one case of twenty.
-APPROACH_NATS = 1.7
+#: scatter does so by chance in one case of thirty.
+APPROACH_NATS = 2.0
 #: Level of the bootstrap tests that a lasting cause must pass.
 LEVEL = 0.05
 
@@ -236,7 +236,7 @@ def _support(case: _Case, leading: str) -> list[str]:
             f"(p = {found.p_value:.3f}), held out {found.held_out:+.1f} nats"
         )
     elif leading == "stick_slip":
-        first, second = np.nanstd(residual.values, axis=1)
+        first, second = residual.scatter_um
         sentences.append(f"scatter {first:.2f} um from the positive side, {second:.2f} um from the negative side")
         gain = max(case.memoryless.one_direction, case.memoryless.along_approach) - case.memoryless.both
         sentences.append(f"an effect bound to the approach explains the readings better by {gain:+.1f} nats")
@@ -250,8 +250,8 @@ def _evidence(case: _Case, probability: dict[str, float]) -> dict[str, Any]:
     evidence: dict[str, Any] = {f"probability_{name}": value for name, value in probability.items()}
     evidence |= {
         "scatter_typical_um": case.residual.typical_um,
-        "scatter_positive_um": float(np.nanstd(case.residual.values[0])),
-        "scatter_negative_um": float(np.nanstd(case.residual.values[1])),
+        "scatter_positive_um": case.residual.scatter_um[0],
+        "scatter_negative_um": case.residual.scatter_um[1],
         "serial_p": case.serial_p,
         "approach_gain_nats": max(case.memoryless.one_direction, case.memoryless.along_approach) - case.memoryless.both,
         "step_p": case.step.p_value,

@@ -59,6 +59,13 @@ class Residual:
     typical_um: float
     temperature: tuple[Array, Array] | None
 
+    @property
+    def scatter_um(self) -> tuple[float, float]:
+        """Standard deviation from the positive and from the negative side, NaN where that was not read."""
+        known = [row[np.isfinite(row)] for row in self.values]
+        first, second = (float(row.std()) if row.size else float("nan") for row in known)
+        return first, second
+
 
 @dataclass(frozen=True)
 class Lasting:
@@ -154,7 +161,7 @@ def local_residuals(fused: xr.Dataset, target: int, flagged: set[int]) -> Residu
 def _take_out_passes(deviation: Array, design: Array, sound: NDArray[np.bool_]) -> Array:
     """Deviations (cycle, direction, target) less each target's mean and each pass's level and stretch, by backfitting."""
     seen = np.isfinite(deviation)
-    rest = deviation - np.nanmean(deviation, axis=0)
+    rest = deviation - _known_mean(deviation)
     for _ in range(50):
         passes = np.zeros_like(deviation)
         for index in np.ndindex(deviation.shape[:2]):
@@ -163,18 +170,26 @@ def _take_out_passes(deviation: Array, design: Array, sound: NDArray[np.bool_]) 
                 passes[index] = design @ np.linalg.lstsq(design[used], rest[index][used], rcond=None)[0]
             else:
                 passes[index] = np.nan
-        profile = np.nanmean(rest - passes, axis=0)
+        profile = _known_mean(rest - passes)
         rest = rest - profile
-        if np.nanmax(np.abs(profile)) < 1e-6:
+        if np.abs(profile).max() < 1e-6:
             break
     return rest - passes
+
+
+def _known_mean(values: Array) -> Array:
+    """Mean over the first dim of what is known, 0 where nothing is."""
+    known = np.isfinite(values)
+    return np.asarray(np.where(known, values, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1), float)
 
 
 def _typical_scatter(passes: Array, design: Array, sound: NDArray[np.bool_], place: int) -> float:
     """Scatter (um) that this target would show if it were like the others; what the passes' own fit takes away is given back."""
     normal = np.linalg.inv(design[sound].T @ design[sound])
     kept = 1.0 - np.einsum("ij,jk,ik->i", design[sound], normal, design[sound])
-    others = 1.4826 * np.nanmedian(np.abs(passes[:, :, sound]), axis=0) / np.sqrt(kept)
+    columns = passes[:, :, sound] / np.sqrt(kept)
+    read = np.isfinite(columns).any(axis=0)
+    others = 1.4826 * np.nanmedian(np.abs(columns[:, read]), axis=0)
     return float(np.median(others) * np.sqrt(1.0 + design[place] @ normal @ design[place]))
 
 

@@ -1,0 +1,60 @@
+"""Two campaigns of one machine: only what both show is a cause."""
+
+import numpy as np
+import pytest
+
+from fusion.conjunction import ConjunctionError, agree
+from fusion.correlation import correlate
+from tests.fusion import film_simulator as simulator
+
+
+def maps_of(made):
+    return correlate(made.fused, made.field[:, ::2, ::2], draws=99, checks=1)
+
+
+@pytest.fixture(scope="module")
+def first():
+    return maps_of(simulator.driven_session(np.random.default_rng(8), source=0))
+
+
+def verdict(found, channel="joint"):
+    return next(one for one in found if one.channel == channel)
+
+
+def test_a_source_that_both_sessions_show_is_a_cause(first):
+    second = maps_of(simulator.driven_session(np.random.default_rng(9), source=0))
+    joined, found = agree(first, second)
+    joint = verdict(found)
+    assert joint.verdict == "attributable"
+    assert joint.p_value <= 0.05
+    assert simulator.distance_cells(joint.y_mm / 10 - 0.5, joint.x_mm / 10 - 0.5, 0) <= 7
+    assert (joined["p_value"].sel(channel="joint") <= 0.05).any()
+
+
+def test_what_only_one_session_shows_is_not(first):
+    second = maps_of(simulator.driven_session(np.random.default_rng(9), source=0, um_per_unit=0.0))
+    _, found = agree(first, second)
+    assert {one.verdict for one in found} == {"not attributable"}
+    assert verdict(found).reason == "no place is found by both sessions"
+
+
+def test_opposite_signs_do_not_agree(first):
+    second = maps_of(simulator.driven_session(np.random.default_rng(9), source=0, um_per_unit=-3.0))
+    joint = verdict(agree(first, second)[1])
+    assert joint.verdict == "not attributable"
+    assert joint.sensitivity_um_per_K[0] * joint.sensitivity_um_per_K[1] < 0
+
+
+def test_two_warm_ups_are_not_separable():
+    sessions = [maps_of(simulator.null_session("warm", np.random.default_rng(seed))) for seed in (1, 2)]
+    assert {one.verdict for one in agree(*sessions)[1]} == {"not separable"}
+
+
+def test_other_plans_are_refused(first):
+    with pytest.raises(ConjunctionError, match="the plan grids differ along x"):
+        agree(first, first.isel(x=slice(0, 5)))
+
+
+def test_other_channels_are_refused(first):
+    with pytest.raises(ConjunctionError, match="share no drift channel"):
+        agree(first.sel(channel=["common"]), first.sel(channel=["reversal"]))
