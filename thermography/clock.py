@@ -209,7 +209,7 @@ class _Motion:
         columns = [(self.residual(best + step) - self.residual(best - step)) / (2 * step.sum()) for step in steps]
         jacobian = np.nan_to_num(np.stack(columns, axis=-1))
         residual = np.nan_to_num(self.residual(best))
-        variance = float(residual @ residual) / max(np.count_nonzero(residual) - len(steps), 1)
+        variance = float(residual @ residual) / max(int(np.count_nonzero(residual)) - len(steps), 1)
         u = np.zeros(4)
         u[self.free] = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * variance)
         return u
