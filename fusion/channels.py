@@ -182,26 +182,27 @@ def reduce_channels(readings: ClockedReadings) -> list[DriftSeries]:
     return series
 
 
-def target_series(readings: ClockedReadings) -> list[DriftSeries]:
-    """Return one series per direction and target with at least 12 readings, each at its own times."""
-    series = []
-    for column in range(readings.deviation.shape[1]):
-        rows = np.flatnonzero(np.isfinite(readings.deviation[:, column]))
-        if rows.size < MIN_CYCLES:
-            continue
-        direction, target = divmod(column, readings.targets.size)
-        seconds = readings.seconds[rows, column]
-        series.append(
-            DriftSeries(
-                name=f"{readings.directions[direction]} {readings.targets[target]}",
-                values=readings.deviation[rows, column] - readings.deviation[rows, column].mean(),
-                variance=np.ones(rows.size),
-                seconds=seconds,
-                cycle=readings.cycle[rows],
-                sampling=_sample(seconds[:, None], np.ones((rows.size, 1)), readings.frame_seconds),
-            )
+def target_table(readings: ClockedReadings) -> tuple[list[str], Array, Array, Array]:
+    """Every direction and target with at least 12 readings as a row over the cycles' mean instants.
+
+    Returns
+    -------
+    names, values (series, cycle) in um with NaN where missing, seconds (cycle,), sampling (cycle, frames)
+    """
+    seen = np.isfinite(readings.deviation)
+    kept = np.flatnonzero(seen.any(axis=1))
+    columns = np.flatnonzero(seen.sum(axis=0) >= MIN_CYCLES)
+    if not columns.size:
+        raise ChannelError(
+            f"no target has readings in {MIN_CYCLES} cycles inside the film; measure more cycles, or check the clock offset"
         )
-    return series
+    seconds = np.nanmean(readings.seconds[kept], axis=1)
+    names = [
+        f"{readings.directions[column // readings.targets.size]} {readings.targets[column % readings.targets.size]}"
+        for column in columns
+    ]
+    sampling = _sample(seconds[:, None], np.ones((seconds.size, 1)), readings.frame_seconds)
+    return names, readings.deviation[np.ix_(kept, columns)].T, seconds, sampling
 
 
 def _sample(seconds: Array, weights: Array, frame_seconds: Array) -> Array:

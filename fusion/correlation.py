@@ -21,8 +21,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.attribution import LAGS_S, LEVEL, Film, Tested, evaluate_film
-from fusion.channels import Array, ClockedReadings, DriftSeries, read_clock, reduce_channels, target_series
+from fusion.channels import Array, ClockedReadings, DriftSeries, read_clock, reduce_channels, target_table
 from fusion.excitation import Excitation, describe_excitation
+from fusion.screening import screen
 
 #: Verdict codes of the maps, in the order of the CF flag meanings.
 NOT_ATTRIBUTABLE, ATTRIBUTABLE, NOT_SEPARABLE = 0, 1, 2
@@ -61,7 +62,7 @@ def correlate(
     checks : int
         Fresh nulls on which the rate of false alarms of this threshold is measured.
     per_target : bool
-        Also test every target and direction by itself (16 times the work for 16 targets).
+        Also screen every target and direction by itself (``target_*`` maps along ``series``), whitening fixed under the null.
     seed : int
         Seed of the redrawn series.
     progress : callable, optional
@@ -245,10 +246,27 @@ def _correlate_targets(
     seed: int,
 ) -> xr.Dataset:
     """Maps of every target and direction by itself, family-wise over all of them, named ``target_*`` along ``series``."""
-    series = target_series(readings)
-    tested = evaluate_film(series, film, excitation, lags_s=lags_s, draws=draws, rng=np.random.default_rng(seed + 1))
-    maps = _lay_out(tested, series, film, seen, field, lags_s, excitation)
-    kept = ["statistic", "p_value", "sensitivity", "sensitivity_u", "lag", "detectable_sensitivity", "verdict"]
-    renamed = maps[kept].rename({"channel": "series"} | {name: f"target_{name}" for name in kept})
-    renamed.attrs.clear()
-    return renamed
+    names, values, seconds, sampling = target_table(readings)
+    found = screen(
+        values,
+        seconds,
+        sampling,
+        film,
+        excitation,
+        lags_s=lags_s,
+        permutations=draws,
+        rng=np.random.default_rng(seed + 1),
+    )
+    maps = {
+        "statistic": (found.statistic, {"units": "1", "long_name": "likelihood ratio, whitening fixed under the null"}),
+        "p_value": (found.p_value, {"units": "1", "long_name": "family-wise p value over all series"}),
+        "sensitivity": (found.sensitivity, {"units": "um/K"}),
+        "sensitivity_u": (found.sensitivity_u, {"units": "um/K"}),
+        "lag": (np.asarray(lags_s, float)[found.lag_index], {"units": "s"}),
+    }
+    dataset = xr.Dataset(coords={"series": names, "y": field["y"], "x": field["x"]})
+    for name, (columns, attrs) in maps.items():
+        whole = np.full((len(names), seen.size), np.nan)
+        whole[:, seen] = columns
+        dataset[f"target_{name}"] = (("series", "y", "x"), whole.reshape(-1, *field.shape[1:]), attrs)
+    return dataset

@@ -23,6 +23,8 @@ from fusion.excitation import Excitation
 #: Columns of one tile; its whitened films and the products of a thousand permutations stay in the second-level cache.
 _TILE = 512
 _ROWS = 256
+#: Relative variance of a value that is missing.
+_NO_WEIGHT = 1e8
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ def screen(
 
     Parameters
     ----------
-    values : (series, n) um, complete
+    values : (series, n) um, NaN where missing
     seconds : (n,) instants that all series share, s
     sampling : (n, frames) weights that turn the film into the temperatures at these instants
     film, excitation, lags_s, progress : as for :func:`fusion.attribution.evaluate_film`
@@ -81,16 +83,20 @@ def screen(
         Orders of the whitened residuals, the same for all series so that what they share is kept; 0 gives no p values.
     """
     nuisance = nuisance_columns(seconds, excitation)
-    ones = np.ones(seconds.size)
-    banks = [null_bank(row, seconds, ones, nuisance) for row in values]
-    groups: dict[int, list[int]] = {}
+    seen = np.isfinite(values)
+    # A missing value gets a variance that leaves it without weight, so that all series keep the same instants.
+    variance = np.where(seen, 1.0, _NO_WEIGHT)
+    values = np.where(seen, values, np.nanmean(values, axis=1, keepdims=True))
+    banks = [null_bank(row, seconds, own, nuisance) for row, own in zip(values, variance, strict=True)]
+    groups: dict[tuple[int, bytes], list[int]] = {}
     for k, bank in enumerate(banks):
-        groups.setdefault(bank.best, []).append(k)
+        groups.setdefault((bank.best, seen[k].tobytes()), []).append(k)
     orders = np.argsort(rng.random((permutations, seconds.size)), axis=1)
     operators = [sampling @ operator for operator in lag_operators(film.seconds, lags_s)]
     tasks = [_Group.build(banks, members, orders, operators) for members in groups.values()]
     columns = film.values.shape[1]
-    result = _Result(len(values), columns, permutations)
+    freedom = seen.sum(axis=1) - nuisance.shape[1]
+    result = _Result(freedom, columns, permutations)
     film32 = film.values.astype(np.float32, copy=False)
     for start in range(0, columns, _TILE):
         tile = slice(start, min(start + _TILE, columns))
@@ -98,7 +104,7 @@ def screen(
             task.test(np.ascontiguousarray(film32[:, tile]), tile, result)
         if progress is not None:
             progress(tile.stop / columns)
-    return result.finish(banks, permutations)
+    return result.finish(tasks)
 
 
 @dataclass(frozen=True)
@@ -156,7 +162,9 @@ class _Group:
 class _Result:
     """Running best lag and maxima, as squared correlations of whitened series."""
 
-    def __init__(self, series: int, columns: int, permutations: int) -> None:
+    def __init__(self, freedom: NDArray[np.int64], columns: int, permutations: int) -> None:
+        series = freedom.size
+        self.freedom = freedom
         self.share = np.zeros((series, columns), np.float32)
         self.lag = np.zeros((series, columns), np.int8)
         self.coefficient = np.zeros((series, columns), np.float32)
@@ -184,25 +192,28 @@ class _Result:
             self.coefficient[k, tile] = np.where(better, coefficient, self.coefficient[k, tile])
             self.weight[k, tile] = np.where(better, weight, self.weight[k, tile])
 
-    def finish(self, banks: Sequence[NullBank], permutations: int) -> Screening:
+    def finish(self, groups: Sequence[_Group]) -> Screening:
         """Turn shares into likelihood ratios, and compare with the maxima over all series."""
-        freedom = banks[0].freedom
-        statistic = -freedom * np.log1p(-np.minimum(self.share, np.float32(1.0 - 1e-6)))
-        groups: dict[int, list[int]] = {}
-        for k, bank in enumerate(banks):
-            groups.setdefault(bank.best, []).append(k)
-        maxima = np.zeros((permutations, len(banks)))
-        for members in groups.values():
-            if permutations:
-                maxima[:, members] = self._maxima[members[0]].reshape(len(members), permutations).T
-        maxima = -freedom * np.log1p(-np.minimum(maxima, 1.0 - 1e-6))
+        statistic = _log_ratio(self.share, self.freedom[:, None])
+        shares = np.zeros((self._permutations, self.freedom.size))
+        size = np.zeros(self.freedom.size)
+        for group in groups:
+            size[group.members] = group.size
+            if self._permutations:
+                largest = self.maxima_of(group.members).reshape(group.members.size, self._permutations)
+                shares[:, group.members] = largest.T
+        maxima = _log_ratio(shares, self.freedom[None, :])
         p_value = np.full(statistic.shape, np.nan, np.float32)
-        if permutations:
+        if self._permutations:
             ordered = np.sort(maxima.max(axis=1))
-            above = permutations - np.searchsorted(ordered, statistic, side="left")
-            p_value = ((above + 1) / (permutations + 1)).astype(np.float32)
-        size = np.array([np.sqrt(((bank.fitted.project @ bank.values) ** 2).sum()) for bank in banks])
-        left = np.sqrt((1.0 - self.share) / (freedom - 1)) * size[:, None]
+            above = self._permutations - np.searchsorted(ordered, statistic, side="left")
+            p_value = ((above + 1) / (self._permutations + 1)).astype(np.float32)
+        left = np.sqrt((1.0 - self.share) * self.weight / (self.freedom - 1)[:, None]) * size[:, None]
         return Screening(
-            statistic, self.lag, self.coefficient, (left * np.sqrt(self.weight)).astype(np.float32), maxima, p_value
+            statistic.astype(np.float32), self.lag, self.coefficient, left.astype(np.float32), maxima, p_value
         )
+
+
+def _log_ratio(share: Array | Array32, freedom: NDArray[np.int64]) -> Array:
+    """Likelihood ratios of shares of explained squares; a share of 1 is held below by the products' precision."""
+    return np.asarray(-freedom * np.log1p(-np.minimum(share, 1.0 - 1e-6)), float)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fusion.channels import ChannelError, lag_operators, read_clock, reduce_channels, respond, target_series
+from fusion.channels import ChannelError, lag_operators, read_clock, reduce_channels, respond, target_table
 from tests.fusion import film_simulator as simulator
 
 
@@ -65,10 +65,11 @@ def test_a_channel_sees_the_film_at_its_own_instants(rng):
     made, _ = known_session(rng)
     readings = read_clock(made.fused, made.field["time"].values)
     ramp = readings.frame_seconds / 3600.0
-    for one in [*reduce_channels(readings), *target_series(readings)]:
+    _, _, seconds, sampling = target_table(readings)
+    for instants, weights in [*((one.seconds, one.sampling) for one in reduce_channels(readings)), (seconds, sampling)]:
         # Inside the film a linear course is sampled exactly at the readings' mean time.
         inner = slice(1, -1)
-        np.testing.assert_allclose((one.sampling @ ramp)[inner], one.seconds[inner] / 3600.0, atol=1e-9)
+        np.testing.assert_allclose((weights @ ramp)[inner], instants[inner] / 3600.0, atol=1e-9)
 
 
 def test_readings_far_from_every_frame_are_counted_not_used(rng):
@@ -100,3 +101,10 @@ def test_too_few_cycles_are_refused(rng):
     made, _ = known_session(rng)
     with pytest.raises(ChannelError, match=r"only 8 of 8 cycles hold enough readings inside the film"):
         reduce_channels(read_clock(made.fused.isel(cycle=slice(0, 8)), made.field["time"].values))
+
+
+def test_targets_without_readings_are_refused(rng):
+    made, _ = known_session(rng)
+    empty = made.fused.assign(deviation=made.fused["deviation"] * np.nan)
+    with pytest.raises(ChannelError, match="no target has readings in 12 cycles inside the film"):
+        target_table(read_clock(empty, made.field["time"].values))

@@ -83,3 +83,18 @@ def test_an_effect_is_found_by_the_screen(rng):
     assert int(found.statistic[1].argmax()) == 17
     assert float(found.sensitivity[1, 17]) == pytest.approx(0.8, abs=4 * float(found.sensitivity_u[1, 17]))
     assert seen[-1] == 1.0
+
+
+def test_a_missing_value_has_no_weight(problem):
+    values, film = problem
+    holes = values.copy()
+    holes[2, 20] = np.nan
+    far = values.copy()
+    far[2, 20] += 50.0
+    run = {"permutations": 0, "rng": np.random.default_rng(0)}
+    clean = screen(values, SECONDS, np.eye(60), film, VARIED, **run)
+    holed = screen(holes, SECONDS, np.eye(60), film, VARIED, **run)
+    spoilt = screen(far, SECONDS, np.eye(60), film, VARIED, **run)
+    np.testing.assert_allclose(holed.statistic[[0, 1, 3, 4]], clean.statistic[[0, 1, 3, 4]], rtol=1e-4, atol=1e-4)
+    left_out = np.abs(holed.statistic[2] - clean.statistic[2]).mean()
+    assert left_out < 0.3 * np.abs(spoilt.statistic[2] - clean.statistic[2]).mean()
