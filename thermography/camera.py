@@ -202,8 +202,8 @@ def anchored(
 ) -> Callable[[FrameHeader], CameraParameters]:
     """Return a function from frames to parameters that takes the steps out while calibrating.
 
-    A flat-field correction shifts the counts of the detector, which is what Planck O is: the step is exact at `at_degC` and within
-    3 % for surfaces up to 10 K away.
+    A flat-field correction shifts the counts of the detector, which is what Planck O is. In kelvin the shift is the step itself at
+    `at_degC`, and 1 % less for each kelvin that a surface is warmer.
 
     Parameters
     ----------

@@ -223,7 +223,15 @@ def _walk_sequence(file: BinaryIO, path: Path) -> Iterator[FrameReference | Reje
             yield Rejected(path, index, str(error))
             end = following = _find_header(file, start + HEADER_SIZE, size)
         notes = (f"{following - end} bytes of padding before the frame were stepped over",) if following > end else ()
+        if end < following == size and _holds_data(file, end):
+            text = f"{path}: at 0x{end:X}: expected a frame or padding, found {size - end} bytes that are neither"
+            yield Rejected(path, index + 1, text)
         start, index = following, index + 1
+
+
+def _holds_data(file: BinaryIO, offset: int) -> bool:
+    file.seek(offset)
+    return any(file.read(1 << 16))
 
 
 def _next_frame(file: BinaryIO, start: int, size: int, directory: Directory) -> tuple[int, int]:
@@ -267,6 +275,7 @@ def _jpeg_segments(file: BinaryIO, path: Path) -> Segments:
     Each APP1 segment holds `FLIR\0 01 index last` and up to 65524 bytes; the segments may come in any order.
     """
     pieces: dict[int, tuple[int, int]] = {}
+    size = file.seek(0, os.SEEK_END)
     last, offset = -1, 2
     while True:
         file.seek(offset)
@@ -280,7 +289,7 @@ def _jpeg_segments(file: BinaryIO, path: Path) -> Segments:
         if head[1] == 0xE1 and head[4:10] == b"FLIR\0\1" and length >= 10 and len(head) == 12:
             if head[10] in pieces:
                 raise FlirFormatError(f"{path}: at 0x{offset:X}: expected FLIR segment {head[10]} once, found it again")
-            pieces[head[10]] = (offset + 12, length - 10)
+            pieces[head[10]] = (offset + 12, min(length - 10, size - offset - 12))
             last = head[11]
         offset += 2 + max(length, 2)
     missing = [index for index in range(last + 1) if index not in pieces]
