@@ -1,4 +1,4 @@
-"""around - The command: run, simulate, inspect, iso230, schema, export. Bad input ends with one paragraph and exit code 2."""
+"""around - The command: run, simulate, inspect, iso230, schema, export, plan. Bad input ends with one paragraph and exit code 2."""
 
 from __future__ import annotations
 
@@ -171,6 +171,28 @@ def export(
     with _answering():
         for path in export_results(results, format.value, out or results / "export"):
             console.print(str(path), soft_wrap=True, highlight=False)
+
+
+@app.command()
+def plan(
+    source: Annotated[
+        list[str], typer.Option(metavar="NAME=TIME", help="A heat source that can be switched, with its time constant.")
+    ],
+    effect: Annotated[str, typer.Option(help="Smallest drift that one source should be found at.")] = "1 um",
+    drift: Annotated[
+        str, typer.Option(help="Random walk of the axis in one hour (the report's unexplained drift).")
+    ] = "0.4 um",
+    noise: Annotated[str, typer.Option(help="Noise of one cycle's mean.")] = "0.1 um",
+    cycle: Annotated[str, typer.Option(help="Length of one cycle.")] = "252 s",
+    power: Annotated[float, typer.Option(min=0.1, max=0.99, help="Wanted chance to name the weakest source.")] = 0.8,
+    seed: Annotated[int, typer.Option(help="Another seed is another, equally valid schedule.")] = 0,
+) -> None:
+    """Propose a random duty schedule for a new test: which switching tells the heat sources apart, in how much time."""
+    from fusion.summary import duty_lines
+
+    with _answering():
+        for line in duty_lines(source, effect=effect, drift=drift, noise=noise, cycle=cycle, power=power, seed=seed):
+            console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 def main() -> None:

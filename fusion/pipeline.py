@@ -19,7 +19,7 @@ from fusion.progress import Report, silent
 from fusion.provenance import describe_run, hash_inputs, versions
 from fusion.report import render_report
 from fusion.results import Notice, assemble
-from fusion.sources import read_source
+from fusion.sources import SourceError, read_source
 
 #: Where each stage keeps its Dataset; what ends up in fusion.nc is kept apart while it may have to be resumed.
 FILES = {
@@ -113,6 +113,11 @@ def run_campaign(
     """
     campaign = load_campaign(path, effect_names=stages.effect_names())
     folder = Path(out)
+    if campaign.record is not None:
+        raise SourceError(
+            f"{campaign.path}: a [record] is checked but not analysed by this version; its columns can be read with "
+            "fusion.tables.read_record"
+        )
     source = read_source(campaign)
     open_folder(folder, resume=resume)
     started = datetime.now(UTC)

@@ -112,23 +112,23 @@ def plot_cells(maps: xr.Dataset, name: str, channel: str, *, label: str, ax: Axe
     return ax
 
 
+def _stages(loop: xr.Dataset) -> list[tuple[str, str, str]]:
+    """Return variable, colour and label of the residuals to draw: before and after, or one of them where nothing was added."""
+    before, after = loop["residual_declared"], loop["residual_final"]
+    if np.allclose(before, after, atol=1e-9, equal_nan=True):
+        return [("residual_final", COLOURS["positive"], "declared model, nothing added")]
+    return [("residual_declared", BEFORE, "declared model"), ("residual_final", COLOURS["positive"], "after the loop")]
+
+
 def plot_residual_time(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the residual over time before and after the loop: every reading as a dot, the mean per cycle as a line."""
     ax = new_axes(ax)
     hours = hours_since_start(deviations)
-    for name, colour, text, size in (
-        ("residual_declared", BEFORE, "declared model", 1.4),
-        ("residual_final", COLOURS["positive"], "after the loop", 1.4),
-    ):
+    for name, colour, text in _stages(loop):
         residual = loop[name]
-        ax.plot(hours.values.ravel(), residual.values.ravel(), ".", color=colour, markersize=size, alpha=0.5)
-        ax.plot(
-            hours.mean(["direction", "target"]),
-            residual.mean(["direction", "target"]),
-            color=colour,
-            linewidth=1.8,
-            label=text,
-        )
+        ax.plot(hours.values.ravel(), residual.values.ravel(), ".", color=colour, markersize=1.4, alpha=0.5)
+        middle = residual.mean(["direction", "target"])
+        ax.plot(hours.mean(["direction", "target"]), middle, color=colour, linewidth=1.8, label=text)
     ax.axhline(0.0, color=MUTED, linewidth=0.8)
     ax.set(xlabel="time since first reading / h", ylabel="residual / µm")
     ax.legend()
@@ -142,13 +142,13 @@ def plot_residual_position(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes
     """
     ax = new_axes(ax)
     half = loop.sizes["cycle"] // 2
-    for name, solid in (("residual_declared", False), ("residual_final", True)):
+    for name, _, text in _stages(loop):
+        after = name == "residual_final"
         change = loop[name][half:].mean("cycle") - loop[name][:half].mean("cycle")
         for direction in loop["direction"].values:
             ax.plot(
-                deviations["position"], change.sel(direction=direction), MARKERS[direction], linestyle="-" if solid else ":",
-                color=COLOURS[direction] if solid else BEFORE,
-                label=f"{ARROWS[direction]}, {'after' if solid else 'before'}",
+                deviations["position"], change.sel(direction=direction), MARKERS[direction], linestyle="-" if after else ":",
+                color=COLOURS[direction] if after else BEFORE, label=f"{ARROWS[direction]}, {text}",
             )  # fmt: skip
     ax.axhline(0.0, color=MUTED, linewidth=0.8)
     ax.set(xlabel="position / mm", ylabel="residual, second minus first half / µm")
@@ -160,10 +160,7 @@ def plot_residual_direction(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axe
     """Plot half the difference of the residuals of both approaches over time, before and after the loop."""
     ax = new_axes(ax)
     hours = hours_since_start(deviations).mean(["direction", "target"])
-    for name, colour, text in (
-        ("residual_declared", BEFORE, "declared model"),
-        ("residual_final", COLOURS["positive"], "after the loop"),
-    ):
+    for name, colour, text in _stages(loop):
         odd = (loop[name].sel(direction="positive") - loop[name].sel(direction="negative")).mean("target") / 2
         ax.plot(hours, odd, color=colour, label=text)
     ax.axhline(0.0, color=MUTED, linewidth=0.8)
@@ -179,9 +176,12 @@ def plot_contributions(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | N
     at: dict[str, Any] = {"target": far, "direction": "positive"}
     hours = hours_since_start(deviations).sel(at)
     colours = (INK, ACCENT, COLOURS["positive"], COLOURS["negative"])
+    measured = np.isfinite(hours.values)
     for place, effect in enumerate(loop["effect"].values):
         style: dict[str, Any] = {"linestyle": ("-", "--", "-.", ":")[place % 4], "color": colours[place % 4]}
-        ax.plot(hours, loop["contribution"].sel(effect=effect, **at), label=str(effect).replace("_", " "), **style)
+        line = loop["contribution"].sel(effect=effect, **at).values
+        seen = measured & np.isfinite(line)
+        ax.plot(hours.values[seen], line[seen], label=str(effect).replace("_", " "), **style)
     ax.set(xlabel="time since first reading / h", ylabel=f"contribution at position {far} / µm")
     ax.legend()
     return ax

@@ -106,10 +106,10 @@ def describe_candidates(loop: Mapping[str, Any]) -> dict[str, Any] | None:
                     str(turn),
                     wording.effect_name(score["effect"]),
                     parameters(score["parameters"]),
-                    number(score["gain"], 3),
-                    number(score["excess_gain"], 3),
+                    f"{score['gain']:.1f}".replace("-", "−"),
+                    f"{score['excess_gain']:.1f}".replace("-", "−"),
                     wording.p_value(score["family_wise_p"]),
-                    number(score["held_out_gain"], 3),
+                    f"{score['held_out_gain']:.1f}".replace("-", "−"),
                     wording.p_value(score["held_out_p"]),
                 ]
             )

@@ -16,7 +16,7 @@ from fusion.config import Campaign, InterferometryTable, PlanTable, Thermography
 from fusion.contracts import check
 from fusion.preflight import check_clocks
 from fusion.results import Notice
-from fusion.tables import read_drivers, read_record
+from fusion.tables import read_drivers
 from interferometry.contract import DEVIATIONS
 from interferometry.readers import read_deviations, read_environment
 from thermography.flir import FrameReference, index_frames
@@ -97,12 +97,6 @@ def read_source(campaign: Campaign) -> Source:
     )  # fmt: skip
     source.notices.extend(_notices(source))
     return source
-
-
-def read_record_source(campaign: Campaign) -> tuple[xr.Dataset, list[Notice]]:
-    """Read a record, and note the rows left out."""
-    record = read_record(campaign)
-    return record, left_out_notices(record, "record_rows_left_out")
 
 
 def _notices(source: Source) -> list[Notice]:

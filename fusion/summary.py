@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ from rich.table import Table
 
 from fusion import wording
 from fusion.config import CampaignError
+from fusion.duty_plan import DutyPlanError, Machine, plan_duty, switchings
+from fusion.quantities import read_quantity
 from interferometry import iso230
 from interferometry.readers import read_deviations
 
@@ -116,6 +118,49 @@ def _position_table(deviations: xr.Dataset, result: xr.Dataset) -> Table:
         position = float(deviations["position"].sel(target=target))
         table.add_row(str(target), f"{position:g}", *(wording.number(float(value)) for value in values))
     return table
+
+
+def duty_lines(
+    sources: Sequence[str], *, effect: str, drift: str, noise: str, cycle: str, power: float, seed: int
+) -> list[str]:
+    """Propose a duty schedule and return it as lines: how long, with what power, and when to switch what.
+
+    Raises
+    ------
+    QuantityError, DutyPlanError
+        If a quantity has no unit, a source no time constant, or no schedule is possible.
+    """
+    named = [_source(text) for text in sources]
+    machine = Machine(
+        sources=tuple(name for name, _ in named),
+        time_constants_s=tuple(seconds for _, seconds in named),
+        effect_um=read_quantity(effect, "um"),
+        drift_um_per_sqrt_h=read_quantity(drift, "um"),
+        noise_um=read_quantity(noise, "um"),
+        cycle_s=read_quantity(cycle, "s"),
+    )
+    proposed = plan_duty(machine, power=power, seed=seed)
+    reached = float(proposed["power"].sel(hours=float(proposed["test_hours"])).max())
+    enough = (
+        ""
+        if proposed.attrs["enough"]
+        else f"; no test of up to {float(proposed['hours'].max()):g} h reaches {power:.0%}"
+    )
+    lines = [
+        f"test of {float(proposed['test_hours']):g} h, mean dwell {wording.duration(float(proposed['mean_dwell']))}: "
+        f"chance to name the weakest source {reached:.0%}{enough}",
+        "minute  source  state",
+    ]
+    return lines + [f"{minute:6.0f}  {name}  {state}" for minute, name, state in switchings(proposed)]
+
+
+def _source(text: str) -> tuple[str, float]:
+    name, found, seconds = text.partition("=")
+    if not found or not name.strip():
+        raise DutyPlanError(
+            f'--source "{text}" is no source; write its name and time constant, for example "spindle=40 min"'
+        )
+    return name.strip(), read_quantity(seconds, "s")
 
 
 def read_window(text: str, deviations: xr.Dataset) -> list[int]:

@@ -98,6 +98,10 @@ CAUSES: dict[str, tuple[str, str]] = {
 }
 
 
+#: How the remedy of a warning starts that asks for no action.
+NOTHING_TO_DO = "Nothing has to be done"
+
+
 def number(value: float | None, digits: int = 3) -> str:
     """Return a number with significant digits and a true minus sign, or a dash where there is none."""
     if value is None or not math.isfinite(value):
@@ -180,15 +184,14 @@ def verdict_numbers(loop: Mapping[str, Any]) -> str:
 
 def next_steps(results: Mapping[str, Any]) -> list[str]:
     """Return what to do next: first what the loop found, then the anomalies, then the warnings' remedies."""
-    steps = [
-        EFFECTS[step["effect"]][1] for step in results.get("loop", {}).get("steps", []) if step["effect"] in EFFECTS
-    ]
-    for anomaly in results.get("anomalies", []):
-        steps.append(f"Position {anomaly['target']}: {CAUSES[anomaly['cause']][1]}")
-    steps += [warning["remedy"] for warning in results["warnings"]]
-    if results.get("loop", {}).get("verdict") in {"partial", "unexplained"}:
+    loop = results.get("loop") or {"steps": [], "verdict": "complete"}
+    steps = [EFFECTS[step["effect"]][1] for step in loop["steps"] if step["effect"] in EFFECTS]
+    if loop["verdict"] in {"partial", "unexplained"}:
         steps.append(
-            "Log more of what happens at the machine (duty, coolant, doors, air) during the next test: what is left has no name yet."
+            "Log more of what happens at the machine (duty, coolant, doors, air) in the next test: what is left has no name."
         )
+    for anomaly in results.get("anomalies") or []:
+        steps.append(f"Position {anomaly['target']}: {CAUSES[anomaly['cause']][1]}")
+    steps += [warning["remedy"] for warning in results["warnings"] if not warning["remedy"].startswith(NOTHING_TO_DO)]
     unique = list(dict.fromkeys(step for step in steps if step))
-    return unique or ["Nothing has to be done: use the profile and its uncertainty as they are."]
+    return unique or [f"{NOTHING_TO_DO}: use the profile and its uncertainty as they are."]

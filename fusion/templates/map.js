@@ -78,3 +78,4 @@ function drawMap(root) {
   draw();
 }
 document.querySelectorAll(".map").forEach(drawMap);
+window.addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((part) => { part.open = true; }));

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import tomllib
 from pathlib import Path
@@ -111,6 +112,32 @@ def test_iso230_evaluates_a_window(campaign_folder: Path) -> None:
     ):
         refused = invoke("iso230", campaign_folder / "laser.csv", "--cycles", bad)
         assert (refused.exit_code, refused.stderr) == (2, message)
+
+
+def test_plan_proposes_a_schedule_and_refuses_half_a_source() -> None:
+    result = invoke("plan", "--source", "spindle=40 min", "--source", "drive=15 min", "--effect", "3 um")
+    assert result.exit_code == 0, result.output
+    head, _, *rows = result.output.splitlines()
+    assert re.match(r"test of [\d.]+ h, mean dwell \d+ min: chance to name the weakest source \d+%", head)
+    assert {row.split()[1] for row in rows} == {"spindle", "drive"}
+    assert {row.split()[2] for row in rows} == {"on", "off"}
+    for bad, message in (
+        ("spindle", '--source "spindle" is no source; write its name and time constant, for example "spindle=40 min"'),
+        ("spindle=40", 'a time needs its unit in the value; write for example "37 s"'),
+    ):
+        refused = invoke("plan", "--source", bad)
+        assert (refused.exit_code, refused.stderr) == (2, f"thermofuse: {message}\n")
+
+
+def test_a_record_is_refused_with_its_reason(tmp_path: Path) -> None:
+    (tmp_path / "record.csv").write_text("time [s],t1 [degC],ch1 [um]\n0,20,0\n")
+    (tmp_path / "record.toml").write_text(
+        '[campaign]\ntitle = "R"\n[record]\nfile = "record.csv"\ntime = "time [s]"\ntemperatures = ["t*"]\ndisplacements = ["ch*"]\n'
+    )
+    result = invoke("run", tmp_path / "record.toml", "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert "a [record] is checked but not analysed by this version" in result.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_two_campaigns_get_a_folder_each() -> None:
