@@ -69,6 +69,25 @@ class CalibratedRange:
 
 
 @dataclass(frozen=True)
+class CameraSettings:
+    """How the camera was set: focus, frame rate, the temperatures (K) and counts between which it showed its picture.
+
+    0 where the file does not say.
+    """
+
+    focus_distance_m: float = 0.0
+    frame_rate_Hz: float = 0.0
+    clip_maximum_K: float = 0.0
+    clip_minimum_K: float = 0.0
+    warn_maximum_K: float = 0.0
+    warn_minimum_K: float = 0.0
+    saturated_maximum_K: float = 0.0
+    saturated_minimum_K: float = 0.0
+    raw_median: int = 0
+    raw_range: int = 0
+
+
+@dataclass(frozen=True)
 class Samples:
     """Where the pixels of one record are: `offset` and `length` in bytes from the start of the FFF record."""
 
@@ -92,8 +111,10 @@ class FrameHeader:
         Local time minus UTC as set in the camera, minutes.
     camera : CameraIdentity
     limits : CalibratedRange
+    settings : CameraSettings
     housekeeping : dict of str to float
-        The camera's own temperatures by name, K (lens, shutter, aperture, capsule, detector).
+        The camera's own temperatures by name, K (lens, shutter, aperture, capsule, detector); "sensor 1" to "sensor 4" in files
+        that do not name them.
     notes : tuple of str
         What the reader had to mend or assume.
     """
@@ -103,6 +124,7 @@ class FrameHeader:
     utc_offset_minutes: int = 0
     camera: CameraIdentity = CameraIdentity()
     limits: CalibratedRange = CalibratedRange()
+    settings: CameraSettings = CameraSettings()
     housekeeping: dict[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 

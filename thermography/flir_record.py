@@ -21,6 +21,7 @@ from thermography.flir_frame import (
     CalibratedRange,
     CameraIdentity,
     CameraParameters,
+    CameraSettings,
     FlirFormatError,
     FrameHeader,
     Segments,
@@ -190,6 +191,8 @@ def read_header(source: FffSource, directory: Directory) -> tuple[FrameHeader, b
     parameters, notes = _parameters(order, info[0x20:0x40] + info[0x58:0x64] + info[0x70:0x84] + info[0x308:0x310])
     time, utc_offset = _time(order, info)
     limits = _limits(order, info[0x90:0x98] + info[0x310:0x314])
+    whole = info.ljust(0x47C, b"\0")
+    settings = _settings(order, whole[0x98:0xB0] + whole[0x338:0x340] + whole[0x45C:0x466])
     camera = _identity(order, info[0xD4:0x1B8])
     housekeeping = _housekeeping(order, info)
     header = FrameHeader(
@@ -198,6 +201,7 @@ def read_header(source: FffSource, directory: Directory) -> tuple[FrameHeader, b
         utc_offset_minutes=utc_offset,
         camera=camera,
         limits=limits,
+        settings=settings,
         housekeeping=housekeeping,
         notes=notes,
     )
@@ -224,6 +228,12 @@ def _parameters(order: str, data: bytes) -> tuple[CameraParameters, tuple[str, .
 def _limits(order: str, data: bytes) -> CalibratedRange:
     maximum, minimum, raw_minimum, raw_maximum = struct.unpack(order + "2f2H", data)
     return CalibratedRange(minimum, maximum, raw_minimum, raw_maximum)
+
+
+@lru_cache(maxsize=256)
+def _settings(order: str, data: bytes) -> CameraSettings:
+    *temperatures, raw_median, raw_range, focus, frame_rate = struct.unpack(order + "6f2If4xH", data)
+    return CameraSettings(*[focus, frame_rate, *temperatures, raw_median, raw_range])
 
 
 @lru_cache(maxsize=256)
@@ -255,14 +265,21 @@ def _time(order: str, info: bytes) -> tuple[np.datetime64, int]:
     return np.datetime64(seconds * 1000 + milliseconds % 1000, "ms"), -west
 
 
+#: Between these a number in the housekeeping table is a temperature of a camera.
+_LOWEST_K, _HIGHEST_K = 150.0, 450.0
+
+
 def _housekeeping(order: str, info: bytes) -> dict[str, float]:
-    """Return the named camera temperatures, K; raw readings and times in the same table are not temperatures."""
+    """Return the camera's own temperatures, K; raw readings and times in the same table are not temperatures."""
     readings: dict[str, float] = {}
     for at in range(0x47C, len(info) - 27, 28):
         name = info[at + 4 : at + 20].split(b"\0")[0]
         if not name or not name.isascii():
             break
         (value,) = struct.unpack_from(order + "f", info, at)
-        if 150 < value < 450 and name != b"ITimeUs":
+        if _LOWEST_K < value < _HIGHEST_K and name != b"ITimeUs":
             readings[name.decode()] = value
+    if not readings and len(info) >= 0x3A4:
+        unnamed = struct.unpack_from(order + "4f", info, 0x394)
+        readings = {f"sensor {i}": value for i, value in enumerate(unnamed, 1) if _LOWEST_K < value < _HIGHEST_K}
     return readings

@@ -177,7 +177,20 @@ def _camera_info(frame: Frame) -> bytes:
         p.atmosphere_beta2,
         p.atmosphere_x,
     )
-    struct.pack_into("<2f", info, 0x90, limits.maximum_K, limits.minimum_K)
+    settings = frame.settings
+    struct.pack_into(
+        "<8f",
+        info,
+        0x90,
+        limits.maximum_K,
+        limits.minimum_K,
+        settings.clip_maximum_K,
+        settings.clip_minimum_K,
+        settings.warn_maximum_K,
+        settings.warn_minimum_K,
+        settings.saturated_maximum_K,
+        settings.saturated_minimum_K,
+    )
     texts = (
         (0xD4, 32, camera.model),
         (0xF4, 16, camera.part),
@@ -193,7 +206,9 @@ def _camera_info(frame: Frame) -> bytes:
     struct.pack_into("<f", info, 0x1B4, camera.field_of_view_deg)
     struct.pack_into("<if2H", info, 0x308, round(p.planck_o), p.planck_r2, limits.raw_minimum, limits.raw_maximum)
     low, high = int(frame.counts.min()), int(frame.counts.max())
-    struct.pack_into("<2I", info, 0x338, (low + high) // 2, high - low)
+    shown = (settings.raw_median, settings.raw_range) if settings.raw_range else ((low + high) // 2, high - low)
+    struct.pack_into("<2I", info, 0x338, *shown)
+    struct.pack_into("<f4xH", info, 0x45C, settings.focus_distance_m, round(settings.frame_rate_Hz))
     _pack_time(info, frame)
     _pack_housekeeping(info, frame)
     return bytes(info)

@@ -95,6 +95,10 @@ class Inspection:
             f"  temperature {self.lowest_degC:.2f} to {self.highest_degC:.2f} degC, mean {self.mean_degC:.2f} degC "
             f"({self.looked_at} of {len(self.frames)} frames read)",
         ]
+        if first.settings.frame_rate_Hz:
+            lines.append(
+                f"  frame rate {first.settings.frame_rate_Hz:g} Hz, focus {first.settings.focus_distance_m:.3g} m"
+            )
         if inside:
             lines.append(f"  inside the camera, degC: {inside}")
         lines += [f"  note: {note}" for note in dict.fromkeys(note for frame in self.frames for note in frame.notes)]

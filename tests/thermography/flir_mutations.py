@@ -7,7 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from thermography.flir import CalibratedRange, CameraIdentity, CameraParameters, Frame, write_jpeg, write_sequence
+from thermography.flir import (
+    CalibratedRange,
+    CameraIdentity,
+    CameraParameters,
+    CameraSettings,
+    Frame,
+    write_jpeg,
+    write_sequence,
+)
 
 #: The constants of an SC660, as its files store them (float32).
 PARAMETERS = CameraParameters(
@@ -32,6 +40,7 @@ PARAMETERS = CameraParameters(
 )
 CAMERA = CameraIdentity("FLIR SC660", "40402-3502", "404003980", "15.0.14", "FOL38", "T197089", "407803816", 24.0)
 LIMITS = CalibratedRange(233.25, 393.25, 8812, 57240)
+SETTINGS = CameraSettings(1.5, 30.0, 423.25, 213.25, 393.25, 233.25, 423.25, 213.5, 18604, 1304)
 HOUSEKEEPING = {"TSLens": 299.25, "TSShutter": 300.5}
 TIME = np.datetime64("2026-03-09T06:33:47.125", "ms")
 
@@ -46,6 +55,7 @@ def frame(rows: int = 12, columns: int = 16, *, seed: int = 1, seconds: int = 0)
         time=TIME + np.timedelta64(seconds, "s"),
         camera=CAMERA,
         limits=LIMITS,
+        settings=SETTINGS,
         housekeeping=dict(HOUSEKEEPING),
         utc_offset_minutes=60,
     )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -108,6 +110,13 @@ def test_no_frame_at_all_and_frames_of_other_sizes_are_refused(tmp_path: Path) -
         FlirFormatError, match=r"frame 1 has \(rows, columns\) \(9, 8\), .* has \(8, 9\); open files of diff"
     ):
         _open(tmp_path / "b.seq")
+
+
+def test_the_engine_is_declared_under_the_name_flir() -> None:
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    ((name, target),) = project["entry-points"]["xarray.backends"].items()
+    module, attribute = target.split(":")
+    assert name == "flir" and getattr(importlib.import_module(module), attribute) is FlirBackendEntrypoint
 
 
 def test_files_are_recognised_by_their_start(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.thermography.flir_mutations import CAMERA, HOUSEKEEPING, LIMITS, PARAMETERS, TIME, jpeg, sequence
+from tests.thermography.flir_mutations import CAMERA, HOUSEKEEPING, LIMITS, PARAMETERS, SETTINGS, TIME, jpeg, sequence
 from thermography.flir import FlirFormatError, index_frames, read_frame, write_jpeg, write_sequence
 
 SC660_JPEG = "gtatters__Thermimage/inst/extdata/IR_2412.jpg"
@@ -53,6 +53,10 @@ def test_sc660_jpeg_gives_every_field_of_its_header(real_file) -> None:
     assert frame.utc_offset_minutes == -360
     assert frame.limits.raw_minimum == 8812 and frame.limits.raw_maximum == 57240
     assert frame.housekeeping["TSLens"] == pytest.approx(299.0975, abs=1e-4)
+    settings = frame.settings
+    assert (settings.raw_median, settings.raw_range, settings.frame_rate_Hz) == (18604, 1304, 30)
+    assert settings.focus_distance_m == pytest.approx(1.909071, abs=1e-6)
+    assert (settings.clip_maximum_K, settings.saturated_minimum_K) == pytest.approx((423.15, 213.15))
     # The raw detector reading and the integration time of the same table are no temperatures.
     assert set(frame.housekeeping) == {"TSAperture", "TSCapsule", "TSLens", "TSShutter", "TFpa"}
     assert len(frame.camera_info) == 2476 and frame.camera_info[:2] == b"\x02\x00"
@@ -119,6 +123,7 @@ def test_written_jpeg_and_sequence_come_back_equal(tmp_path: Path, encoding: str
     frames, rejected = index_frames([tmp_path / "a.seq"])
     assert [frame.index for frame in frames] == [0, 1, 2] and rejected == []
     assert {frame.samples.encoding for frame in frames} == {encoding}
+    assert {frame.settings for frame in frames} == {SETTINGS}
 
 
 def test_segments_may_come_in_any_order(tmp_path: Path) -> None:
@@ -215,6 +220,25 @@ def test_a_camera_info_of_the_shortest_kind_has_no_housekeeping(tmp_path: Path) 
     path.write_bytes(data)
     frame = read_frame(path)
     assert frame.housekeeping == {} and frame.time == TIME and len(frame.camera_info) == 0x47C
+    assert frame.settings == SETTINGS
+
+
+def test_a_camera_info_that_ends_after_the_calibration_has_no_time(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    sequence(path, frames=1)
+    data = bytearray(path.read_bytes())
+    struct.pack_into(">I", data, 0x40 + 16, 0x314)
+    path.write_bytes(data)
+    frame = read_frame(path)
+    assert np.isnat(frame.time) and frame.settings.raw_range == 0 and frame.settings.clip_maximum_K == 423.25
+    assert frame.parameters == PARAMETERS and frame.camera == CAMERA
+
+
+@pytest.mark.real_data
+def test_camera_temperatures_without_names_are_numbered(real_file) -> None:
+    (frame, _), _ = index_frames([real_file(SC660_SEQ)])
+    expected = {"sensor 1": 302.0170, "sensor 2": 303.4868, "sensor 3": 298.5350, "sensor 4": 300.8738}
+    assert frame.housekeeping == pytest.approx(expected, abs=1e-4)
 
 
 # Many files ----------------------------------------------------------------------------------------------------------
