@@ -37,11 +37,12 @@ Cause = Literal["structural", "local_temperature", "stick_slip", "step", "undete
 
 #: Least probability of each cause. tests/fusion/test_diagnosis_thresholds.py sets and checks them on simulated campaigns.
 THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "stick_slip": 0.4, "step": 0.6}
-#: An effect bound to the approach must explain scatter better than equal scatter in both directions by this much (nats); plain
-#: scatter does so by chance in one case of thirty.
-APPROACH_NATS = 2.0
-#: Level of the bootstrap tests that a lasting cause must pass.
-LEVEL = 0.05
+#: What an effect bound to the approach must gain beyond scatter that is alike in both directions before it counts as likely (nats):
+#: amounts that follow the motion, more scatter in one direction, a slow walk in one direction. Plain scatter exceeds each of them by
+#: chance in one case of thirty or fewer.
+APPROACH_NATS = {"along": 1.8, "one_direction": 4.0, "slow": 2.5}
+#: Level of the bootstrap test that a lasting cause must pass; local temperature is the name that costs most when it is wrong.
+LEVELS = {"step": 0.05, "local_temperature": 0.01}
 
 CHECKS: dict[str, str] = {
     "structural": "guideway, screw and nut at this position: preload, wear, contamination, loose scale or cover; repeat at small "
@@ -154,12 +155,17 @@ def weigh(case: _Case) -> dict[str, float]:
     cycles = case.residual.seconds.size
     one = 0.5 * float(np.log(cycles))
     scatter = case.memoryless
-    sticking = max(scatter.one_direction, scatter.along_approach) - APPROACH_NATS
+    sticking = float(
+        np.logaddexp(
+            scatter.one_direction - APPROACH_NATS["one_direction"], scatter.along_approach - APPROACH_NATS["along"]
+        )
+    )
     share = 1.0 / (1.0 + float(np.exp(np.clip(scatter.both - sticking, -50, 50))))
     score = {
         "structural": case.slow.white + float(np.log(max(1.0 - share, 1e-30))),
         "stick_slip": max(
-            case.slow.white + float(np.log(max(share, 1e-30))), case.slow.one_direction - one - float(np.log(2.0))
+            case.slow.white + float(np.log(max(share, 1e-30))),
+            case.slow.one_direction - one - APPROACH_NATS["slow"],
         ),
         "slow": case.slow.shared - one,
         "step": case.step.log_likelihood - one - float(np.log(step_columns(cycles).shape[1])),
@@ -199,7 +205,7 @@ def _objections(case: _Case, leading: str, probability: float) -> list[str]:
         reasons.append(f"probability {probability:.2f} of {leading} is below its threshold {threshold:.2f}")
     lasting = {"step": case.step, "local_temperature": case.temperature}.get(leading)
     if lasting is not None:
-        if lasting.p_value > LEVEL:
+        if lasting.p_value > LEVELS[leading]:
             reasons.append(f"p = {lasting.p_value:.3f}: a slow walk alone looks like this too often")
         if lasting.held_out <= 0:
             reasons.append(

@@ -1,0 +1,95 @@
+"""Speed of the screen at full size, and as a ratio to nilearn (if installed) on one regressor measured in the same run."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from fusion.attribution import LAGS_S, Film
+from fusion.excitation import Excitation
+from fusion.screening import screen
+
+pytestmark = pytest.mark.slow
+
+CYCLES, SERIES = 100, 32
+SECONDS = np.arange(CYCLES) * 252.0
+VARIED = Excitation(0.5, False, 3)
+
+
+def film(columns: int, rng: np.random.Generator) -> Film:
+    courses = np.cumsum(rng.standard_normal((CYCLES, 6), dtype=np.float32), axis=0)
+    patterns = rng.standard_normal((6, columns), dtype=np.float32)
+    values = courses @ patterns + np.float32(0.1) * rng.standard_normal((CYCLES, columns), dtype=np.float32)
+    return Film(SECONDS, values - values.mean(axis=0))
+
+
+def drifts(rng: np.random.Generator, series: int = SERIES) -> np.ndarray:
+    common = np.cumsum(rng.standard_normal(CYCLES))
+    return common + 0.4 * rng.standard_normal((series, CYCLES))
+
+
+def cost(work: Callable[[], object]) -> tuple[float, float]:
+    """Wall and processor seconds of one call; on a shared machine the second is what can be compared."""
+    wall, processor = time.perf_counter(), time.process_time()
+    work()
+    return time.perf_counter() - wall, time.process_time() - processor
+
+
+def run(values: np.ndarray, seen: Film, permutations: int, lags: tuple[float, ...] = LAGS_S) -> Callable[[], object]:
+    return lambda: screen(
+        values,
+        SECONDS,
+        np.eye(CYCLES),
+        seen,
+        VARIED,
+        lags_s=lags,
+        permutations=permutations,
+        rng=np.random.default_rng(1),
+    )
+
+
+def test_full_size(rng: np.random.Generator) -> None:
+    values = drifts(rng)
+    run(values, film(600, rng), 5)()
+    wall, processor = cost(run(values, film(10_000, rng), 1000))
+    print(f"\n10,000 cells x {CYCLES} cycles x {SERIES} series x {len(LAGS_S)} lags x 1,000 permutations: ", end="")
+    print(f"{wall:.1f} s wall, {processor:.1f} s processor, peak {_peak_GB():.2f} GB")
+    wall, processor = cost(run(values, film(307_200, rng), 0))
+    print(
+        f"307,200 pixels without permutations: {wall:.1f} s wall, {processor:.1f} s processor, peak {_peak_GB():.2f} GB"
+    )
+
+
+def test_against_nilearn(rng: np.random.Generator) -> None:
+    glm = pytest.importorskip("nilearn.glm.first_level", reason="nilearn is not installed")
+    mass_univariate = pytest.importorskip("nilearn.mass_univariate")
+    columns, permutations = 2_000, 50
+    seen = film(columns, rng)
+    values = drifts(rng, 1)
+    trend = np.linspace(-1, 1, CYCLES)
+    design = np.column_stack([values[0], np.ones(CYCLES), trend])
+    run(values, seen, 1, (0.0,))()
+    _, ours = cost(run(values, seen, 0, (0.0,)))
+    _, theirs = cost(lambda: glm.run_glm(np.asarray(seen.values, float), design, noise_model="ar1"))
+    print(f"\n{columns} pixels, one series: nilearn run_glm(ar1) / screen = {theirs / ours:.0f}")
+    _, ours = cost(run(values, seen, permutations, (0.0,)))
+    _, theirs = cost(
+        lambda: mass_univariate.permuted_ols(
+            values.T,
+            np.asarray(seen.values, float),
+            np.column_stack([np.ones(CYCLES), trend]),
+            n_perm=permutations,
+            verbose=0,
+        )
+    )
+    print(
+        f"{columns} pixels, one series, {permutations} permutations: nilearn permuted_ols / screen = {theirs / ours:.0f}"
+    )
+
+
+def _peak_GB() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
