@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,10 @@ from typing import Any
 import xarray as xr
 
 from fusion import stages, stages_thermal
+from fusion.cf import annotate
 from fusion.config import Campaign, load_campaign
 from fusion.outcome import Outcome
-from fusion.products import StageStamps, digest, open_folder, read_dataset, write_dataset, write_json, write_text
+from fusion.products import StageStamps, digest, open_folder, plain, read_dataset, write_dataset, write_json, write_text
 from fusion.progress import Report, silent
 from fusion.provenance import describe_run, hash_inputs, versions
 from fusion.report import render_report
@@ -71,7 +72,8 @@ class Run:
             outcome = Outcome(read_dataset(path), note["parts"], tuple(Notice(**item) for item in note["notices"]))
             self.report(f"{stages.LABELS[name]} (kept)", 1, 1)
         else:
-            outcome = compute()
+            computed = compute()
+            outcome = replace(computed, dataset=self.described(computed.dataset))
             write_dataset(path, outcome.dataset)
             self.stamps.record(
                 name, key, [path], {"parts": outcome.parts, "notices": [vars(item) for item in outcome.notices]}
@@ -81,6 +83,12 @@ class Run:
         self.notices.extend(outcome.notices)
         self.seconds[name] = time.monotonic() - begun
         return outcome.dataset
+
+    def described(self, dataset: xr.Dataset) -> xr.Dataset:
+        """Return a product's Dataset with what NetCDF files have to say of themselves."""
+        history = f"{self.started.isoformat(timespec='seconds')} thermofuse run {self.campaign.path.name}"
+        origin = {"software": "thermofuse", "versions": versions(), "inputs": dict(self.inputs)}
+        return annotate(dataset, title=self.campaign.campaign.title, history=history, provenance=origin)
 
 
 def run_campaign(
@@ -142,7 +150,7 @@ def run_campaign(
         ("fields", "deviations"),
         lambda: stages.model_drift(source, fused, deviations, report=report),
     )
-    fusion = stages.join_fusion(fused, maps, model)
+    fusion = run.described(stages.join_fusion(fused, maps, model))
     write_dataset(folder / "fusion.nc", fusion)
     stages_thermal.write_exr(folder / "maps", fields, report=report)
     return _finish(run, {"fields": fields, "deviations": deviations, "fusion": fusion})
@@ -150,7 +158,7 @@ def run_campaign(
 
 def _finish(run: Run, datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:
     """Write results, provenance and report from what the stages found."""
-    results = assemble(run.campaign.campaign.title, run.parts, run.notices)
+    results = plain(assemble(run.campaign.campaign.title, run.parts, run.notices))
     provenance = describe_run(run.campaign, run.inputs, started=run.started, seconds=run.seconds)
     run.report("report", 0, 1)
     write_json(run.folder / "results.json", results)

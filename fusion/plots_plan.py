@@ -37,7 +37,7 @@ def plot_registration(fields: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     column, row = fields["fiducial_column"].values, fields["fiducial_row"].values
     ax.plot(column, row, "o", markersize=9, markerfacecolor="none", markeredgecolor="#7fe3ff", markeredgewidth=1.1)
     label = {"boxstyle": "round,pad=0.15", "facecolor": INK, "edgecolor": "none", "alpha": 0.75}
-    for name, x, y in zip(fields["fiducial"].values, column, row, strict=True):
+    for name, x, y in zip(fields["fiducial_name"].values, column, row, strict=True):
         ax.annotate(str(name), (x, y), (7, 4), textcoords="offset points", color="white", fontsize=7, bbox=label)
     ax.set(xlabel="column / px", ylabel="row / px")
     ax.grid(visible=False)

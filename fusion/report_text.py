@@ -196,7 +196,7 @@ def _fiducial_rows(fields: xr.Dataset | None) -> list[dict[str, Any]]:
     if fields is None:
         return []
     values = zip(
-        fields["fiducial"].values,
+        fields["fiducial_name"].values,
         fields["fiducial_residual"].values,
         fields["fiducial_leave_one_out"].values,
         strict=True,

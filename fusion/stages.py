@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from fusion import cf
 from fusion.alignment import align
 from fusion.collinearity import cluster_cells, evidence_at
 from fusion.correlation import correlate
@@ -159,7 +160,8 @@ def model_drift(source: Source, fused: xr.Dataset, deviations: xr.Dataset, *, re
 def join_fusion(fused: xr.Dataset, maps: xr.Dataset, loop: xr.Dataset) -> xr.Dataset:
     """Return everything that joins both recordings in one Dataset, for fusion.nc."""
     dataset = joined(fused, correlation=maps, loop=loop)
-    return dataset.assign_attrs({f"correlation_{name}": value for name, value in maps.attrs.items()})
+    own = {name: value for name, value in maps.attrs.items() if name not in cf.GLOBAL_ATTRIBUTES}
+    return dataset.assign_attrs({f"correlation_{name}": value for name, value in own.items()})
 
 
 def sites_of(anomalies: Sequence[Anomaly], targets: int) -> list[tuple[int, str]]:

@@ -175,7 +175,8 @@ def registration_variables(registration: Registration, reference: np.ndarray) ->
     variables["homography"] = (("plan_axis", "sensor_axis"), registration.homography, {"units": "1"})
     degrees = {"units": "degC", "units_metadata": "temperature: on_scale"}
     variables["reference_frame"] = (("row", "column"), reference.astype("f4"), degrees)
-    return xr.Dataset(variables, coords={"fiducial": names})
+    variables["fiducial_name"] = ("fiducial", names)
+    return xr.Dataset(variables)
 
 
 def registration_notices(registration: Registration) -> list[Notice]:

@@ -10,6 +10,7 @@ import jsonschema
 import numpy as np
 import pytest
 import xarray as xr
+from compliance_checker.runner import CheckSuite
 
 from fusion.alignment import AlignmentError
 from fusion.config import load_campaign
@@ -60,6 +61,21 @@ def test_all_products_are_written_and_keep_their_contracts(results_folder: Path)
     check(read_dataset(results_folder / "fields.nc"), FIELDS, name="fields.nc")
     assert len(list((results_folder / "maps").glob("cycle_*.exr"))) == 24
     assert not list(results_folder.rglob("*.partial*"))
+
+
+def test_fields_pass_the_cf_checker(results_folder: Path) -> None:
+    """CF-1.11 without an error or a warning; deviations and fusion carry the same global attributes."""
+    CheckSuite.load_all_available_checkers()
+    suite = CheckSuite()
+    dataset = suite.load_dataset(str(results_folder / "fields.nc"))
+    groups, errors = suite.run_all(dataset, ["cf:1.11"])["cf:1.11"]
+    assert errors == {}
+    assert [message for group in groups if group.value[0] < group.value[1] for message in group.msgs] == []
+    for name in ("fields", "deviations", "fusion"):
+        product = read_dataset(results_folder / f"{name}.nc")
+        assert product.attrs["Conventions"] == "CF-1.11" and product.attrs["title"] == "Small campaign"
+        assert set(json.loads(product.attrs["provenance"])) == {"software", "versions", "inputs"}
+        assert all({"long_name", "standard_name"} & set(variable.attrs) for variable in product.variables.values())
 
 
 def test_maps_hold_the_fields_bit_by_bit(results_folder: Path) -> None:
