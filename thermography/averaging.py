@@ -10,14 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermography.flir import CameraParameters
-from thermography.radiometry import count_line, temperature_from_counts
+from thermography.radiometry import ZERO_CELSIUS_K, count_line
 
 Array = NDArray[Any]
 
 #: Where averaging counts may err by more than this, frames are calibrated one by one.
 AVERAGING_LIMIT_K = 0.5e-3
-#: Pixels per tile: sums of one tile stay in the cache while many frames pass over it.
-TILE_PX = 32768
+#: Pixels per tile, and frames per chunk: the sums of a tile stay in the first cache, the frames of a chunk in the last.
+TILE_PX = 2048
+CHUNK_FRAMES = 16
+#: Counts over which the squared steps of one chunk might not fit 32 bits.
+WIDE = 8192
 
 
 @dataclass(frozen=True)
@@ -103,51 +106,86 @@ class MeanTemperature:
 def accumulate(counts: NDArray[np.uint16]) -> CountStatistics:
     """Sum counts, shape (time, ...), over time.
 
-    Parameters
-    ----------
-    counts
-        uint16, at most 65,536 frames.
-
     Raises
     ------
     ValueError
-        Not uint16, no frame, or more frames than a 32-bit sum holds.
+        Not uint16, or no frame.
     """
-    if counts.dtype != np.uint16 or not 0 < len(counts) <= 65536:
-        raise ValueError(
-            f"counts: expected 1..65536 frames of uint16, got {counts.dtype} of shape {counts.shape}; add smaller blocks"
+    sums = Accumulator(counts.shape[1:])
+    sums.add(counts)
+    return sums.statistics()
+
+
+class Accumulator:
+    """Sums that grow by chunks of frames, so that a block of any length takes the memory of one chunk.
+
+    Parameters
+    ----------
+    shape
+        Of one frame.
+    """
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.shape = shape
+        pixels = int(np.prod(shape))
+        self.frames = 0
+        self.total, self.squares = np.zeros(pixels, np.uint64), np.zeros(pixels, np.uint64)
+        self.lowest, self.highest = np.full(pixels, 65535, np.uint16), np.zeros(pixels, np.uint16)
+
+    def add(self, counts: NDArray[np.uint16]) -> None:
+        """Add frames of counts, shape (time, ...)."""
+        if counts.dtype != np.uint16 or len(counts) == 0 or counts.shape[1:] != self.shape:
+            raise ValueError(f"counts: expected frames of {self.shape} uint16, got {counts.shape} {counts.dtype}")
+        flat = np.ascontiguousarray(counts).reshape(len(counts), -1)
+        for start in range(0, len(flat), CHUNK_FRAMES):
+            _add(flat[start : start + CHUNK_FRAMES], self.total, self.squares, self.lowest, self.highest)
+        self.frames += len(flat)
+
+    def statistics(self) -> CountStatistics:
+        """What has been added so far."""
+        if self.frames == 0:
+            raise ValueError("no frame has been added")
+        shape = self.shape
+        return CountStatistics(
+            self.frames,
+            self.total.reshape(shape),
+            self.squares.reshape(shape),
+            self.lowest.reshape(shape),
+            self.highest.reshape(shape),
         )
-    shape = counts.shape[1:]
-    flat = np.ascontiguousarray(counts).reshape(len(counts), -1)
-    total, squares, lowest, highest = _accumulate(flat)
-    return CountStatistics(
-        len(flat), total.reshape(shape), squares.reshape(shape), lowest.reshape(shape), highest.reshape(shape)
-    )
 
 
 @numba.njit(cache=True, nogil=True)
-def _accumulate(counts: Array) -> tuple[Array, Array, Array, Array]:
+def _add(counts: Array, total: Array, squares: Array, lowest: Array, highest: Array) -> None:
     frames, pixels = counts.shape
-    total = np.zeros(pixels, np.uint64)
-    squares = np.zeros(pixels, np.uint64)
-    lowest = np.full(pixels, np.uint16(65535), np.uint16)
-    highest = np.zeros(pixels, np.uint16)
-    tile_total = np.empty(min(TILE_PX, pixels), np.uint32)
+    step_sum, step_squares = np.empty(TILE_PX, np.int32), np.empty(TILE_PX, np.uint32)
+    low, high = np.empty(TILE_PX, np.uint16), np.empty(TILE_PX, np.uint16)
     for start in range(0, pixels, TILE_PX):
-        stop = min(start + TILE_PX, pixels)
-        tile_total[:] = 0
-        q, low, high = squares[start:stop], lowest[start:stop], highest[start:stop]
-        for frame in range(frames):
-            row = counts[frame, start:stop]
-            for i in range(stop - start):
-                value = np.uint32(row[i])
-                tile_total[i] += value
-                q[i] += np.uint64(value) * np.uint64(value)
+        width = min(TILE_PX, pixels - start)
+        first = counts[0, start : start + width]
+        for i in range(width):
+            step_sum[i], step_squares[i], low[i], high[i] = 0, 0, first[i], first[i]
+        # Steps from the chunk's first frame fit 32 bits, of which a processor adds twice as many at once as of 64.
+        for frame in range(1, frames):
+            row = counts[frame, start : start + width]
+            for i in range(width):
+                step = np.int32(row[i]) - np.int32(first[i])
+                step_sum[i] += step
+                step_squares[i] += np.uint32(step * step)
                 low[i] = min(low[i], row[i])
                 high[i] = max(high[i], row[i])
-        for i in range(stop - start):
-            total[start + i] = tile_total[i]
-    return total, squares, lowest, highest
+        for i in range(width):
+            reference = np.int64(first[i])
+            own_squares = np.int64(step_squares[i])
+            if high[i] - low[i] >= WIDE:
+                own_squares = np.int64(0)
+                for frame in range(frames):
+                    own_squares += (np.int64(counts[frame, start + i]) - reference) ** 2
+            own_sum = np.int64(step_sum[i])
+            total[start + i] += np.uint64(frames * reference + own_sum)
+            squares[start + i] += np.uint64(own_squares + 2 * reference * own_sum + frames * reference * reference)
+            lowest[start + i] = min(lowest[start + i], low[i])
+            highest[start + i] = max(highest[start + i], high[i])
 
 
 def mean_temperature(statistics: CountStatistics, parameters: CameraParameters) -> MeanTemperature:
@@ -169,30 +207,56 @@ def mean_temperature(statistics: CountStatistics, parameters: CameraParameters) 
     MeanTemperature
         Same pixel shape.
     """
-    mean, variance = statistics.mean, statistics.variance
-    first, second, _ = _derivatives(mean, parameters)
-    _, _, third = _derivatives(statistics.lowest.astype(float), parameters)
-    reach = np.maximum(statistics.highest - mean, mean - statistics.lowest)
-    lowest = temperature_from_counts(statistics.lowest, parameters)
-    return MeanTemperature(
-        statistics.frames,
-        np.where(np.isfinite(lowest), temperature_from_counts(mean, parameters) + 0.5 * second * variance, np.nan),
-        first**2 * variance,
-        np.abs(third) / 6 * variance * reach,
-    )
-
-
-def _derivatives(counts: Array, parameters: CameraParameters) -> tuple[Array, Array, Array]:
-    """First, second and third derivative of the temperature by the counts, K per count to the first, second and third power."""
     p = parameters
     gain, offset = count_line(p)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        s = (counts - offset) / gain + p.planck_o
-        a = p.planck_r1 / p.planck_r2
-        log = np.log(a / s + p.planck_f)
-        d, d1, d2 = s * (a + p.planck_f * s), a + 2 * p.planck_f * s, 2 * p.planck_f
-        g, g1, g2 = a / d, -a * d1 / d**2, -a * d2 / d**2 + 2 * a * d1**2 / d**3
-        first = p.planck_b * g / log**2
-        second = p.planck_b * (g1 / log**2 + 2 * g**2 / log**3)
-        third = p.planck_b * (g2 / log**2 + 6 * g * g1 / log**3 + 6 * g**3 / log**4)
-    return first / gain, second / gain**2, third / gain**3
+    curve = np.array([p.planck_r1 / p.planck_r2, p.planck_b, p.planck_f, gain, offset - gain * p.planck_o])
+    total, squares, lowest, highest = (
+        values.ravel() for values in (statistics.total, statistics.squares, statistics.lowest, statistics.highest)
+    )
+    mean, variance, bound = _mean_temperature(statistics.frames, total, squares, lowest, highest, curve)
+    shape = statistics.total.shape
+    return MeanTemperature(statistics.frames, mean.reshape(shape), variance.reshape(shape), bound.reshape(shape))
+
+
+@numba.njit(cache=True, nogil=True)
+def _mean_temperature(
+    frames: int, total: Array, squares: Array, lowest: Array, highest: Array, curve: Array
+) -> tuple[Array, Array, Array]:
+    pixels = len(total)
+    mean, variance, bound = np.empty(pixels), np.empty(pixels), np.empty(pixels)
+    n = np.uint64(frames)
+    steepest = abs(_derivatives(float(lowest.min()), curve)[3])
+    for i in range(pixels):
+        low = np.uint64(lowest[i])
+        first_moment = float(total[i] - n * low) / frames
+        counts = float(low) + first_moment
+        spread = max(float(squares[i] + n * low * low - np.uint64(2) * low * total[i]) / frames - first_moment**2, 0.0)
+        temperature, first, second, _ = _derivatives(counts, curve)
+        reach = max(highest[i] - counts, counts - float(low))
+        limit = steepest / 6 * spread * reach
+        if not limit <= AVERAGING_LIMIT_K:
+            # The smallest count of the whole window is a coarse bound; only where it does not do, the pixel's own is worked out.
+            own = _derivatives(float(low), curve)
+            limit = abs(own[3]) / 6 * spread * reach
+            if np.isnan(own[0]):
+                temperature = np.nan
+        mean[i] = temperature + 0.5 * second * spread
+        variance[i] = first**2 * spread
+        bound[i] = limit
+    return mean, variance, bound
+
+
+@numba.njit(cache=True, nogil=True)
+def _derivatives(counts: float, curve: Array) -> tuple[float, float, float, float]:
+    """Temperature (degC) and its first three derivatives by the counts, K per count to their power; NaN below any temperature."""
+    a, b, f, gain, offset = curve
+    s = (counts - offset) / gain
+    if s <= 0 or a / s + f <= 1:
+        return np.nan, np.nan, np.nan, np.nan
+    log = np.log(a / s + f)
+    d, d1, d2 = s * (a + f * s), a + 2 * f * s, 2 * f
+    g, g1, g2 = a / d, -a * d1 / d**2, -a * d2 / d**2 + 2 * a * d1**2 / d**3
+    first = b * g / log**2
+    second = b * (g1 / log**2 + 2 * g**2 / log**3)
+    third = b * (g2 / log**2 + 6 * g * g1 / log**3 + 6 * g**3 / log**4)
+    return b / log - ZERO_CELSIUS_K, first / gain, second / gain**2, third / gain**3

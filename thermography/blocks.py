@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,8 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography.averaging import AVERAGING_LIMIT_K, CountStatistics, MeanTemperature, accumulate, mean_temperature
-from thermography.cycles import pixel_noise
+from thermography.averaging import (
+    AVERAGING_LIMIT_K,
+    CHUNK_FRAMES,
+    Accumulator,
+    CountStatistics,
+    MeanTemperature,
+    mean_temperature,
+)
+from thermography.cycles import noise_of_differences
 from thermography.flir import CameraParameters, FrameReference
 from thermography.knocks import RegisteredFrom, Watch
 from thermography.radiometry import calibrate
@@ -20,8 +28,10 @@ from thermography.resampling import PlanWeights
 Array = NDArray[Any]
 Override = Callable[[FrameReference], CameraParameters]
 
-#: Most frames that one block holds in memory.
-BLOCK_FRAMES = 128
+#: Most frames of one block: what a cluster computes at once, and what is lost when a run is broken off.
+BLOCK_FRAMES = 512
+#: Rows either side of the middle of a frame from which its noise is taken.
+NOISE_ROWS = 24
 #: Corrections within a block differ by no more than this.
 CORRECTION_STEP_K = 2e-3
 
@@ -103,21 +113,50 @@ def reduce_block(
     frames: Sequence[FrameReference], parameters: CameraParameters, camera: Camera, *, keep_statistics: bool = False
 ) -> BlockResult:
     """Read the frames of a block and reduce them; counts are averaged, and calibrated one by one only where they vary too much."""
-    counts = read_window(frames, camera.weights.window)
-    statistics = None
-    if len(frames) == 1 and not keep_statistics:
+    window = camera.weights.window
+    sums = Accumulator(camera.weights.used.shape)
+    shifts, noise, counts = [], np.nan, np.empty((0, 0, 0), np.uint16)
+    for start in range(0, len(frames), CHUNK_FRAMES):
+        counts = read_window(frames[start : start + CHUNK_FRAMES], window)
+        sums.add(counts)
+        # The middle rows of one frame give the noise well enough to tell whether a disc shows.
+        middle = slice(max(counts.shape[1] // 2 - NOISE_ROWS, 0), counts.shape[1] // 2 + NOISE_ROWS)
+        noise = (
+            noise_of_differences(counts[0, middle].astype(float), camera.weights.whole[middle]) if start == 0 else noise
+        )
+        shifts.append(camera.watch.shifts(counts, noise))
+    statistics = sums.statistics()
+    if len(frames) == 1:
         mean = calibrate(counts[0], parameters).astype(float)
         reduced = MeanTemperature(1, mean, np.zeros_like(mean), np.zeros_like(mean))
     else:
-        statistics = accumulate(counts)
         reduced = mean_temperature(statistics, parameters)
-        wild = reduced.bound_K > AVERAGING_LIMIT_K
-        if wild.any():
-            temperature = calibrate(counts[:, wild], parameters).astype(float)
-            reduced.mean[wild], reduced.variance[wild] = temperature.mean(axis=0), temperature.var(axis=0)
-    noise = pixel_noise(counts[0].astype(float), camera.weights.used)
-    shift = camera.watch.shifts(counts, noise)
-    return BlockResult(reduced, camera.weights.resample(reduced.mean), shift, statistics if keep_statistics else None)
+        _calibrate_one_by_one(
+            reduced, (reduced.bound_K > AVERAGING_LIMIT_K) & camera.weights.used, frames, parameters, window
+        )
+    cells = camera.weights.resample(reduced.mean)
+    return BlockResult(reduced, cells, np.concatenate(shifts), statistics if keep_statistics else None)
+
+
+def _calibrate_one_by_one(
+    reduced: MeanTemperature,
+    wild: Array,
+    frames: Sequence[FrameReference],
+    parameters: CameraParameters,
+    window: tuple[slice, slice],
+) -> None:
+    """Replace mean and variance of the pixels that vary too much for averaged counts, from a second reading of the block."""
+    if not wild.any():
+        return
+    total, squares = np.zeros(int(wild.sum())), np.zeros(int(wild.sum()))
+    reference = reduced.mean[wild]
+    for start in range(0, len(frames), CHUNK_FRAMES):
+        counts = read_window(frames[start : start + CHUNK_FRAMES], window)
+        step = calibrate(counts[:, wild], parameters).astype(float) - reference
+        total += step.sum(axis=0)
+        squares += (step**2).sum(axis=0)
+    reduced.mean[wild] = reference + total / len(frames)
+    reduced.variance[wild] = np.maximum(squares / len(frames) - (total / len(frames)) ** 2, 0.0)
 
 
 def read_window(frames: Sequence[FrameReference], window: tuple[slice, slice]) -> NDArray[np.uint16]:
@@ -137,13 +176,19 @@ def read_window(frames: Sequence[FrameReference], window: tuple[slice, slice]) -
                 path, file = frame.path, os.open(frame.path, os.O_RDONLY)
             width = samples.shape[1] * 2
             start = frame.segments[0][0] + samples.offset + rows.start * width
-            data = os.pread(file, counts.shape[1] * width, start)
-            if len(data) < counts.shape[1] * width:
+            wanted = (
+                counts[i].reshape(-1)
+                if samples.shape[1] == counts.shape[2]
+                else np.empty(counts.shape[1] * width // 2, np.uint16)
+            )
+            if os.preadv(file, [memoryview(wanted.data).cast("B")], start) < wanted.nbytes:
                 raise OSError(
                     f"{frame.path}: frame {frame.index} ends early; the file has become shorter since it was indexed"
                 )
-            values = np.frombuffer(data, "<u2" if samples.little_endian else ">u2").reshape(-1, samples.shape[1])
-            counts[i] = values[:, columns]
+            if samples.little_endian != (sys.byteorder == "little"):
+                wanted.byteswap(inplace=True)
+            if wanted.size != counts[i].size:
+                counts[i] = wanted.reshape(-1, samples.shape[1])[:, columns]
     finally:
         if file >= 0:
             os.close(file)

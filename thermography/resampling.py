@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
+from scipy import ndimage, sparse
 
-from thermography.plan import PlanGrid, mask_discs
+from thermography.plan import PlanGrid
 from thermography.registration import Registration
 
 Array = NDArray[Any]
@@ -44,21 +46,30 @@ class PlanWeights:
     coverage: Array
     grid: PlanGrid
 
-    @property
+    @cached_property
     def used(self) -> NDArray[np.bool_]:
         """Which pixels of the window have a weight."""
         shape = tuple(side.stop - side.start for side in self.window)
-        return np.asarray(np.asarray(self.areas.sum(axis=0)).reshape(shape) > 0)
+        used = np.zeros(shape[0] * shape[1], bool)
+        used[self.areas.indices] = True
+        return used.reshape(shape)
+
+    @cached_property
+    def whole(self) -> NDArray[np.bool_]:
+        """Which of them have eight neighbours with a weight."""
+        return np.asarray(ndimage.binary_erosion(self.used, np.ones((3, 3))))
+
+    @cached_property
+    def noise_factor(self) -> Array:
+        """Variance of every cell, (y, x), for independent pixels of unit variance."""
+        squares = sparse.csr_array(
+            (self.matrix.data**2, self.matrix.indices, self.matrix.indptr), shape=self.matrix.shape
+        )
+        return self._on_plan(np.asarray(squares.sum(axis=1)).ravel())
 
     def resample(self, values: Array) -> Array:
         """Average window pixels, shape (row, column), over every cell; shape (y, x), NaN where a cell is not seen."""
         return self._on_plan(self.matrix @ values.ravel())
-
-    def propagate(self, variance: Array | float) -> Array:
-        """Variance of every cell from the variance of independent pixels, scalar or (row, column) of the window."""
-        squares = self.matrix.power(2)
-        pixels = np.broadcast_to(np.asarray(variance, float).ravel(), (self.matrix.shape[1],))
-        return self._on_plan(squares @ pixels)
 
     def average(self, values: Array) -> Array:
         """As `resample`, but by area alone: for quantities that must not be extrapolated (variances)."""
@@ -84,53 +95,90 @@ def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float
         The plan.
     margin_px
         Width of the lens's blur; 2 px hold all but 1 % of an edge for common cameras.
+
+    Raises
+    ------
+    ValueError
+        No pixel lies on the plan.
     """
-    pixels, places, areas = _unmasked_parts(registration, grid, margin_px)
-    cells = np.floor(places / grid.cell_size_mm).astype(np.int64)
-    ny, nx = grid.shape
-    inside = (cells >= 0).all(axis=1) & (cells[:, 0] < nx) & (cells[:, 1] < ny)
-    pixels, places, areas, cells = pixels[inside], places[inside], areas[inside], cells[inside]
-    rows, columns = np.divmod(pixels, registration.shape[1])
-    if rows.size == 0:
+    outline = registration.to_sensor(_outline(grid))
+    rows, columns = registration.shape
+    top = max(int(np.floor(outline[:, 1].min())), 0)
+    bottom = min(int(np.ceil(outline[:, 1].max())), rows - 1)
+    if bottom < top:
         raise ValueError("no pixel of the frame lies on the plan; check the fiducials and the plan's size")
-    window = (slice(int(rows.min()), int(rows.max()) + 1), slice(int(columns.min()), int(columns.max()) + 1))
-    shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
-    index = (rows - window[0].start) * shape[1] + columns - window[1].start
-    cell = cells[:, 1] * nx + cells[:, 0]
-    area = np.bincount(cell, areas, ny * nx)
-    coverage = (area / grid.cell_size_mm**2).reshape(ny, nx).clip(0, 1)
-    by_area = sparse.csr_array((areas / area[cell], (cell, index)), shape=(ny * nx, shape[0] * shape[1]))
-    by_area.sum_duplicates()
-    offset = np.stack([np.bincount(cell, areas * places[:, axis], ny * nx) for axis in (0, 1)], axis=-1)
+    # Whole rows: they lie together in the file.
+    window = (slice(top, bottom + 1), slice(0, columns))
+    across, down = np.meshgrid(np.arange(columns + 1) - 0.5, np.arange(top, bottom + 2) - 0.5)
+    corners = registration.to_plan(np.stack([across, down], axis=-1))
+    discs = np.array([(disc.x_mm, disc.y_mm, disc.diameter_mm / 2) for disc in registration.masked])
+    cell, pixel, area, x, y = _parts(corners, discs, (grid.width_mm, grid.height_mm), grid.cell_size_mm, margin_px)
+    if len(cell) == 0:
+        raise ValueError("no pixel of the frame lies on the plan; check the fiducials and the plan's size")
+    cells = grid.shape[0] * grid.shape[1]
+    seen = np.bincount(cell, area, cells)
+    coverage = (seen / grid.cell_size_mm**2).reshape(grid.shape).clip(0, 1)
+    by_area = sparse.csr_array((area / seen[cell], (cell, pixel)), shape=(cells, (bottom + 1 - top) * columns))
+    centre = np.stack([np.bincount(cell, area * along, cells) for along in (x, y)], axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        offset = offset / area[:, None] - np.stack(np.meshgrid(grid.x_mm, grid.y_mm), axis=-1).reshape(-1, 2)
+        offset = centre / seen[:, None] - np.stack(np.meshgrid(grid.x_mm, grid.y_mm), axis=-1).reshape(-1, 2)
     matrix = sparse.csr_array(by_area + centring(offset, coverage, grid) @ by_area)
+    matrix.sum_duplicates()
     return PlanWeights(matrix, by_area, window, coverage, grid)
 
 
-def _unmasked_parts(registration: Registration, grid: PlanGrid, margin_px: float) -> tuple[Array, Array, Array]:
-    """Parts of the pixels that count: index of their pixel, place on the plan (mm), and area on the plan (mm2)."""
-    corners = registration.to_sensor(_outline(grid))
-    low = np.maximum(np.floor(corners.min(axis=0)).astype(int), 0)
-    high = np.minimum(np.ceil(corners.max(axis=0)).astype(int), np.array(registration.shape[::-1]) - 1)
-    columns, rows = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
-    centres = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(float)
-    plan = registration.to_plan(centres)
-    near = grid.contains(plan)
-    centres, plan = centres[near], plan[near]
-    to_mm = np.linalg.inv(registration.projection.jacobian(plan))
-    pixel_mm = np.linalg.norm(to_mm, axis=1).max(axis=1)
-    edge = np.minimum.reduce([plan[:, 0], grid.width_mm - plan[:, 0], plan[:, 1], grid.height_mm - plan[:, 1]])
-    kept = (edge >= margin_px * pixel_mm) & ~mask_discs(plan, registration.masked, margin_mm=margin_px * pixel_mm)
-    centres, plan, to_mm = centres[kept], plan[kept], to_mm[kept]
-    steps = (np.arange(PARTS) + 0.5) / PARTS - 0.5
-    across, down = (side.ravel() for side in np.meshgrid(steps, steps))
-    # Within one pixel the projection is as good as affine.
-    x = plan[:, :1] + to_mm[:, 0, :1] * across + to_mm[:, 0, 1:] * down
-    y = plan[:, 1:] + to_mm[:, 1, :1] * across + to_mm[:, 1, 1:] * down
-    areas = np.abs(to_mm[:, 0, 0] * to_mm[:, 1, 1] - to_mm[:, 0, 1] * to_mm[:, 1, 0]) / PARTS**2
-    index = (centres[:, 1] * registration.shape[1] + centres[:, 0]).astype(np.int64)
-    return np.repeat(index, PARTS**2), np.stack([x.ravel(), y.ravel()], axis=-1), np.repeat(areas, PARTS**2)
+@numba.njit(cache=True, nogil=True)
+def _parts(
+    corners: Array, discs: Array, size: tuple[float, float], cell_mm: float, margin_px: float
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Cut every unmasked pixel in parts and add them up by cell: cell, pixel, area (mm2) and mean place (mm) of every pair."""
+    rows, columns = corners.shape[0] - 1, corners.shape[1] - 1
+    nx, ny = round(size[0] / cell_mm), round(size[1] / cell_mm)
+    most = 4 * rows * columns
+    cell, pixel = np.empty(most, np.int64), np.empty(most, np.int64)
+    area, x_mean, y_mean = np.empty(most), np.empty(most), np.empty(most)
+    count = 0
+    for row in range(rows):
+        for column in range(columns):
+            a, b = corners[row, column], corners[row, column + 1]
+            c, d = corners[row + 1, column], corners[row + 1, column + 1]
+            ux, uy = (b[0] - a[0] + d[0] - c[0]) / 2, (b[1] - a[1] + d[1] - c[1]) / 2
+            vx, vy = (c[0] - a[0] + d[0] - b[0]) / 2, (c[1] - a[1] + d[1] - b[1]) / 2
+            px, py = (a[0] + b[0] + c[0] + d[0]) / 4, (a[1] + b[1] + c[1] + d[1]) / 4
+            margin = margin_px * max(np.hypot(ux, uy), np.hypot(vx, vy))
+            if not (margin <= px <= size[0] - margin and margin <= py <= size[1] - margin):
+                continue
+            hidden = False
+            for k in range(len(discs)):
+                if (px - discs[k, 0]) ** 2 + (py - discs[k, 1]) ** 2 < (discs[k, 2] + margin) ** 2:
+                    hidden = True
+                    break
+            if hidden:
+                continue
+            part = abs(ux * vy - uy * vx) / PARTS**2
+            first = count
+            for i in range(PARTS):
+                for j in range(PARTS):
+                    s, t = (j + 0.5) / PARTS - 0.5, (i + 0.5) / PARTS - 0.5
+                    x, y = px + s * ux + t * vx, py + s * uy + t * vy
+                    cx, cy = int(x / cell_mm), int(y / cell_mm)
+                    if not (0 <= cx < nx and 0 <= cy < ny):
+                        continue
+                    own = cy * nx + cx
+                    place = first
+                    while place < count and cell[place] != own:
+                        place += 1
+                    if place == most:
+                        # Pixels of the size of cells spread over many: such a plan is too coarse to be seen anyway.
+                        continue
+                    if place == count:
+                        cell[place], pixel[place] = own, row * columns + column
+                        area[place], x_mean[place], y_mean[place] = 0.0, 0.0, 0.0
+                        count += 1
+                    area[place] += part
+                    x_mean[place] += part * x
+                    y_mean[place] += part * y
+    return cell[:count], pixel[:count], area[:count], x_mean[:count] / area[:count], y_mean[:count] / area[:count]
 
 
 def _outline(grid: PlanGrid) -> Array:
@@ -145,25 +193,49 @@ def centring(offset: Array, coverage: Array, grid: PlanGrid) -> sparse.csr_array
 
     That is minus their offset, (cells, 2) mm, times the gradient of the cells around them; both are linear in the cells.
     """
-    ny, nx = grid.shape
-    rows, columns, weights = [], [], []
+    places = offset + np.stack(np.meshgrid(grid.x_mm, grid.y_mm), axis=-1).reshape(-1, 2)
     seen = coverage.ravel() >= LEAST_COVERAGE
-    for cell in np.flatnonzero((np.abs(offset) > 0.02 * grid.cell_size_mm).any(axis=1) & seen):
-        y, x = divmod(int(cell), nx)
-        around = [
-            j * nx + i
-            for j in range(max(y - 1, 0), min(y + 2, ny))
-            for i in range(max(x - 1, 0), min(x + 2, nx))
-            if seen[j * nx + i]
-        ]
-        i, j = np.array(around) % nx, np.array(around) // nx
-        places = offset[around] + np.stack([grid.x_mm[i], grid.y_mm[j]], axis=-1)
-        basis = np.column_stack([np.ones(len(around)), places - places.mean(axis=0)])
-        if np.linalg.matrix_rank(basis, tol=0.1 * grid.cell_size_mm) < 3:
+    off = (np.abs(offset) > 0.02 * grid.cell_size_mm).any(axis=1) & seen
+    rows, columns, weights = _gradients(
+        np.flatnonzero(off), offset, places, coverage.ravel(), grid.shape, grid.cell_size_mm
+    )
+    return sparse.csr_array((weights, (rows, columns)), shape=(seen.size, seen.size))
+
+
+@numba.njit(cache=True, nogil=True)
+def _gradients(
+    chosen: Array, offset: Array, places: Array, coverage: Array, shape: tuple[int, int], cell_mm: float
+) -> tuple[Array, Array, Array]:
+    """Entries of `centring`: a plane fitted to the 3 x 3 cells around each, weighted by how much of them is seen."""
+    rows, columns = np.empty(9 * len(chosen), np.int64), np.empty(9 * len(chosen), np.int64)
+    weights = np.empty(9 * len(chosen))
+    count = 0
+    around = np.empty(9, np.int64)
+    for cell in chosen:
+        y, x = cell // shape[1], cell % shape[1]
+        n, total, mx, my = 0, 0.0, 0.0, 0.0
+        for j in range(max(y - 1, 0), min(y + 2, shape[0])):
+            for i in range(max(x - 1, 0), min(x + 2, shape[1])):
+                other = j * shape[1] + i
+                if coverage[other] >= LEAST_COVERAGE:
+                    around[n] = other
+                    n += 1
+                    total += coverage[other]
+                    mx += coverage[other] * places[other, 0]
+                    my += coverage[other] * places[other, 1]
+        mx, my = mx / total, my / total
+        sxx, sxy, syy = 0.0, 0.0, 0.0
+        for k in range(n):
+            w, dx, dy = coverage[around[k]], places[around[k], 0] - mx, places[around[k], 1] - my
+            sxx, sxy, syy = sxx + w * dx * dx, sxy + w * dx * dy, syy + w * dy * dy
+        det = sxx * syy - sxy * sxy
+        # Cells in a line have no gradient across it; such a cell stays where it is seen.
+        if det < 0.05 * cell_mm**4:
             continue
-        weight = np.sqrt(coverage.ravel()[around])
-        gradient = (np.linalg.pinv(basis * weight[:, None]) * weight)[1:]
-        rows.extend([cell] * len(around))
-        columns.extend(around)
-        weights.extend(-(offset[cell] @ gradient))
-    return sparse.csr_array((weights, (rows, columns)), shape=(ny * nx, ny * nx))
+        for k in range(n):
+            w, dx, dy = coverage[around[k]], places[around[k], 0] - mx, places[around[k], 1] - my
+            gx, gy = w * (syy * dx - sxy * dy) / det, w * (sxx * dy - sxy * dx) / det
+            rows[count], columns[count] = cell, around[k]
+            weights[count] = -(offset[cell, 0] * gx + offset[cell, 1] * gy)
+            count += 1
+    return rows[:count], columns[:count], weights[:count]
