@@ -22,6 +22,7 @@ from fusion.model import ModelFit, Term, fit_model, refit_fixed
 from fusion.readings import Readings
 from fusion.scoring import FamilyScore
 from fusion.search import Search, member_of
+from fusion.shape import wrong_patterns
 from fusion.story import LoopResult, Step, coefficients_of, make_step, nuisance_size, persistence, rmse
 
 #: Chance of adding an effect where nothing is missing, in the second look after the seal has been opened.
@@ -30,7 +31,7 @@ SEALED_SHARE = 0.2
 MOST_EFFECTS = 4
 _SUPERFLUOUS_GAIN = 2.0
 #: An effect is withdrawn where the error on the sealed cycles grows by more than this factor with it.
-_WORSE = 1.01
+_WORSE = 1.05
 #: More events than this are no events but a switching that the library has no name for.
 MOST_EVENTS = 2
 
@@ -104,6 +105,7 @@ def close_loop(
     ]
     report(MOST_EFFECTS + 1, MOST_EFFECTS + 2, "second look, at all cycles")
     whole, steps = _second_look(search, whole, steps, errors[-1], rounds)
+    whole, steps = _keep_right_patterns(search, whole, steps, len(terms))
     remainder = _remainder(whole, seed, set_aside)
     report(MOST_EFFECTS + 2, MOST_EFFECTS + 2, "loop closed")
     return LoopResult(
@@ -252,6 +254,29 @@ def _second_look(
         steps = [*steps, Step(**{**vars(step), "confirmed": confirmed})]
         error = after
     return whole, steps
+
+
+def _keep_right_patterns(
+    search: Search, whole: ModelFit, steps: list[Step], declared: int
+) -> tuple[ModelFit, list[Step]]:
+    """Withdraw the name of an effect whose pattern along the axis is not what the readings show; it was the nearest, not the cause."""
+    wrong = wrong_patterns(whole, whole.terms[declared:])
+    if not wrong:
+        return whole, steps
+    for number, reason in wrong.items():
+        search.blocked[steps[number].effect] = f"withdrawn: {reason}"
+    kept = [k for k in range(len(steps)) if k not in wrong]
+    added = [whole.terms[declared + k] for k in kept]
+    named = list(whole.terms[:declared])
+    # Errors of the steps that remain are those without the withdrawn ones.
+    chained = _chain_errors(search, named, added, [steps[k] for k in kept])
+    return _keep_right_patterns(search, fit_model(search.readings, [*named, *added]), chained, declared)
+
+
+def _chain_errors(search: Search, declared: list[Term], added: list[Term], steps: list[Step]) -> list[Step]:
+    """The same steps with the errors on the sealed cycles that they have one after the other."""
+    errors = [rmse(search.fit([*declared, *added[:k]]).open_loop_errors()[0]) for k in range(len(added) + 1)]
+    return [replace(step, rmse_before_um=errors[k], rmse_after_um=errors[k + 1]) for k, step in enumerate(steps)]
 
 
 def _events(steps: Sequence[Step]) -> int:
