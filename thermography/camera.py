@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, stats
 
-from thermography.flir import CameraParameters, FrameHeader, FrameReference
-from thermography.radiometry import RadiometryError, calibrate, counts_from_temperature, override
+from thermography.flir import CameraParameters, FrameReference
+from thermography.radiometry import RadiometryError, calibrate
 
 Cause = Literal["flat_field_step", "transient", "repeated_frame", "frozen_frames", "camera_drift"]
 #: More equal frames in a row than this are a stopped camera, not a frame written twice.
@@ -191,38 +191,6 @@ def anchor(levels: Levels, steps: Sequence[CameraFlag]) -> NDArray[np.float64]:
         if step.cause == "flat_field_step":
             offset[step.index :] += step.value_K
     return offset
-
-
-def anchored(
-    parameters: Callable[[FrameHeader], CameraParameters],
-    levels: Levels,
-    steps: Sequence[CameraFlag],
-    *,
-    at_degC: float = 25.0,
-) -> Callable[[FrameHeader], CameraParameters]:
-    """Return a function from frames to parameters that takes the steps out while calibrating.
-
-    A flat-field correction shifts the counts of the detector, which is what Planck O is. In kelvin the shift is the step itself at
-    `at_degC`, and 1 % less for each kelvin that a surface is warmer.
-
-    Parameters
-    ----------
-    parameters : callable
-        As given to `read_levels`.
-    levels : Levels
-    steps : sequence of CameraFlag
-    at_degC : float
-        Surface temperature at which the steps were seen.
-    """
-    offsets = anchor(levels, steps)
-
-    def corrected(frame: FrameHeader) -> CameraParameters:
-        before = parameters(frame)
-        offset = offsets[max(int(np.searchsorted(levels.time, frame.time, side="right")) - 1, 0)]
-        low, high = counts_from_temperature([at_degC - offset / 2, at_degC + offset / 2], before)
-        return override(before, planck_o=before.planck_o - float(high - low))
-
-    return corrected
 
 
 def _excess_change(levels: Levels, fresh: NDArray[np.intp]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:

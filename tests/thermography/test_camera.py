@@ -15,7 +15,6 @@ from thermography.camera import (
     OFFSET,
     Levels,
     anchor,
-    anchored,
     find_bad_pixels,
     find_repeats,
     find_steps,
@@ -23,7 +22,7 @@ from thermography.camera import (
     regress_drift,
 )
 from thermography.flir import FrameReference, index_frames, write_sequence
-from thermography.radiometry import RadiometryError, calibrate, counts_from_temperature
+from thermography.radiometry import RadiometryError, counts_from_temperature
 
 ROWS, COLUMNS = 48, 64
 NOISE_K = 0.05
@@ -78,18 +77,6 @@ def test_planted_steps_are_found_where_they_are_and_re_anchored(
     smooth = offset - sum(np.where(np.arange(200) >= index, height, 0) for index, height in planted.items())
     left = offset - anchor(levels, steps) - smooth
     assert np.abs(left).max() < 0.030
-
-
-def test_steps_are_taken_out_while_calibrating(tmp_path: Path, rng: np.random.Generator) -> None:
-    frames, _ = _record(tmp_path / "a.seq", 120, rng, steps={60: 0.4})
-    levels = read_levels(frames)
-    parameters = anchored(lambda each: each.parameters, levels, find_steps(levels), at_degC=22.5)
-    assert parameters(frames[59]).planck_o == PARAMETERS.planck_o
-    before, after = (calibrate(frames[i].read_counts(), parameters(frames[i])).mean() for i in (59, 60))
-    # Half a millikelvin of drift, 1 mK of noise in each mean, and the step itself to 30 mK.
-    assert after - before == pytest.approx(0.0, abs=0.03)
-    again = read_levels(frames, parameters)  # type: ignore[arg-type]
-    assert find_steps(again) == []
 
 
 def test_a_reference_region_serves_when_the_scene_warms_everywhere(tmp_path: Path, rng: np.random.Generator) -> None:
