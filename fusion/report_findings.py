@@ -130,8 +130,10 @@ def runner_up(found: Mapping[str, Any]) -> str:
     """Return the second best effect of a step and how far behind it is."""
     if not found:
         return "none"
-    behind = number(found.get("behind_by"), 2)
-    return f"{wording.effect_name(found['effect'])}, behind by {behind} in log-likelihood"
+    name, behind = wording.effect_name(found["effect"]), float(found["behind_by"])
+    if behind < 0:
+        return f"{name}, {number(-behind, 2)} more in log-likelihood but not confirmed"
+    return f"{name}, {number(behind, 2)} less in log-likelihood"
 
 
 def print_unit(unit: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import xarray as xr
 
 from fusion import cf
 from fusion.alignment import align
+from fusion.attribution import LEVEL
 from fusion.collinearity import cluster_cells, evidence_at
 from fusion.correlation import correlate
 from fusion.diagnosis import Diagnosis, diagnose
@@ -108,7 +109,7 @@ def correlate_field(fields: xr.Dataset, fused: xr.Dataset, *, report: Report) ->
     report("sensor places", 0, 1)
     maps = joined(maps, clusters=cluster_cells(film), sensors=sensor_variables(choose_sensors(fused, film)))
     report("sensor places", 1, 1)
-    return Outcome(maps, {"hotspots": hotspot_part(fields, maps)})
+    return Outcome(maps, {"hotspots": hotspot_part(fields, maps, fused)})
 
 
 def sensor_variables(sets: Sequence[SensorSet]) -> xr.Dataset:
@@ -252,18 +253,28 @@ def centred(fit: ModelFit) -> np.ndarray:
     return residual - residual.mean()
 
 
-def hotspot_part(fields: xr.Dataset, maps: xr.Dataset) -> list[dict[str, Any]]:
+def hotspot_part(fields: xr.Dataset, maps: xr.Dataset, fused: xr.Dataset) -> list[dict[str, Any]]:
     """Return the hotspots of the last cycle with what the correlation says of their place."""
-    return [_hotspot(spot, maps) for spot in detect_hotspots(fields["temperature_rise"].isel(cycle=-1))]
+    return [_hotspot(spot, maps, fused) for spot in detect_hotspots(fields["temperature_rise"].isel(cycle=-1))]
 
 
-def _hotspot(spot: Hotspot, maps: xr.Dataset) -> dict[str, Any]:
+def driven_targets(maps: xr.Dataset, fused: xr.Dataset, evidence: Mapping[str, float | str]) -> list[int]:
+    """Return the targets that a place drives: none unless the session tells, all for a shift, those away from zero for a stretch."""
+    if maps.attrs["verdict"] != "attributable" or float(evidence["p_value"]) > LEVEL:
+        return []
+    away = (
+        fused["position"].values != 0 if evidence["channel"] == "proportional" else np.ones(fused.sizes["target"], bool)
+    )
+    return fused["target"].values[away].astype(int).tolist()
+
+
+def _hotspot(spot: Hotspot, maps: xr.Dataset, fused: xr.Dataset) -> dict[str, Any]:
     evidence = evidence_at(maps, spot.x_mm, spot.y_mm)
     return {
         "x_mm": spot.x_mm,
         "y_mm": spot.y_mm,
         "peak_rise_K": spot.peak_rise_K,
-        "targets": [],
+        "targets": driven_targets(maps, fused, evidence),
         "p_value": evidence["p_value"],
         "lag_s": evidence["lag_s"],
     }

@@ -163,9 +163,10 @@ def verdict_headline(loop: Mapping[str, Any]) -> str:
     """Return one sentence that states what the closed loop found."""
     added = join([effect_name(step["effect"]) for step in loop["steps"]])
     left = loop["unexplained"]["shape"] or "without a clear shape"
+    noun, pronoun = ("an effect", "it") if len(loop["steps"]) == 1 else (f"{len(loop['steps'])} effects", "them")
     return {
         "complete": "The declared model explains the drift; nothing in these data shows that an effect is missing.",
-        "explained": f"The declared model lacked an effect: {added}. With it, nothing is left that these data can show.",
+        "explained": f"The declared model lacked {noun}: {added}. With {pronoun}, nothing is left that these data can show.",
         "partial": f"The declared model lacked {added}; after adding it, something without a name is left ({left}).",
         "unexplained": f"Something is left that no effect of the library explains ({left}).",
     }[loop["verdict"]]

@@ -1,5 +1,5 @@
 """The campaign file: every promise kept for good input, one exact message per kind of bad input."""
-# ruff: noqa: E501 - messages are quoted whole
+
 
 from __future__ import annotations
 
