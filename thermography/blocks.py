@@ -110,7 +110,7 @@ def cut_blocks(
 
 
 def reduce_block(
-    frames: Sequence[FrameReference], parameters: CameraParameters, camera: Camera, *, keep_statistics: bool = False
+    frames: Sequence[FrameReference], parameters: CameraParameters, camera: Camera, keep_statistics: bool = False
 ) -> BlockResult:
     """Read the frames of a block and reduce them; counts are averaged, and calibrated one by one only where they vary too much."""
     window = camera.weights.window

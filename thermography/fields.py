@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from thermography.blocks import Block, BlockResult, Camera, Override, cut_blocks, reduce_block
-from thermography.cycles import NOT_NUMBERED, CyclePart, annotate, assemble, position_covariance
+from thermography.blocks import Override, cut_blocks, reduce_block
+from thermography.checkpoint import Checkpoint, describe
+from thermography.cycles import NOT_NUMBERED
 from thermography.flir import FrameReference
-from thermography.knocks import KNOCK_PX, SUSPECT_PX, RegisteredFrom, fiducial_shift, register_anew, watch
+from thermography.knocks import RegisteredFrom
 from thermography.plan import PlanGrid
-from thermography.radiometry import calibrate
+from thermography.reduction import Reduction
 from thermography.registration import Registration
-from thermography.resampling import plan_weights
 from thermography.scheduling import in_order, open_pool
 
 __all__ = [
@@ -35,8 +34,6 @@ Array = NDArray[Any]
 
 #: Frames of one cycle that follow each other within this time share one field of the frame stack.
 BLOCK_S = 10.0
-#: Frames whose mean the plan is registered on anew after a knock.
-RENEWAL_FRAMES = 8
 
 
 class FieldError(ValueError):
@@ -53,6 +50,7 @@ def reduce_frames(
     correction_K: Array | None = None,
     block_s: float = BLOCK_S,
     scheduler: str | None = None,
+    checkpoint: str | Path | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> xr.Dataset:
     """Reduce frames of a still table to one temperature field per cycle on the table plan.
@@ -79,6 +77,9 @@ def reduce_frames(
         Frames of one cycle within this time share one field of `frame_temperature`; 0 gives every frame its own.
     scheduler
         Address of a dask scheduler whose workers see the same files; without it two threads do the work.
+    checkpoint
+        Folder to which every finished cycle is written with the sums of its counts. A run that finds the folder goes on after the
+        last finished cycle; `thermography.checkpoint.recalibrate` calibrates the cycles anew without the frames.
     progress
         Called with the number of frames done since the last call.
 
@@ -93,6 +94,8 @@ def reduce_frames(
     ------
     FieldError
         No frame, frames of different sizes, frames out of order, cycles that overlap, or no frame within any cycle.
+    CheckpointError
+        The checkpoint belongs to another reduction.
     """
     spans = [RegisteredFrom(0, registration)] if isinstance(registration, Registration) else list(registration)
     _check_spans(spans)
@@ -105,15 +108,24 @@ def reduce_frames(
             f"no frame lies within a cycle: frames {times[0]} to {times[-1]}, cycles {bounds[0, 0]} to {bounds[-1, 1]}; "
             "check the time zones and the clock offset"
         )
-    run = _Reduction(references, times, correction, grid, spans, override)
-    done = 0
+    kept = None
+    if checkpoint is not None:
+        parameters = [override(frame) for frame in references]
+        kept = Checkpoint(checkpoint, describe(references, parameters, correction, bounds, grid, spans, block_s))
+    run = Reduction(references, times, correction, grid, spans, override, kept)
+    done = run.resume(override)
+    if progress is not None and done:
+        progress(done)
     with open_pool(scheduler) as pool:
         while done < len(references):
             blocks = cut_blocks(
                 references, times, cycles, run.spans, correction, override=override, block_s=block_s, first=done
             )
             cameras = [pool.share(camera) for camera in run.cameras]
-            tasks = ((b, (reduce_block, references[b.first : b.stop], b.parameters, cameras[b.span])) for b in blocks)
+            tasks = (
+                (b, (reduce_block, references[b.first : b.stop], b.parameters, cameras[b.span], run.keep_statistics))
+                for b in blocks
+            )
             results = in_order(pool, tasks)
             for block, result in results:
                 if run.renew(block, result):
@@ -124,116 +136,6 @@ def reduce_frames(
                 if progress is not None:
                     progress(block.stop - block.first)
     return run.dataset(bounds, cycles)
-
-
-@dataclass
-class _Reduction:
-    """What has been gathered so far, in the order of time: the registrations, the open cycle, and the frame stack."""
-
-    references: Sequence[FrameReference]
-    times: Array
-    correction_K: Array
-    grid: PlanGrid
-    spans: list[RegisteredFrom]
-    override: Override
-    cameras: list[Camera] = field(default_factory=list)
-    parts: list[CyclePart] = field(default_factory=list)
-    blocks: list[Block] = field(default_factory=list)
-    stack: list[NDArray[np.float32]] = field(default_factory=list)
-    shift_px: Array = field(default_factory=lambda: np.empty(0))
-    shaken: set[int] = field(default_factory=set)
-    baseline_px: Array = field(default_factory=lambda: np.zeros(2))
-
-    def __post_init__(self) -> None:
-        self.shift_px = np.full(len(self.references), np.nan)
-        self.cameras = [self._camera(span.registration) for span in self.spans]
-
-    def _camera(self, registration: Registration) -> Camera:
-        weights = plan_weights(registration, self.grid)
-        return Camera(weights, watch(registration, self.grid, weights.window))
-
-    def renew(self, block: Block, result: BlockResult) -> bool:
-        """Look for a knock in a block; register anew from its first moved frame and return True, so that the block is cut again."""
-        for i, seen in zip(range(block.first, block.stop), result.shift_px, strict=True):
-            shift = seen - self.baseline_px
-            if np.hypot(*shift) > SUSPECT_PX:
-                exact = self._exact_shift(i, block.span)
-                if np.hypot(*exact) > KNOCK_PX:
-                    if i + 1 == len(self.references) or _alike(self._exact_shift(i + 1, block.span), exact):
-                        self._renew_from(i, block.span, exact)
-                        return True
-                    self.shaken.add(i)
-                elif np.isfinite(exact).all():
-                    self.baseline_px = seen - exact
-                shift = exact
-            self.shift_px[i] = np.hypot(*shift)
-        return False
-
-    def _exact_shift(self, i: int, span: int) -> Array:
-        return fiducial_shift(self._temperature(i), self.spans[span].registration, self.grid)
-
-    def _temperature(self, i: int) -> Array:
-        return calibrate(self.references[i].read().counts, self.override(self.references[i]))
-
-    def _renew_from(self, i: int, span: int, shift: Array) -> None:
-        later = [
-            j
-            for j in range(i + 1, min(i + RENEWAL_FRAMES, len(self.references)))
-            if self._same_place(j, i, span, shift)
-        ]
-        frame = np.mean([self._temperature(j) for j in [i, *later]], axis=0, dtype=float)
-        registration = register_anew(frame, self.spans[span].registration, shift, self.grid, where=self._name(i))
-        self.spans.insert(span + 1, RegisteredFrom(i, registration, (float(shift[0]), float(shift[1]))))
-        self.cameras.insert(span + 1, self._camera(registration))
-        self.baseline_px = np.zeros(2)
-
-    def _same_place(self, j: int, i: int, span: int, shift: Array) -> bool:
-        following = self.spans[span + 1].first if span + 1 < len(self.spans) else len(self.references)
-        return j < following and _alike(self._exact_shift(j, span), shift)
-
-    def gather(self, block: Block, result: BlockResult) -> None:
-        """Add a block to the stack and to the cycle that is open; a block of the next cycle or registration closes it."""
-        offset = float(self.correction_K[block.first : block.stop].mean())
-        self.blocks.append(block)
-        self.stack.append((result.cells + offset).astype(np.float32))
-        if block.cycle == NOT_NUMBERED:
-            return
-        last = self.parts[-1] if self.parts else None
-        if last is None or (last.cycle, last.span) != (block.cycle, block.span):
-            if last is not None:
-                last.finish(self.cameras[last.span].weights)
-            self.parts.append(CyclePart(block.cycle, block.span))
-        temperature = replace(result.temperature, mean=result.temperature.mean + offset)
-        self.parts[-1].add(temperature, self.times[block.first : block.stop])
-
-    def dataset(self, bounds: Array, cycles: Array) -> xr.Dataset:
-        """Put everything together."""
-        if self.parts:
-            self.parts[-1].finish(self.cameras[self.parts[-1].span].weights)
-        covariances = [position_covariance(span.registration, self.grid) for span in self.spans]
-        coverages = [camera.weights.coverage for camera in self.cameras]
-        blocks = self.blocks
-        fields = assemble(self.parts, len(bounds), self.grid, covariances, coverages).assign(
-            frame_temperature=(("time", "y", "x"), np.stack(self.stack)),
-            frame_cycle=("time", np.array([b.cycle + 1 for b in blocks], np.int32)),
-            frame_count=("time", np.array([b.stop - b.first for b in blocks], np.int32)),
-            frame_shift=("time", np.array([_largest(self.shift_px[b.first : b.stop]) for b in blocks], np.float32)),
-        )
-        middles = [self.times[b.first] + (self.times[b.first : b.stop] - self.times[b.first]).mean() for b in blocks]
-        knocks = [
-            {"frame": self._name(s.first), "index": s.first, "shift_px": list(s.shift_px)} for s in self.spans[1:]
-        ]
-        texts = {
-            "frames_outside_cycles": [self._name(i) for i in np.flatnonzero(cycles == NOT_NUMBERED)],
-            "knocks": knocks,
-            "frames_shaken": [self._name(i) for i in sorted(self.shaken)],
-            "frames_unchecked": [self._name(i) for i in np.flatnonzero(np.isnan(self.shift_px))],
-        }
-        fields = annotate(fields.assign_coords(time=np.array(middles)))
-        return fields.assign_attrs({name: json.dumps(value) for name, value in texts.items()})
-
-    def _name(self, i: int) -> str:
-        return f"{self.references[i].path.name}#{self.references[i].index}"
 
 
 def check_bounds(cycle_bounds: Array) -> Array:
@@ -295,12 +197,3 @@ def check_correction(correction_K: Array | None, frames: int) -> Array:
             f"correction_K has shape {correction.shape}; it needs one finite value for each of {frames} frames"
         )
     return correction
-
-
-def _alike(one: Array, other: Array) -> bool:
-    return bool(np.hypot(*one) > KNOCK_PX and np.hypot(*(one - other)) < max(KNOCK_PX, 0.3 * np.hypot(*other)))
-
-
-def _largest(values: Array) -> float:
-    known = values[np.isfinite(values)]
-    return float(known.max()) if known.size else float("nan")
