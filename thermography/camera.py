@@ -3,7 +3,7 @@
 A bolometer camera closes its shutter now and then to re-zero its pixels (flat-field correction, FFC); afterwards the whole picture
 sits a few tenths of a kelvin higher or lower. `read_levels` reduces each frame to the level of a reference in one pass; the finders
 work on these levels, so they cost nothing and never touch the frames again. Every finding is a `CameraFlag`; `anchor` says what to
-subtract from each frame.
+add to each frame.
 """
 
 from __future__ import annotations
@@ -185,12 +185,12 @@ def find_steps(levels: Levels, *, smallest_step_K: float = 0.1, threshold: float
 
 
 def anchor(levels: Levels, steps: Sequence[CameraFlag]) -> NDArray[np.float64]:
-    """Return what to subtract from the temperature of each frame (time,), K, so that steps vanish; the first frame stays."""
-    offset = np.zeros(len(levels.time))
+    """Return what to add to the temperature of each frame (time,), K, so that steps vanish; the first frame stays."""
+    correction = np.zeros(len(levels.time))
     for step in steps:
         if step.cause == "flat_field_step":
-            offset[step.index :] += step.value_K
-    return offset
+            correction[step.index :] -= step.value_K
+    return correction
 
 
 def _excess_change(levels: Levels, fresh: NDArray[np.intp]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
@@ -235,24 +235,28 @@ class CameraDrift:
 
     Attributes
     ----------
-    offset : ndarray (time,)
-        What to subtract from each frame, K; 0 at the first frame, and 0 everywhere where the housekeeping explains nothing.
+    correction : ndarray (time,)
+        What to add to each frame, K; 0 at the first frame, and 0 everywhere where the housekeeping explains nothing.
     coefficients : dict of str to float
         K per K of each sensor.
     explained : float
         Share of the variance of the level that the housekeeping explains.
     p_value : float
         Of that share, with the number of independent frames reduced by their autocorrelation.
+    flag : CameraFlag or None
+        What was corrected; None where nothing was.
     """
 
-    offset: NDArray[np.float64]
+    correction: NDArray[np.float64]
     coefficients: dict[str, float]
     explained: float
     p_value: float
+    flag: CameraFlag | None = None
 
 
 def regress_drift(
-    level: NDArray[np.float64],
+    levels: Levels,
+    steps: Sequence[CameraFlag],
     camera_temperature: NDArray[np.float64],
     sensors: Sequence[str],
     *,
@@ -262,8 +266,10 @@ def regress_drift(
 
     Parameters
     ----------
-    level : ndarray (time,)
-        Level of a patch that keeps its temperature, K, after `anchor`.
+    levels : Levels
+        Of a patch that keeps its temperature: what it does is the camera's doing.
+    steps : sequence of CameraFlag
+        From `find_steps`; taken out first.
     camera_temperature : ndarray (time, sensor)
         K; sensors with gaps or without change are left out.
     sensors : sequence of str
@@ -274,6 +280,7 @@ def regress_drift(
     -------
     CameraDrift
     """
+    level = levels.level + anchor(levels, steps)
     moving = np.isfinite(camera_temperature).all(axis=0) & (np.ptp(camera_temperature, axis=0) > 0)
     names = [name for name, use in zip(sensors, moving, strict=True) if use]
     nothing = CameraDrift(np.zeros(len(level)), {}, 0.0, 1.0)
@@ -290,9 +297,12 @@ def regress_drift(
     p_value = _p_value(explained, int(kept.sum()), target - fitted, target)
     coefficients = right[kept].T @ (projection / singular[kept])
     if p_value > significance:
-        return CameraDrift(nothing.offset, {}, explained, p_value)
+        return CameraDrift(nothing.correction, {}, explained, p_value)
     by_name = dict(zip(names, coefficients.tolist(), strict=True))
-    return CameraDrift(fitted - fitted[0], by_name, explained, p_value)
+    size, u = float(np.ptp(fitted)), float(np.std(target - fitted))
+    text = f"the camera's own temperatures explain {explained:.0%} of a drift; up to {size:.3f} K were taken out"
+    flag = CameraFlag("camera_drift", 0, levels.time[0], size, u, text)
+    return CameraDrift(fitted[0] - fitted, by_name, explained, p_value, flag)
 
 
 def _p_value(explained: float, regressors: int, residual: NDArray[np.float64], target: NDArray[np.float64]) -> float:

@@ -75,7 +75,7 @@ def test_planted_steps_are_found_where_they_are_and_re_anchored(
         assert step.value_K == pytest.approx(planted[step.index], abs=0.03)
         assert 0 < step.value_u_K < 0.02
     smooth = offset - sum(np.where(np.arange(200) >= index, height, 0) for index, height in planted.items())
-    left = offset - anchor(levels, steps) - smooth
+    left = offset + anchor(levels, steps) - smooth
     assert np.abs(left).max() < 0.030
 
 
@@ -155,6 +155,10 @@ def test_repeated_and_frozen_frames_are_told_apart(tmp_path: Path) -> None:
 # Slow drift ----------------------------------------------------------------------------------------------------------
 
 
+def _of(level: np.ndarray) -> Levels:
+    return _levels(np.diff(level, prepend=0.0))
+
+
 def _temperatures(frames: int, rng: np.random.Generator) -> np.ndarray:
     """Three camera temperatures (K) of a body that warms and of a room that breathes; the last one is constant."""
     t = np.linspace(0, 8, frames)
@@ -168,20 +172,23 @@ def test_drift_with_the_camera_is_explained_and_removed(rng: np.random.Generator
     temperature = _temperatures(400, rng)
     drift = 0.08 * (temperature[:, 0] - 300) - 0.05 * (temperature[:, 1] - 299)
     level = drift - drift[0] + rng.normal(0, 0.005, 400)
-    found = regress_drift(level, temperature, ["TSCapsule", "TSLens", "TSShutter"])
+    found = regress_drift(_of(level), [], temperature, ["TSCapsule", "TSLens", "TSShutter"])
     assert found.p_value < 1e-6 and found.explained > 0.9
     assert found.coefficients["TSCapsule"] == pytest.approx(0.08, abs=0.01)
     assert found.coefficients["TSLens"] == pytest.approx(-0.05, abs=0.015)
     assert "TSShutter" not in found.coefficients
-    assert np.std(level - found.offset) < 0.007 < np.std(level)
+    assert found.flag is not None and found.flag.cause == "camera_drift"
+    assert found.flag.value_K == pytest.approx(np.ptp(drift), rel=0.05)
+    assert "of a drift; up to 0." in found.flag.message
+    assert np.std(level + found.correction) < 0.007 < np.std(level)
 
 
 def test_noise_is_not_explained_by_the_camera() -> None:
     corrected = 0
     for seed in range(100):
         rng = np.random.default_rng(seed)
-        found = regress_drift(rng.normal(0, 0.01, 300), _temperatures(300, rng), ["a", "b", "c"])
-        corrected += bool(found.offset.any())
+        found = regress_drift(_of(rng.normal(0, 0.01, 300)), [], _temperatures(300, rng), ["a", "b", "c"])
+        corrected += bool(found.correction.any())
     # One in a hundred by chance at a significance of 0.01; 5 or more has a probability of 0.4 %.
     assert corrected < 5
 
@@ -192,15 +199,27 @@ def test_a_wandering_level_is_not_easily_explained() -> None:
     for seed in range(100):
         rng = np.random.default_rng(seed)
         wander = np.cumsum(rng.normal(0, 1, (300, 2)), axis=0)
-        found = regress_drift(wander[:, 0] * 0.01, 300 + wander[:, 1:], ["TSLens"])
-        corrected += bool(found.offset.any())
+        found = regress_drift(_of(wander[:, 0] * 0.01), [], 300 + wander[:, 1:], ["TSLens"])
+        corrected += bool(found.correction.any())
     assert corrected <= 10
 
 
 @pytest.mark.parametrize("temperature", [np.full((50, 1), 300.0), np.full((50, 1), np.nan)])
 def test_sensors_without_change_or_with_gaps_explain_nothing(temperature: np.ndarray) -> None:
-    found = regress_drift(np.linspace(0, 1, 50), temperature, ["TSLens"])
-    assert not found.offset.any() and found.coefficients == {} and found.p_value == 1.0
+    found = regress_drift(_of(np.linspace(0, 1, 50)), [], temperature, ["TSLens"])
+    assert not found.correction.any() and found.coefficients == {} and found.p_value == 1.0 and found.flag is None
+
+
+def test_steps_are_no_drift(rng: np.random.Generator) -> None:
+    """A step that happens while the camera warms must not pass for its drift."""
+    temperature = _temperatures(300, rng)
+    level = rng.normal(0, 0.003, 300) + np.where(np.arange(300) >= 150, 0.4, 0.0)
+    levels = _of(level)
+    steps = find_steps(levels)
+    assert [step.index for step in steps] == [150]
+    found = regress_drift(levels, steps, temperature, ["a", "b", "c"])
+    # The step is known to about 3 mK, and only that rest may look like drift.
+    assert np.ptp(found.correction) < 0.01
 
 
 # Bad pixels ----------------------------------------------------------------------------------------------------------
