@@ -82,10 +82,7 @@ def linuxcnc(table: pd.DataFrame) -> str:
     """Return a COMP_FILE of type 0: triplets of nominal, and true position by the forward and by the reverse approach, in mm."""
     if len(table) > LINUXCNC_POINTS:
         raise ExportError(f"{len(table)} positions; LinuxCNC reads at most {LINUXCNC_POINTS} per joint, measure fewer")
-    rows = [
-        f"{row.position:.4f} {row.position + row.positive:.6f} {row.position + row.negative:.6f}"
-        for row in table.itertuples()
-    ]
+    rows = [f"{place:.4f} {place + forward:.6f} {place + reverse:.6f}" for place, forward, reverse in _rows(table)]
     return "\n".join(rows) + "\n"
 
 
@@ -116,7 +113,7 @@ def heidenhain(table: pd.DataFrame) -> str:
     step = _spacing(table, "Heidenhain")
     start = table["position"].iloc[0]
     head = f"BEGIN AXIS-X.COM DATUM:{start:+.4f} DISTANCE:{step:+.4f}"
-    rows = [f"{at} {row.positive:+.6f} {row.positive - row.negative:+.6f}" for at, row in enumerate(table.itertuples())]
+    rows = [f"{at} {forward:+.6f} {forward - reverse:+.6f}" for at, (_, forward, reverse) in enumerate(_rows(table))]
     return "\n".join([head, "NR X BACKLASH", *rows, "[END]"]) + "\n"
 
 
@@ -129,8 +126,8 @@ def renishaw(table: pd.DataFrame) -> str:
         f"Compensation spacing {step:.4f}",
         "No. Position Forward Reverse",
         *(
-            f"{at} {row.position:.4f} {row.positive * 1e3:.3f} {row.negative * 1e3:.3f}"
-            for at, row in enumerate(table.itertuples(), start=1)
+            f"{at} {place:.4f} {forward * 1e3:.3f} {reverse * 1e3:.3f}"
+            for at, (place, forward, reverse) in enumerate(_rows(table), start=1)
         ),
     ]
     return "\n".join(lines) + "\n"
@@ -142,6 +139,12 @@ _CONTROLS: dict[str, tuple[Callable[[pd.DataFrame], str], str]] = {
     "heidenhain": (heidenhain, "com"),
     "renishaw": (renishaw, "ren"),
 }
+
+
+def _rows(table: pd.DataFrame) -> list[tuple[float, float, float]]:
+    """Return position and profile by the forward and the reverse approach, mm, as plain numbers."""
+    columns = [table[name].to_numpy(dtype=float).tolist() for name in ("position", "positive", "negative")]
+    return list(zip(*columns, strict=True))
 
 
 def _spacing(table: pd.DataFrame, control: str) -> float:

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from thermography.inspection import inspect_file, is_flir_file
 
 from fusion.sources import left_out_notices
 from fusion.wording import moment
 from interferometry.readers import read_deviations, read_environment
+from thermography.inspection import inspect_file, is_flir_file
 
 
 def describe_file(path: Path) -> list[str]:
