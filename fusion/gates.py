@@ -56,6 +56,11 @@ def blocked_reason(
             f"one warm-up only excited the machine ({100 * share:.1f} % of the candidate is a plain warm-up), and beside free "
             f"warm-ups it gains only {gain:.1f} in log-likelihood; switch the load on purpose to tell"
         )
+    if effect.excited_by == "field" and _follows_the_rate(part, model, member):
+        return (
+            "beside it the field's own coefficient takes the opposite sign and nearly cancels it: the readings follow the rate at "
+            "which the table warms, which is the power of a source, not a lag"
+        )
     if effect.excited_by == "field":
         smoothed = smoothed_copy(part, float(member.parameters["time_constant_min"]))
         advantage = _gain(part, model, member, None) - _gain(part, model, smoothed, None)
@@ -109,6 +114,21 @@ def _residual_share(course: Array, curve: Array) -> float:
     basis = np.column_stack([np.ones(course.size), curve])
     left = course - basis @ np.linalg.lstsq(basis, course, rcond=None)[0]
     return float(left @ left) / max(float(((course - course.mean()) ** 2).sum()), 1e-300)
+
+
+def _follows_the_rate(part: Readings, model: ModelFit, member: Member) -> bool:
+    """True where the field and its delayed copy enter with opposite signs and little is left in the long run."""
+    fit = fit_fixed_effects(model.fit.system, model.fit.response, np.column_stack([model.fit.design, member.columns]))
+    at_once = dict(zip(("table_offset", "axis_expansion"), ("um/K", "ppm/K"), strict=True))
+    for term in model.terms:
+        unit = at_once.get(term.effect)
+        if unit not in member.units:
+            continue
+        direct = float(fit.coefficients[model.place(term)][0])
+        delayed = float(fit.coefficients[model.fit.design.shape[1] + member.units.index(unit)])
+        if direct * delayed < 0.0 and abs(direct + delayed) < 0.5 * max(abs(direct), abs(delayed)):
+            return True
+    return False
 
 
 def _gain(part: Readings, model: ModelFit, member: Member, beside: Array | None) -> float:

@@ -205,9 +205,7 @@ def _re_examine(search: Search, models: list[ModelFit], chosen: Chosen) -> tuple
     model = models[-1]
     declared = len(models[0].terms)
     for k in range(len(chosen) - 1):
-        without = refit_fixed(model, [term for j, term in enumerate(model.terms) if j != declared + k])
-        gain = 0.5 * model.fit.response.size * np.log(without.rss / model.fit.rss)
-        if gain < _SUPERFLUOUS_GAIN:
+        if _loss(model, [term for j, term in enumerate(model.terms) if j != declared + k]) < _SUPERFLUOUS_GAIN:
             return _rebuild(search, models[0], [pair for j, pair in enumerate(chosen) if j != k])
     return models, chosen
 
@@ -251,9 +249,27 @@ def _second_look(
             after = rmse(search.fit(whole.terms).open_loop_errors()[0])
             confirmed = "named with the sealed cycles in view, coefficients from the cycles before: the error after is optimistic"
         step = make_step(whole, term, best, scores, error, after)
-        steps = [*steps, Step(**{**vars(step), "confirmed": confirmed})]
-        error = after
+        steps = [*steps, replace(step, confirmed=confirmed)]
+        whole, steps = _drop_superfluous(search, whole, steps)
+        error = steps[-1].rmse_after_um
     return whole, steps
+
+
+def _drop_superfluous(search: Search, whole: ModelFit, steps: list[Step]) -> tuple[ModelFit, list[Step]]:
+    """Drop an earlier effect that the newest has made superfluous, and follow the errors anew."""
+    declared = len(whole.terms) - len(steps)
+    for k in range(len(steps) - 1):
+        terms = [term for j, term in enumerate(whole.terms) if j != declared + k]
+        if _loss(whole, terms) < _SUPERFLUOUS_GAIN:
+            left = [step for j, step in enumerate(steps) if j != k]
+            chained = _chain_errors(search, terms[:declared], terms[declared:], left)
+            return _drop_superfluous(search, fit_model(search.readings, terms), chained)
+    return whole, steps
+
+
+def _loss(model: ModelFit, terms: Sequence[Term]) -> float:
+    """Log-likelihood that is lost with other terms, the drift's variances kept."""
+    return 0.5 * model.fit.response.size * float(np.log(refit_fixed(model, terms).rss / model.fit.rss))
 
 
 def _keep_right_patterns(

@@ -179,10 +179,13 @@ class Judge:
         return float(gain[0] / (2.0 * noise)), float((1 + (gain[1:] >= gain[0]).sum()) / gain.size)
 
     def _gain_in_time(self, y: Array, x: Array, c: Array) -> Array:
-        """Forward chaining: coefficients from all blocks before, error on the next one, summed over the later two thirds."""
+        """Forward chaining: coefficients from all blocks before, error on the next one, summed over the later half.
+
+        Before that, a load that has been switched only a few times leaves the coefficients undetermined.
+        """
         both, k, last = np.column_stack([x, c]), x.shape[1], int(self.blocks.max())
         gain = np.zeros(y.shape[1])
-        for block in range(max(1, last // 3) + 1, last + 1):
+        for block in range(max(1, last // 2) + 1, last + 1):
             train, test = self.blocks < block, self.blocks == block
             normal, moment = both[train].T @ both[train], both[train].T @ y[train]
             without = y[test] - x[test] @ _solve(normal[:k, :k], moment[:k])

@@ -22,6 +22,8 @@ CONFIRMATION_LEVEL = 0.2
 _WORTH_ASKING = 0.1
 #: Chance that the one question to the sealed readings is answered with yes where the effect is not there.
 ASKED_LEVEL = 0.02
+#: Effects whose log-likelihoods differ by less than this (odds of 20 to 1) are reported as a tie.
+TIE_GAIN = 3.0
 _BLOCKS = 10
 _MAY_REPEAT = frozenset({"step_event", "camera_offset", "sensor_fault", "periodic_disturbance"})
 
@@ -86,18 +88,28 @@ class Search:
         self, scores: Sequence[FamilyScore], model: ModelFit, *, level: float = ENTRY_LEVEL
     ) -> FamilyScore | None:
         """Best effect that is significant, confirmed and not blocked, its parameters refined."""
+        strongest = -np.inf
         for score in scores:
-            if score.member is None or score.family_wise_p > level or score.held_out_p > CONFIRMATION_LEVEL:
+            if score.member is None or score.family_wise_p > level or self._withdrawn(score):
                 continue
-            if self.blocked.get(score.name, "").startswith("withdrawn"):
-                continue
-            part = self.readings.subset(model.used)
-            reason = blocked_reason(self.effects[score.name], score.member, part, model, scores)
+            # Where a stronger effect could not be confirmed, a much weaker one only stands in for it.
+            if score.excess < strongest - TIE_GAIN:
+                return None
+            reason = self._blocked(score, model, scores)
             if reason is not None:
                 self.blocked[score.name] = reason
                 continue
-            return self._refined(score, model)
+            if score.held_out_p <= CONFIRMATION_LEVEL:
+                return self._refined(score, model)
+            strongest = max(strongest, score.excess)
         return None
+
+    def _withdrawn(self, score: FamilyScore) -> bool:
+        return self.blocked.get(score.name, "").startswith("withdrawn")
+
+    def _blocked(self, score: FamilyScore, model: ModelFit, scores: Sequence[FamilyScore]) -> str | None:
+        part = self.readings.subset(model.used)
+        return blocked_reason(self.effects[score.name], member_of(score), part, model, scores)
 
     def ask_sealed(self, scores: Sequence[FamilyScore], model: ModelFit) -> FamilyScore | None:
         """Put the strongest candidate that the search could not decide on to the sealed readings, as a single question.
@@ -107,8 +119,7 @@ class Search:
         for score in scores:
             if score.member is None or score.p_value > _WORTH_ASKING or score.name in self.blocked:
                 continue
-            part = self.readings.subset(model.used)
-            reason = blocked_reason(self.effects[score.name], score.member, part, model, scores)
+            reason = self._blocked(score, model, scores)
             if reason is not None:
                 self.blocked[score.name] = reason
                 continue

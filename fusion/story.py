@@ -12,10 +12,9 @@ from fusion.adequacy import Remainder
 from fusion.model import ModelFit, Term
 from fusion.readings import Readings
 from fusion.scoring import FamilyScore
+from fusion.search import TIE_GAIN
 from interferometry.statespace import Array
 
-#: Effects whose log-likelihoods differ by less than this (odds of 20 to 1) are reported as a tie.
-TIE_GAIN = 3.0
 #: An effect that is not even significant alone is no rival.
 _RIVAL_LEVEL = 0.05
 
