@@ -84,30 +84,54 @@ class NullBank:
         """Fitted drift over one hour in the unit of the series."""
         return self.fitted.per_hour * self.sigma
 
-    def only_fitted(self) -> NullBank:
-        """The bank with the fitted point alone: whitening fixed under the null."""
-        return NullBank((self.fitted,), self.freedom, self.values, 0, self.sigma, self.log_likelihood[[self.best]])
-
 
 def _grid(integrated: bool) -> list[tuple[int, float]]:
     walks = [(0, 0.0), *[(1, float(rate)) for rate in _WALK_PER_HOUR]]
     return [*walks, *[(2, float(rate)) for rate in _INTEGRATED_PER_HOUR]] if integrated else walks
 
 
-def null_bank(values: Array, seconds: Array, variance: Array, nuisance: Array, *, integrated: bool = True) -> NullBank:
-    """Whiten under every drift of the grid (with or without integrated walks) and fit the null.
+@njit(cache=True, nogil=True)
+def _invert_lower(lower: Array) -> Array:
+    """Inverse of a lower triangular matrix; threaded BLAS is slower at this size."""
+    n = lower.shape[0]
+    inverse = np.zeros((n, n))
+    for j in range(n):
+        inverse[j, j] = 1.0 / lower[j, j]
+        for i in range(j + 1, n):
+            total = 0.0
+            for k in range(j, i):
+                total += lower[i, k] * inverse[k, j]
+            inverse[i, j] = -total / lower[i, i]
+    return inverse
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Whitenings under every drift of the grid, for all series that share instants, variances and nuisance columns.
+
+    Attributes
+    ----------
+    freedom : number of values minus nuisance columns
+    scale : variance of an ordinary value
+    """
+
+    whitenings: tuple[Whitening, ...]
+    freedom: int
+    scale: float
+
+
+def whitening_grid(seconds: Array, variance: Array, nuisance: Array, *, integrated: bool = True) -> Grid:
+    """Whiten under every drift of the grid, with or without integrated walks.
 
     Parameters
     ----------
-    values, seconds, variance : (n,) series, times in s (increasing), relative variances
+    seconds, variance : (n,) times in s (increasing), relative variances
     nuisance : (n, k) columns that every hypothesis contains
     """
-    n = values.size
+    n = seconds.size
     scale = float(np.median(variance))
     freedom = n - nuisance.shape[1]
     whitenings = []
-    scores = []
-    sigmas = []
     for order, per_hour in _grid(integrated):
         ratio = scale * per_hour**2 / 3600.0 if order < 2 else scale * per_hour**2 * 3.0 / 3600.0**3
         kind: Order = 2 if order == 2 else 1
@@ -117,16 +141,24 @@ def null_bank(values: Array, seconds: Array, variance: Array, nuisance: Array, *
         project = white - basis @ (basis.T @ white)
         log_normal = 2.0 * float(np.log(np.abs(np.diag(triangle))).sum())
         penalty = float(log_determinant + log_normal) / freedom
-        rss = float(((project @ values) ** 2).sum())
         whitenings.append(
-            Whitening(
-                order, per_hour, project, project.astype(np.float32), np.asarray(np.linalg.inv(white), float), penalty
-            )
+            Whitening(order, per_hour, project, project.astype(np.float32), _invert_lower(white), penalty)
         )
-        scores.append(np.log(max(rss, 1e-300)) + penalty)
-        sigmas.append(np.sqrt(scale * rss / freedom))
-    best = int(np.argmin(scores))
-    return NullBank(tuple(whitenings), freedom, values, best, float(sigmas[best]), -0.5 * freedom * np.asarray(scores))
+    return Grid(tuple(whitenings), freedom, scale)
+
+
+def fit_null(grid: Grid, values: Array) -> NullBank:
+    """Fit the null to a series (n,): the grid point of highest restricted likelihood."""
+    rss = np.array([((point.project @ values) ** 2).sum() for point in grid.whitenings])
+    score = np.log(np.maximum(rss, 1e-300)) + np.array([point.log_penalty for point in grid.whitenings])
+    best = int(np.argmin(score))
+    sigma = float(np.sqrt(grid.scale * rss[best] / grid.freedom))
+    return NullBank(grid.whitenings, grid.freedom, values, best, sigma, -0.5 * grid.freedom * score)
+
+
+def null_bank(values: Array, seconds: Array, variance: Array, nuisance: Array, *, integrated: bool = True) -> NullBank:
+    """Whiten one series (n,) under every drift of the grid and fit the null; see :func:`whitening_grid`."""
+    return fit_null(whitening_grid(seconds, variance, nuisance, integrated=integrated), values)
 
 
 def resample(bank: NullBank, orders: NDArray[np.int64], rng: np.random.Generator, *, gaussian: bool = False) -> Array:

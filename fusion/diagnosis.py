@@ -19,28 +19,27 @@ from fusion.excitation import WARM_UP_SHARE
 from fusion.explanations import (
     LAGS_S,
     Lasting,
-    Memoryless,
     Residual,
     Slow,
     fit_lasting,
     fit_slow,
     lagged_temperature,
     local_residuals,
-    memoryless_likelihoods,
     serial_p,
     step_columns,
     step_instant,
     warm_up_like,
 )
+from fusion.scatter import Memoryless, memoryless_likelihoods
 
 Cause = Literal["structural", "local_temperature", "stick_slip", "step", "undetermined"]
 
 #: Least probability of each cause. tests/fusion/test_diagnosis_thresholds.py sets and checks them on simulated campaigns.
 THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "stick_slip": 0.4, "step": 0.6}
 #: What an effect bound to the approach must gain beyond scatter that is alike in both directions before it counts as likely (nats):
-#: amounts that follow the motion, more scatter in one direction, a slow walk in one direction. Plain scatter exceeds each of them by
-#: chance in one case of thirty or fewer.
-APPROACH_NATS = {"along": 1.8, "one_direction": 4.0, "slow": 2.5}
+#: amounts that follow the motion, more scatter in one direction, a slow walk in one direction (beside its parameter). Plain scatter
+#: exceeds one of them by chance in about one case of twenty.
+APPROACH_NATS = {"along": 1.9, "one_direction": 4.0, "slow": 1.5}
 #: Level of the bootstrap test that a lasting cause must pass; local temperature is the name that costs most when it is wrong.
 LEVELS = {"step": 0.05, "local_temperature": 0.01}
 

@@ -2,25 +2,26 @@
 
 A residual is what one target shows in both directions after its own mean and every pass's level and stretch (from the other targets)
 are taken out. Explanations that last (local temperature, step) are profile likelihood ratios against white noise plus a random walk,
-with parametric-bootstrap p values; explanations without memory (scatter, stick-slip) are permutation tests on its values.
+with parametric-bootstrap p values. Explanations without memory are in :mod:`fusion.scatter`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import special
 
 from fusion.attribution_kernel import (
-    NullBank,
+    Grid,
     estimate_effects,
+    fit_null,
     likelihood_ratios,
-    null_bank,
     resample,
     whiten_series,
+    whitening_grid,
 )
 from fusion.channels import MIN_CYCLES, Array, respond
 from fusion.excitation import warm_up_columns
@@ -30,14 +31,30 @@ LAGS_S = (0.0, 600.0, 1800.0, 3600.0)
 #: Steps are tried after every cycle but the first and last of this number.
 _STEP_MARGIN = 5
 _LEVELS = 499
-#: Natural spread of the targets' scatter around their typical value (standard deviation of its logarithm).
-_SIGMA_SPREAD = 0.1
-#: Share of readings that a scatter with rare large values disturbs.
-_RARE_SHARE = 0.1
 
 
 class DiagnosisError(ValueError):
     """An anomaly cannot be diagnosed; the message names the target and what is missing."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Orthonormal mean and difference of the directions over complete cycles; the mean alone where one direction was read.
+
+    Attributes
+    ----------
+    rows : cycles used
+    mean, difference : (n,) um times `unit`, or None
+    sides : (2, n) both directions, or None
+    grid : whitenings that all of them share
+    """
+
+    rows: NDArray[np.int64]
+    mean: Array
+    difference: Array | None
+    sides: Array | None
+    unit: float
+    grid: Grid
 
 
 @dataclass(frozen=True)
@@ -65,6 +82,25 @@ class Residual:
         known = [row[np.isfinite(row)] for row in self.values]
         first, second = (float(row.std()) if row.size else float("nan") for row in known)
         return first, second
+
+    @cached_property
+    def parts(self) -> Parts:
+        """Its mean and difference, with the whitenings for their instants."""
+        read = np.isfinite(self.values)
+        rows = np.flatnonzero(read.all(axis=0))
+        if rows.size >= MIN_CYCLES:
+            first, second = self.values[:, rows]
+            root = float(np.sqrt(2.0))
+            return Parts(
+                rows, (first + second) / root, (first - second) / root, self.values[:, rows], root, self._grid(rows)
+            )
+        side = int(read.sum(axis=1).argmax())
+        rows = np.flatnonzero(read[side])
+        return Parts(rows, self.values[side, rows], None, None, 1.0, self._grid(rows))
+
+    def _grid(self, rows: NDArray[np.int64]) -> Grid:
+        ones = np.ones(rows.size)
+        return whitening_grid(self.seconds[rows], ones, ones[:, None], integrated=False)
 
 
 @dataclass(frozen=True)
@@ -222,51 +258,22 @@ def step_instant(place: int) -> int:
     return place + _STEP_MARGIN
 
 
-@dataclass(frozen=True)
-class _Parts:
-    """Orthonormal mean and difference of the directions over complete cycles; the mean alone where one direction was read."""
-
-    rows: NDArray[np.int64]
-    mean: Array
-    difference: Array | None
-    unit: float
-
-
-def _parts(residual: Residual) -> _Parts:
-    read = np.isfinite(residual.values)
-    if read.all(axis=0).sum() >= MIN_CYCLES:
-        rows = np.flatnonzero(read.all(axis=0))
-        first, second = residual.values[:, rows]
-        root = float(np.sqrt(2.0))
-        return _Parts(rows, (first + second) / root, (first - second) / root, root)
-    side = int(read.sum(axis=1).argmax())
-    rows = np.flatnonzero(read[side])
-    return _Parts(rows, residual.values[side, rows], None, 1.0)
-
-
-def _bank(series: Array, seconds: Array) -> NullBank:
-    ones = np.ones(series.size)
-    return null_bank(series, seconds, ones, ones[:, None], integrated=False)
-
-
 def fit_slow(residual: Residual) -> Slow:
     """Fit white noise alone, a walk that both directions share, and a walk in one direction."""
-    parts = _parts(residual)
-    seconds = residual.seconds[parts.rows]
-    mean = _bank(parts.mean, seconds).log_likelihood
-    if parts.difference is None:
+    parts = residual.parts
+    mean = fit_null(parts.grid, parts.mean).log_likelihood
+    if parts.difference is None or parts.sides is None:
         return Slow(float(mean[0]), float(mean.max()), -np.inf, 0)
-    difference = _bank(parts.difference, seconds).log_likelihood
-    sides = [_bank(row, seconds).log_likelihood for row in residual.values[:, parts.rows]]
+    difference = fit_null(parts.grid, parts.difference).log_likelihood
+    sides = [fit_null(parts.grid, row).log_likelihood for row in parts.sides]
     alone = [float(sides[side].max() + sides[1 - side][0]) for side in (0, 1)]
     return Slow(float(mean[0] + difference[0]), float(mean.max() + difference[0]), max(alone), int(np.argmax(alone)))
 
 
 def fit_lasting(residual: Residual, columns: Array, rng: np.random.Generator) -> Lasting:
     """Fit the best of several columns (cycle, members), each with its own nuisance, to both directions."""
-    parts = _parts(residual)
-    seconds = residual.seconds[parts.rows]
-    bank = _bank(parts.mean, seconds)
+    parts = residual.parts
+    bank = fit_null(parts.grid, parts.mean)
     regressors = np.ascontiguousarray(columns[parts.rows], np.float32)
     orders = np.empty((_LEVELS, parts.mean.size), np.int64)
     stack = np.vstack([parts.mean, resample(bank, orders, rng, gaussian=True)])
@@ -274,8 +281,8 @@ def fit_lasting(residual: Residual, columns: Array, rng: np.random.Generator) ->
     best = ratios.max(axis=1)
     place = int(ratios[0].argmax())
     found = estimate_effects(bank, regressors[:, [place]])
-    shared = 0.0 if parts.difference is None else float(_bank(parts.difference, seconds).log_likelihood[0])
-    by_direction, held_out = _cross_directions(residual, parts, columns, place)
+    shared = 0.0 if parts.difference is None else float(fit_null(parts.grid, parts.difference).log_likelihood[0])
+    by_direction, held_out = _cross_directions(parts, columns, place)
     return Lasting(
         float(bank.log_likelihood.max() + 0.5 * best[0] + shared),
         float((np.sum(best[1:] >= best[0]) + 1) / (_LEVELS + 1)),
@@ -287,14 +294,12 @@ def fit_lasting(residual: Residual, columns: Array, rng: np.random.Generator) ->
     )
 
 
-def _cross_directions(
-    residual: Residual, parts: _Parts, columns: Array, place: int
-) -> tuple[tuple[float, float], float]:
+def _cross_directions(parts: Parts, columns: Array, place: int) -> tuple[tuple[float, float], float]:
     """Coefficient of one member in each direction, and what each direction's own best member gains in the other (nats)."""
-    if parts.difference is None:
+    if parts.sides is None:
         return (np.nan, np.nan), np.nan
     regressors = np.ascontiguousarray(columns[parts.rows], np.float32)
-    banks = [_bank(row, residual.seconds[parts.rows]) for row in residual.values[:, parts.rows]]
+    banks = [fit_null(parts.grid, row) for row in parts.sides]
     own = [float(estimate_effects(bank, regressors[:, [place]]).coefficient[0]) for bank in banks]
     gained = 0.0
     for train, test in (banks, banks[::-1]):
@@ -310,90 +315,11 @@ def _cross_directions(
 
 def serial_p(residual: Residual, rng: np.random.Generator) -> float:
     """Permutation p that successive values are nearer to each other than chance (von Neumann 1941, Ann. Math. Stat. 12, 367)."""
-    series = _parts(residual).mean
+    series = residual.parts.mean
     shuffled = rng.permuted(np.tile(series, (_LEVELS, 1)), axis=1)
     measured = (np.diff(series) ** 2).sum()
     null = (np.diff(shuffled, axis=1) ** 2).sum(axis=1)
     return float((np.sum(null <= measured) + 1) / (_LEVELS + 1))
-
-
-@dataclass(frozen=True)
-class Memoryless:
-    """Log-likelihoods (nats, highest over their one parameter) of scatter without memory, the other targets' scatter given.
-
-    Attributes
-    ----------
-    both : more scatter, equal in both directions (Gaussian, or with rare large values)
-    one_direction : more scatter in one direction only
-    along_approach : one-sided amounts that follow the sense of motion (exponential), as a carriage that sticks short of its target
-    side : direction with the larger scatter, 0 positive, 1 negative
-    short : whether the amounts fall short of the target
-    """
-
-    both: float
-    one_direction: float
-    along_approach: float
-    side: int
-    short: bool
-
-
-def memoryless_likelihoods(residual: Residual) -> Memoryless:
-    """Compare explanations that treat every reading alike, without order in time."""
-    rows = [row[np.isfinite(row)] for row in residual.values]
-    rows = [row - row.mean() if row.size else row for row in rows]
-    usual = residual.typical_um
-    spread = np.exp(np.linspace(-2.0, 2.0, 9) * _SIGMA_SPREAD)
-    prior = -0.5 * np.linspace(-2.0, 2.0, 9)[:, None] ** 2
-    sigma = usual * spread[:, None]
-    # Explanations live on the grid (usual scatter of this target, extra scatter), both in um.
-    extra = usual * np.geomspace(0.1, 4.0, 25)[None, :]
-    wide = np.hypot(sigma, extra)
-    rare = np.hypot(sigma, extra / np.sqrt(_RARE_SHARE))
-    steady = sum((_gaussian(row, wide) for row in rows), np.zeros_like(wide))
-    bursts = sum((_mixture(_normal(row, sigma), _normal(row, rare)) for row in rows), np.zeros_like(wide))
-    both = float((prior + np.maximum(steady, bursts)).max())
-    sides = [float((prior + _gaussian(rows[k], wide) + _gaussian(rows[1 - k], sigma)).max()) for k in (0, 1)]
-    along = [
-        float((prior + _sticking(np.concatenate([sign * rows[0], -sign * rows[1]]), sigma, extra)).max())
-        for sign in (-1.0, 1.0)
-    ]
-    return Memoryless(both, max(sides), max(along), int(np.argmax(sides)), along[0] > along[1])
-
-
-def _normal(row: Array, sigma: Array) -> Array:
-    """Log-density of every reading under every sigma, (..., n)."""
-    scaled = row / sigma[..., None]
-    return -0.5 * (scaled**2 + np.log(2.0 * np.pi)) - np.log(sigma)[..., None]
-
-
-def _gaussian(row: Array, sigma: Array) -> Array:
-    return _normal(row, sigma).sum(axis=-1)
-
-
-def _mixture(usual: Array, disturbed: Array) -> Array:
-    """Log-likelihood where a small share of the readings is disturbed."""
-    return np.logaddexp(np.log(1 - _RARE_SHARE) + usual, np.log(_RARE_SHARE) + disturbed).sum(axis=-1)
-
-
-def _one_sided(amounts: Array, sigma: Array, mean: Array) -> Array:
-    """Log-density of normal noise plus an exponential amount (Grushka 1972, Anal. Chem. 44, 1733)."""
-    rate = sigma / mean
-    scaled = amounts / sigma[..., None]
-    return (
-        -np.log(mean)[..., None]
-        + 0.5 * rate[..., None] ** 2
-        - scaled * rate[..., None]
-        + special.log_ndtr(scaled - rate[..., None])
-    )
-
-
-def _sticking(along: Array, sigma: Array, extra: Array) -> Array:
-    """Readings along the motion, centred: an exponential amount at every approach, or at a small share of them."""
-    sigma, extra = np.broadcast_arrays(sigma, extra)
-    always = _one_sided(along + extra[..., None], sigma, extra).sum(axis=-1)
-    amount = extra / np.sqrt(2.0 * _RARE_SHARE)
-    centred = along + _RARE_SHARE * amount[..., None]
-    return np.maximum(always, _mixture(_normal(centred, sigma), _one_sided(centred, sigma, amount)))
 
 
 def warm_up_like(seconds: Array, temperature: Array) -> float:

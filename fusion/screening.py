@@ -16,13 +16,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fusion.attribution import LAGS_S, Film, nuisance_columns
-from fusion.attribution_kernel import Array32, NullBank, null_bank
+from fusion.attribution_kernel import Array32, Grid, NullBank, fit_null, whitening_grid
 from fusion.channels import Array, lag_operators
 from fusion.excitation import Excitation
 
 #: Columns of one tile; its whitened films and the products of a thousand permutations stay in the second-level cache.
 _TILE = 512
-_ROWS = 256
+_ROWS = 1000
 #: Relative variance of a value that is missing.
 _NO_WEIGHT = 1e8
 
@@ -59,6 +59,27 @@ def _largest(products: Array32, weight: Array32, largest: Array32) -> None:
         largest[b] = best
 
 
+@njit(cache=True, nogil=True)
+def _keep_best(
+    product: Array32,
+    weight: Array32,
+    size: np.float32,
+    lag: int,
+    share: Array32,
+    best_lag: NDArray[np.int8],
+    coefficient: Array32,
+    best_weight: Array32,
+) -> None:
+    """Keep this lag (of one series, along the columns) where it explains more than those before it."""
+    for j in range(product.size):
+        explained = product[j] * product[j] * weight[j]
+        if explained > share[j]:
+            share[j] = explained
+            best_lag[j] = lag
+            coefficient[j] = product[j] * weight[j] * size
+            best_weight[j] = weight[j]
+
+
 def screen(
     values: Array,
     seconds: Array,
@@ -87,10 +108,14 @@ def screen(
     # A missing value gets a variance that leaves it without weight, so that all series keep the same instants.
     variance = np.where(seen, 1.0, _NO_WEIGHT)
     values = np.where(seen, values, np.nanmean(values, axis=1, keepdims=True))
-    banks = [null_bank(row, seconds, own, nuisance) for row, own in zip(values, variance, strict=True)]
-    groups: dict[tuple[int, bytes], list[int]] = {}
-    for k, bank in enumerate(banks):
-        groups.setdefault((bank.best, seen[k].tobytes()), []).append(k)
+    grids: dict[bytes, Grid] = {}
+    banks, groups = [], dict[tuple[int, bytes], list[int]]()
+    for k, row in enumerate(values):
+        pattern = seen[k].tobytes()
+        if pattern not in grids:
+            grids[pattern] = whitening_grid(seconds, variance[k], nuisance)
+        banks.append(fit_null(grids[pattern], row))
+        groups.setdefault((banks[k].best, pattern), []).append(k)
     orders = np.argsort(rng.random((permutations, seconds.size)), axis=1)
     operators = [sampling @ operator for operator in lag_operators(film.seconds, lags_s)]
     tasks = [_Group.build(banks, members, orders, operators) for members in groups.values()]
@@ -183,14 +208,17 @@ class _Result:
         self, members: NDArray[np.int64], tile: slice, lag: int, product: Array32, weight: Array32, size: Array
     ) -> None:
         """Keep this lag where it explains more than those before it."""
-        share = product * product * weight
         for row, k in enumerate(members):
-            better = share[row] > self.share[k, tile]
-            self.share[k, tile] = np.where(better, share[row], self.share[k, tile])
-            self.lag[k, tile] = np.where(better, np.int8(lag), self.lag[k, tile])
-            coefficient = product[row] * weight * np.float32(size[row])
-            self.coefficient[k, tile] = np.where(better, coefficient, self.coefficient[k, tile])
-            self.weight[k, tile] = np.where(better, weight, self.weight[k, tile])
+            _keep_best(
+                product[row],
+                weight,
+                np.float32(size[row]),
+                lag,
+                self.share[k, tile],
+                self.lag[k, tile],
+                self.coefficient[k, tile],
+                self.weight[k, tile],
+            )
 
     def finish(self, groups: Sequence[_Group]) -> Screening:
         """Turn shares into likelihood ratios, and compare with the maxima over all series."""
