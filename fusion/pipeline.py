@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -62,9 +63,7 @@ class Run:
         compute : callable
             Does the work.
         """
-        asked = self.campaign.model_dump(mode="json", include=set(tables))
-        files = {file: self.inputs[file] for table in tables for file in self.campaign.files_of(table)}
-        key = digest(name, versions(), asked, files, [self.keys[earlier] for earlier in after])
+        key = self.key_of(name, tables, after)
         path = self.folder / FILES[name]
         begun = time.monotonic()
         if self.stamps.done(name, key):
@@ -83,6 +82,20 @@ class Run:
         self.notices.extend(outcome.notices)
         self.seconds[name] = time.monotonic() - begun
         return outcome.dataset
+
+    def key_of(self, name: str, tables: tuple[str, ...], after: tuple[str, ...]) -> str:
+        """Return a digest of everything that decides the result of a stage."""
+        asked = self.campaign.model_dump(mode="json", include=set(tables))
+        files = {file: self.inputs[file] for table in tables for file in self.campaign.files_of(table)}
+        return digest(name, versions(), asked, files, [self.keys[earlier] for earlier in after])
+
+    def checkpoint(self, key: str) -> Path:
+        """Return the folder in which the cycles of a long recording are kept as they are finished; those of other input go."""
+        chosen = self.folder / ".stages" / f"cycles_{key[:16]}"
+        for stale in chosen.parent.glob("cycles_*"):
+            if stale != chosen:
+                shutil.rmtree(stale)
+        return chosen
 
     def described(self, dataset: xr.Dataset) -> xr.Dataset:
         """Return a product's Dataset with what NetCDF files have to say of themselves."""
@@ -131,11 +144,13 @@ def run_campaign(
     started = datetime.now(UTC)
     inputs = hash_inputs(campaign.input_files(), report=report)
     run = Run(campaign, folder, report, StageStamps(folder), inputs, started, notices=list(source.notices))
+    seen = ("thermography", "plan", "interferometry")
+    checkpoint = run.checkpoint(run.key_of("fields", seen, ()))
     fields = run.stage(
         "fields",
-        ("thermography", "plan", "interferometry"),
+        seen,
         (),
-        lambda: stages_thermal.reduce_thermography(source, scheduler=scheduler, report=report),
+        lambda: stages_thermal.reduce_thermography(source, checkpoint=checkpoint, scheduler=scheduler, report=report),
     )
     deviations = run.stage("deviations", ("interferometry",), (), lambda: stages.evaluate_interferometry(source))
     fused, outside = stages.align_recordings(source, fields, deviations)

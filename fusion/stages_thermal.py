@@ -31,11 +31,16 @@ from thermography.registration import Registration, register
 _REGISTRATION_FRAMES = 5
 #: Of a video, so many frames at most are looked at for steps of the camera's zero: a step stays.
 _CHECKED_FRAMES = 1000
+#: Longer recordings keep their finished cycles on disk while they are reduced; for shorter ones that would cost more than it saves.
+_CHECKPOINT_FRAMES = 2000
 _KELVIN = 273.15
 
 
-def reduce_thermography(source: Source, *, scheduler: str | None, report: Report) -> Outcome:
-    """Check the camera, register the plan on the first frames, and reduce all frames to one field per cycle."""
+def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | None, report: Report) -> Outcome:
+    """Check the camera, register the plan on the first frames, and reduce all frames to one field per cycle.
+
+    A long recording keeps its finished cycles in the folder `checkpoint`, so that a run that is stopped goes on from there.
+    """
     override = Overrides(campaign_constants(source))
     notices = camera_notices(source, override, report=report)
     report("registration", 0, 1)
@@ -44,7 +49,9 @@ def reduce_thermography(source: Source, *, scheduler: str | None, report: Report
     reference = np.mean([calibrate(frame.read_counts(), override(frame)) for frame in first], axis=0)
     registration = register(reference, source.fiducials, grid=source.grid)
     report("registration", 1, 1)
-    fields, clock, found = _reduce_on_clock(source, registration, override, scheduler=scheduler, report=report)
+    fields, clock, found = _reduce_on_clock(
+        source, registration, override, checkpoint=checkpoint, scheduler=scheduler, report=report
+    )
     check(fields, FIELDS, name="the fields")
     notices += [*found, *registration_notices(registration), *frame_notices(fields)]
     fields = fields.assign_coords(cycle=source.deviations["cycle"].values)
@@ -65,11 +72,18 @@ def reduce_thermography(source: Source, *, scheduler: str | None, report: Report
 
 
 def _reduce_on_clock(
-    source: Source, registration: Registration, override: Overrides, *, scheduler: str | None, report: Report
+    source: Source,
+    registration: Registration,
+    override: Overrides,
+    *,
+    checkpoint: Path,
+    scheduler: str | None,
+    report: Report,
 ) -> tuple[xr.Dataset, dict[str, Any], list[Notice]]:
     """Reduce the frames with the clock offset that the campaign gives, that the moving table shows, or that is assumed."""
     given = source.thermography.clock_offset_s
-    fields = _reduce(source, registration, override, given or 0.0, scheduler=scheduler, report=report)
+    how: dict[str, Any] = {"checkpoint": checkpoint, "scheduler": scheduler, "report": report}
+    fields = _reduce(source, registration, override, given or 0.0, **how)
     if given is not None:
         return fields, {"value": given, "u": 0.0}, []
     if source.thermography.table == "still":
@@ -85,7 +99,7 @@ def _reduce_on_clock(
     )
     report("clock offset", 1, 1)
     # Frames belong to cycles by the laser's clock, so they are sorted into them again.
-    fields = _reduce(source, registration, override, clock.offset_s, scheduler=scheduler, report=report)
+    fields = _reduce(source, registration, override, clock.offset_s, **how)
     return fields, {"value": clock.offset_s, "u": clock.offset_u_s}, []
 
 
@@ -102,6 +116,7 @@ def _reduce(
     override: Overrides,
     offset_s: float,
     *,
+    checkpoint: Path,
     scheduler: str | None,
     report: Report,
 ) -> xr.Dataset:
@@ -119,7 +134,8 @@ def _reduce(
     if source.thermography.table == "moving":
         direction = source.plan.axis.direction
         return reduce_moving_frames(source.frames, registration, source.grid, bounds, direction=direction, **common)
-    return reduce_frames(source.frames, registration, source.grid, bounds, **common)
+    kept = checkpoint if total > _CHECKPOINT_FRAMES else None
+    return reduce_frames(source.frames, registration, source.grid, bounds, checkpoint=kept, **common)
 
 
 def campaign_constants(source: Source) -> dict[str, float]:

@@ -211,7 +211,9 @@ def test_the_clock_of_a_camera_that_sees_the_table_move_is_found(tmp_path: Path)
     )
     campaign = simulate_campaign(tmp_path / "recipe.toml", tmp_path / "campaign")
     campaign.write_text(campaign.read_text().replace('cell_size = "5 mm"', 'cell_size = "20 mm"'))
-    outcome = reduce_thermography(read_source(load_campaign(campaign)), scheduler=None, report=silent)
+    outcome = reduce_thermography(
+        read_source(load_campaign(campaign)), checkpoint=tmp_path / "cycles", scheduler=None, report=silent
+    )
     assert outcome.parts["alignment"]["clock_offset_s"]["value"] == pytest.approx(37.0, abs=0.2)
     place = outcome.dataset["table_position"]
     assert float(place.max() - place.min()) == pytest.approx(240.0, abs=0.5)
