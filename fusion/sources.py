@@ -17,6 +17,7 @@ from fusion.contracts import check
 from fusion.preflight import check_clocks
 from fusion.results import Notice
 from fusion.tables import read_drivers
+from interferometry.compensation import air_index, dead_path_error_um
 from interferometry.contract import DEVIATIONS
 from interferometry.readers import read_deviations, read_environment
 from thermography.flir import FrameReference, index_frames
@@ -75,6 +76,7 @@ def read_source(campaign: Campaign) -> Source:
     environment = None
     if interferometry.environment is not None:
         environment = read_environment(campaign.resolve(interferometry.environment))
+    deviations, corrected = correct_dead_path(deviations, environment, interferometry.dead_path_mm)
     drivers = read_drivers(campaign.resolve(campaign.drivers.file)) if campaign.drivers is not None else None
     frames, rejected = index_frames(campaign.frame_paths())
     listed = [
@@ -95,8 +97,39 @@ def read_source(campaign: Campaign) -> Source:
         campaign, thermography, plan, interferometry, deviations, environment, drivers,
         read_fiducials(campaign.resolve(plan.fiducials)), timed, listed,
     )  # fmt: skip
-    source.notices.extend(_notices(source))
+    source.notices.extend([*_notices(source), *corrected])
     return source
+
+
+def correct_dead_path(
+    deviations: xr.Dataset, environment: xr.Dataset | None, dead_path_mm: float
+) -> tuple[xr.Dataset, list[Notice]]:
+    """Take out what the air of a known dead path adds to the readings, for a reflector that moves away from the laser.
+
+    The readings' own path is left as the instrument compensated it.
+    """
+    if dead_path_mm == 0.0:
+        return deviations, []
+    if environment is None:
+        remedy = "log air temperature, pressure and humidity, and name the file as [interferometry] environment"
+        message = f"The dead path of {dead_path_mm:g} mm is not corrected: the air was not logged."
+        return deviations, [Notice("dead_path_uncorrected", message, remedy)]
+    log = environment.dropna("time")
+    start = log["time"].values[0]
+    at, known = (
+        (times.astype("datetime64[ns]") - start) / np.timedelta64(1, "s")
+        for times in (deviations["time"].values, log["time"].values)
+    )
+    names = ("air_temperature", "air_pressure", "relative_humidity")
+    index = air_index(*(np.interp(at, known, log[name].values) for name in names))
+    first = float(index.ravel()[np.nanargmin(at)])
+    error = dead_path_error_um(index, first, dead_path_mm=dead_path_mm)
+    size = float(np.nanmax(error) - np.nanmin(error))
+    message = f"The dead path of {dead_path_mm:g} mm is corrected for the logged air: {size:.2f} um from least to most."
+    corrected = deviations.assign(deviation=deviations["deviation"] - error)
+    corrected["deviation"].attrs.update(deviations["deviation"].attrs)
+    remedy = "nothing, unless the reflector moves towards the laser: then give the dead path a minus sign"
+    return corrected, [Notice("dead_path_corrected", message, remedy, size)]
 
 
 def _notices(source: Source) -> list[Notice]:

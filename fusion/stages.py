@@ -49,7 +49,7 @@ def evaluate_interferometry(source: Source) -> Outcome:
     deviations = source.deviations
     drift = estimate_drift(deviations)
     deviations = flag_outliers(deviations, drift)
-    comparison = neighbours.compare(deviations)
+    comparison = neighbours.compare(deviations, drift)
     windows = iso230.evaluate_windows(deviations)
     dataset = joined(
         deviations,
@@ -147,7 +147,8 @@ def model_drift(source: Source, fused: xr.Dataset, deviations: xr.Dataset, *, re
     report("anomalies", 0, 1)
     explained = variables["contribution"].sum("effect", skipna=False)
     cleaned = deviations.assign(deviation=deviations["deviation"].copy(data=(fused["deviation"] - explained).values))
-    anomalies = detect_anomalies(estimate_drift(cleaned), cleaned)
+    # Scatter that is only unequal, as it naturally is, makes no position a machine's anomaly; one that stands out does.
+    anomalies = [one for one in detect_anomalies(estimate_drift(cleaned), cleaned) if one.stands_out]
     diagnoses = diagnose(anomalies, fused.assign(deviation=fused["deviation"].copy(data=cleaned["deviation"].values)))
     found = set_aside_sites(found, sites_of(anomalies, deviations.sizes["target"]))
     report("anomalies", 1, 1)

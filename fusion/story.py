@@ -33,6 +33,7 @@ class Step:
     tied : effects that these data cannot tell from it
     runner_up : the next best effect, its gain and how far behind it is in log-likelihood
     confirmed : how it was confirmed
+    event_cycle : the cycle in which an event happened, None for an effect that is no event
     """
 
     effect: str
@@ -46,6 +47,7 @@ class Step:
     tied: list[str]
     runner_up: dict[str, float | str]
     confirmed: str
+    event_cycle: int | None
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,16 @@ def make_step(
         tied=tied,
         runner_up=runner_up,
         confirmed=f"{way}, coefficients frozen",
+        event_cycle=_event_cycle(model.readings, term),
     )
+
+
+def _event_cycle(readings: Readings, term: Term) -> int | None:
+    """The cycle of the first reading at or after an event."""
+    if term.member.event_s is None:
+        return None
+    later = np.flatnonzero(readings.seconds >= term.member.event_s)
+    return int(readings.cycle[later[0] if later.size else -1])
 
 
 def rmse(errors: Array) -> float:
