@@ -84,7 +84,7 @@ def _image_data(data: bytes, shape: tuple[int, int]) -> list[bytes]:
         at = end
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _undo_filters(lines: NDArray[np.uint8]) -> bool:  # pragma: no cover - compiled
     """Undo the filters in place; lines are (1 + row, filter + bytes) below a line of zeros; False where a filter is unknown."""
     for row in range(1, len(lines)):

@@ -54,8 +54,14 @@ def read_counts(source: FffSource, samples: Samples) -> NDArray[np.uint16]:
     Returns
     -------
     ndarray of uint16, shape (row, column)
-        Counts in native byte order.
+        Counts in native byte order; read-only, whatever the packing.
     """
+    counts = _decode(source, samples)
+    counts.flags.writeable = False
+    return counts
+
+
+def _decode(source: FffSource, samples: Samples) -> NDArray[np.uint16]:
     rows, columns = samples.shape
     if samples.encoding == "raw":
         data = source.take(samples.offset, samples.length, f"{columns} x {rows} samples")
@@ -63,13 +69,13 @@ def read_counts(source: FffSource, samples: Samples) -> NDArray[np.uint16]:
         return counts if counts.dtype.isnative else counts.astype(np.uint16)
     # Rounded up to 8 bytes by the writers; the padding after the last frame's stream may be missing.
     data = source.read(samples.offset, min(samples.length, 2 * MAX_PIXELS))
-    if samples.encoding == "png":
-        try:
-            counts = decode_png(data, samples.shape)
-        except PngError as error:
-            raise source.error(samples.offset, *error.args) from error
-        return counts.byteswap() if samples.little_endian else counts
-    return _decode_jpegls(source, samples, data)
+    if samples.encoding == "jpegls":
+        return _decode_jpegls(source, samples, data)
+    try:
+        counts = decode_png(data, samples.shape)
+    except PngError as error:
+        raise source.error(samples.offset, *error.args) from error
+    return counts.byteswap() if samples.little_endian else counts
 
 
 def _decode_jpegls(source: FffSource, samples: Samples, data: bytes) -> NDArray[np.uint16]:

@@ -115,6 +115,7 @@ def test_written_jpeg_and_sequence_come_back_equal(tmp_path: Path, encoding: str
     sequence(tmp_path / "a.seq", encoding)
     for frame in (read_frame(tmp_path / "a.jpg"), index_frames([tmp_path / "a.jpg"])[0][0].read()):
         np.testing.assert_array_equal(frame.counts, written.counts)
+        assert not frame.counts.flags.writeable
         assert frame.time == TIME and frame.utc_offset_minutes == 60
         assert (frame.parameters, frame.camera, frame.limits) == (PARAMETERS, CAMERA, LIMITS)
         assert frame.housekeeping == HOUSEKEEPING and frame.notes == ()
