@@ -69,7 +69,10 @@ def run(
         str | None, typer.Option(metavar="ADDRESS", help="dask scheduler for the per-frame work.")
     ] = None,
 ) -> None:
-    """Run the whole pipeline on a campaign: maps, drift, anomalies, the closed loop, report.html."""
+    """Run the whole pipeline on a campaign.
+
+    Temperature maps, drift, anomalies, the closed loop, and report.html.
+    """
     from fusion.pipeline import run_campaign
     from fusion.progress import Reporter
     from fusion.summary import summary_table
@@ -107,7 +110,10 @@ def simulate(
     recipe: Annotated[Path, typer.Argument(metavar="RECIPE.toml", help="What the machine of the twin does.")],
     out: Annotated[Path, typer.Option(help="Folder of the campaign; must be empty or absent.")],
 ) -> None:
-    """Simulate a campaign on the twin: the files that the instruments would write, with the truth kept apart."""
+    """Simulate a campaign with known truth.
+
+    Writes the files that the instruments would write; the truth is kept beside the folder.
+    """
     from fusion.progress import Reporter
     from fusion.twin.instruments import simulate_campaign
 
@@ -120,7 +126,7 @@ def simulate(
 def inspect(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="FLIR, laser or environment files.")],
 ) -> None:
-    """Tell what FLIR or laser files hold, with warnings for what looks wrong."""
+    """Tell what files hold and what looks wrong."""
     from fusion.inspection import describe_file
 
     with _answering():
@@ -136,7 +142,7 @@ def iso230(
     ],
     cycles: Annotated[str | None, typer.Option(help="Window, for example 1-5; left out: all cycles.")] = None,
 ) -> None:
-    """Evaluate a file by ISO 230-2: B, R, E, M, A with their uncertainty."""
+    """Evaluate a file by ISO 230-2."""
     from fusion.summary import iso230_tables
 
     with _answering():
@@ -148,7 +154,7 @@ def iso230(
 def schema(
     name: Annotated[str, typer.Argument(metavar="results|campaign", help="Which file to describe.")] = "results",
 ) -> None:
-    """Print the JSON Schema of results.json, or of the campaign file."""
+    """Print the JSON Schema of a file."""
     from fusion.config import campaign_schema
     from fusion.results import results_schema
 
@@ -165,7 +171,10 @@ def export(
     format: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
     out: Annotated[Path | None, typer.Option(help="Folder for the files; left out: RESULTS/export.")] = None,
 ) -> None:
-    """Export drift and fields as CSV, or the profile as the compensation table of a control."""
+    """Export tables, or a control's compensation.
+
+    Drift, profile and fields as CSV, or the drift-free profile as the compensation table of a control.
+    """
     from fusion.exports import export_results
 
     with _answering():
@@ -187,7 +196,10 @@ def plan(
     power: Annotated[float, typer.Option(min=0.1, max=0.99, help="Wanted chance to name the weakest source.")] = 0.8,
     seed: Annotated[int, typer.Option(help="Another seed is another, equally valid schedule.")] = 0,
 ) -> None:
-    """Propose a random duty schedule for a new test: which switching tells the heat sources apart, in how much time."""
+    """Propose a duty schedule for a new test.
+
+    A random one, which tells heat sources apart that are otherwise taken for each other.
+    """
     from fusion.summary import duty_lines
 
     with _answering():

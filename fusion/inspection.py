@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from fusion.sources import left_out_notices
+from fusion.sources import counted, left_out_notices
 from fusion.wording import moment
 from interferometry.readers import read_deviations, read_environment
 from thermography.inspection import inspect_file, is_flir_file
@@ -35,7 +35,7 @@ def _describe_deviations(path: Path, deviations: xr.Dataset) -> list[str]:
     known = time[~np.isnat(time)]
     found = int(np.isfinite(deviations["deviation"]).sum())
     lines = [
-        f"{path}: deviations, {deviations.sizes['cycle']} cycles, {deviations.sizes['target']} targets "
+        f"{path}: deviations, {counted(deviations.sizes['cycle'], 'cycle')}, {counted(deviations.sizes['target'], 'target')} "
         f"from {position.min():g} to {position.max():g} mm, {found} of {deviations['deviation'].size} readings",
         f"  deviation {float(deviations['deviation'].min()):.3f} to {float(deviations['deviation'].max()):.3f} um",
     ]

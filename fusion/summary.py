@@ -91,15 +91,14 @@ def iso230_tables(path: Path, cycles: str | None) -> list[Table]:
         raise CampaignError(f"{path}: {error}") from None
     axis = Table(title=f"{path.name}, {result.attrs['window']}", title_justify="left")
     axis.add_column("quantity")
-    axis.add_column("value ± U (k = 2) / µm", justify="right")
+    axis.add_column("value / µm", justify="right")
+    axis.add_column("U (k = 2) / µm", justify="right")
     for name in iso230.QUANTITIES:
-        axis.add_row(name, wording.measured(float(result[name]), float(result[f"{name}_u"])))
-    axis.add_row("mean reversal", wording.number(float(result["mean_reversal"])))
+        axis.add_row(name, f"{float(result[name]):.2f}", f"{2 * float(result[f'{name}_u']):.2f}")
+    axis.add_row("mean reversal", f"{float(result['mean_reversal']):.2f}")
     for direction, sign in (("positive", "+"), ("negative", "-")):
         for name in ("E", "R", "A"):
-            axis.add_row(
-                f"{name}{sign}", wording.number(float(result[f"{name}_unidirectional"].sel(direction=direction)))
-            )
+            axis.add_row(f"{name}{sign}", f"{float(result[f'{name}_unidirectional'].sel(direction=direction)):.2f}")
     return [axis, _position_table(deviations, result)]
 
 
@@ -116,7 +115,7 @@ def _position_table(deviations: xr.Dataset, result: xr.Dataset) -> Table:
             row["repeatability_bidirectional"],
         ]
         position = float(deviations["position"].sel(target=target))
-        table.add_row(str(target), f"{position:g}", *(wording.number(float(value)) for value in values))
+        table.add_row(str(target), f"{position:g}", *(f"{float(value):.2f}" for value in values))
     return table
 
 
