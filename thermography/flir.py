@@ -33,6 +33,7 @@ from thermography.flir_record import (
     Directory,
     FffSource,
     damaged_records,
+    find_camera_info,
     plausible_header,
     read_directory,
     read_header,
@@ -69,6 +70,8 @@ class FrameReference(FrameHeader):
         Place of the frame in the file, from 0.
     segments : tuple of (offset, length)
         Where the pieces of the FFF record lie in the file, bytes.
+    camera_info_place : tuple of (offset, length)
+        Where the camera information lies in the record, bytes.
     samples : Samples
         Where the pixels lie in the record.
     """
@@ -76,6 +79,7 @@ class FrameReference(FrameHeader):
     path: Path
     index: int
     segments: Segments
+    camera_info_place: tuple[int, int]
     samples: Samples
 
     @property
@@ -90,7 +94,7 @@ class FrameReference(FrameHeader):
 
     def _read_from(self, file: BinaryIO) -> Frame:
         source = FffSource(file, self.path, self.segments)
-        _, info = read_header(source, read_directory(source))
+        info = source.take(*self.camera_info_place, "camera information")
         counts = read_counts(source, self.samples)
         header = {each.name: getattr(self, each.name) for each in fields(FrameHeader)}
         return Frame(**header, counts=counts, source=str(self.path), index=self.index, camera_info=info)
@@ -189,7 +193,8 @@ def _walk(file: BinaryIO, path: Path) -> Iterator[FrameReference | Rejected]:
 
 def _reference(source: FffSource, directory: Directory, index: int) -> FrameReference:
     """Read the headers of one FFF record."""
-    header, _ = read_header(source, directory)
+    place = find_camera_info(source, directory)
+    header = read_header(source, place)
     samples = read_sample_place(source, directory)
     notes = header.notes
     missing = samples.offset + samples.length - source.size
@@ -204,6 +209,7 @@ def _reference(source: FffSource, directory: Directory, index: int) -> FrameRefe
         path=source.path,
         index=index,
         segments=source.segments,
+        camera_info_place=place,
         samples=samples,
     )
 

@@ -171,20 +171,19 @@ def damaged_records(source: FffSource, directory: Directory) -> list[int]:
     ]
 
 
-def read_header(source: FffSource, directory: Directory) -> tuple[FrameHeader, bytes]:
-    """Read the camera-info record.
-
-    Returns
-    -------
-    FrameHeader
-    bytes
-        The record untouched.
-    """
+def find_camera_info(source: FffSource, directory: Directory) -> tuple[int, int]:
+    """Return offset and length of the camera-info record."""
     offset, length = find_record(source, directory, CAMERA_RECORD, "camera information")
     if length < _MINIMUM_CAMERA_INFO:
         raise source.error(offset, f"camera information of at least {_MINIMUM_CAMERA_INFO} bytes", f"{length} bytes")
     # The longest record seen has 2476 bytes; a wild length must not cost memory.
-    info = source.take(offset, min(length, 0x4000), "camera information")
+    return offset, min(length, 0x4000)
+
+
+def read_header(source: FffSource, place: tuple[int, int]) -> FrameHeader:
+    """Read the camera-info record at a place (offset, length) from `find_camera_info`."""
+    offset, length = place
+    info = source.take(offset, length, "camera information")
     order = "<" if info[:2] == b"\x02\x00" else ">" if info[:2] == b"\x00\x02" else None
     if order is None:
         raise source.error(offset, "the byte-order mark 2 of the camera information", info[:2].hex(" "))
@@ -195,7 +194,7 @@ def read_header(source: FffSource, directory: Directory) -> tuple[FrameHeader, b
     settings = _settings(order, whole[0x98:0xB0] + whole[0x338:0x340] + whole[0x45C:0x466])
     camera = _identity(order, info[0xD4:0x1B8])
     housekeeping = _housekeeping(order, info)
-    header = FrameHeader(
+    return FrameHeader(
         parameters=parameters,
         time=time,
         utc_offset_minutes=utc_offset,
@@ -205,7 +204,6 @@ def read_header(source: FffSource, directory: Directory) -> tuple[FrameHeader, b
         housekeeping=housekeeping,
         notes=notes,
     )
-    return header, info
 
 
 #: Up to and including Planck R2 and the raw range; the oldest record seen has 1148 bytes.
