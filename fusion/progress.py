@@ -36,6 +36,7 @@ class Reporter(AbstractContextManager["Reporter"]):
         self._tasks: dict[str, object] = {}
         self._started: dict[str, float] = {}
         self._spoken: dict[str, float] = {}
+        self._finished: set[str] = set()
 
     def __enter__(self) -> Reporter:
         if self._console.is_terminal:
@@ -66,6 +67,11 @@ class Reporter(AbstractContextManager["Reporter"]):
         self._bars.update(self._tasks[label], completed=done if total else 1, total=max(total, 1))  # type: ignore[arg-type]
 
     def _write(self, label: str, done: int, total: int) -> None:
+        if label in self._finished:
+            if done >= total:
+                return
+            self._finished.remove(label)
+            del self._started[label]
         now = time.monotonic()
         if label not in self._started:
             self._started[label] = self._spoken[label] = now
@@ -73,6 +79,7 @@ class Reporter(AbstractContextManager["Reporter"]):
                 self._console.print(f"{label} ...", highlight=False)
                 return
         if done >= total:
+            self._finished.add(label)
             self._console.print(f"{label}: done in {now - self._started[label]:.1f} s", highlight=False)
         elif now - self._spoken[label] > _SECONDS_BETWEEN_LINES:
             self._spoken[label] = now
