@@ -198,10 +198,10 @@ def _stack(estimate: Estimate) -> Array:
 
 
 def nuisance_columns(seconds: Array, excitation: Excitation) -> Array:
-    """Columns of every hypothesis: level and trend, and for a session that is one warm-up also free exponentials."""
+    """Columns of every hypothesis: level and trend, and where a warm-up dominates also free exponentials."""
     centred = (seconds - seconds.mean()) / max(float(np.ptp(seconds)), 1e-9)
     columns = np.column_stack([np.ones_like(seconds), centred])
-    if not excitation.warm_up_only:
+    if not excitation.protected:
         return columns
     return np.column_stack([columns, warm_up_columns(seconds)])
 

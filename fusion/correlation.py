@@ -6,9 +6,10 @@ integrated random walk whose size is estimated anew under every hypothesis, and 
 family-wise p value compares it with the maximum over all cells, lags and channels in series redrawn from the fitted null.
 
 Two limits are built into the answer. A session that is one warm-up moves every series along one curve; it is tested beside free
-exponentials and its best verdict is "not separable". And a map without a finding says how large an effect it would have found.
+exponentials and its best verdict is "not separable"; where a warm-up only dominates, the rest must carry the evidence. And a map
+without a finding says how large an effect it would have found.
 
-Sources of the procedure: Harris (2020), bioRxiv 2020.11.29.402719 (nonsense correlations);
+Source: Harris (2020), bioRxiv 2020.11.29.402719 (nonsense correlations).
 """
 
 from __future__ import annotations
@@ -206,7 +207,7 @@ def describe_session(tested: Tested, excitation: Excitation) -> xr.Dataset:
         coords={"channel": list(tested.names)},
         attrs={
             "verdict": _FLAG_MEANINGS.split()[session].replace("_", " "),
-            "excitation": "warm-up only" if excitation.warm_up_only else "varied",
+            "excitation": excitation.name,
             "draws": tested.null_maxima.shape[0],
         },
     )

@@ -11,8 +11,11 @@ Array = NDArray[np.float64]
 
 #: Time constants of the exponentials that a machine's warm-up can be made of, s.
 WARM_UP_CONSTANTS_S = (600.0, 1500.0, 3600.0, 10200.0)
-#: A film of which at least this share of the resolved variation follows those exponentials is one warm-up.
-WARM_UP_SHARE = 0.98
+#: A film of which at least this share of the resolved variation follows those exponentials is one warm-up (simulated warm-ups of
+#: three sources under a wandering ambient: 0.991 and more; sources switched at random, whatever their time constants: nearly always less).
+WARM_UP_SHARE = 0.99
+#: From this share on a warm-up dominates; what else moved the field is still tested, beside free exponentials.
+MOSTLY_WARM_UP_SHARE = 0.95
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,18 @@ class Excitation:
     warm_up_share: float
     warm_up_only: bool
     resolved_modes: int
+
+    @property
+    def protected(self) -> bool:
+        """Whether sources must explain more than free exponentials of a warm-up do."""
+        return self.warm_up_only or self.warm_up_share >= MOSTLY_WARM_UP_SHARE
+
+    @property
+    def name(self) -> str:
+        """In words: warm-up only, mostly warm-up, or varied."""
+        if self.warm_up_only:
+            return "warm-up only"
+        return "mostly warm-up" if self.protected else "varied"
 
 
 def warm_up_columns(seconds: Array) -> Array:
@@ -61,7 +76,7 @@ def describe_excitation(seconds: Array, values: Array) -> Excitation:
     """Judge a film (frames, cells), each cell centred over time."""
     courses, _ = thermal_modes(values)
     if courses.shape[1] == 0:
-        return Excitation(1.0, False, 0)
+        return Excitation(0.0, False, 0)
     trend = (seconds - seconds.mean()) / np.ptp(seconds)
     design = np.column_stack([np.ones_like(seconds), trend, warm_up_columns(seconds)])
     rest = courses - design @ np.linalg.lstsq(design, courses, rcond=None)[0]

@@ -52,7 +52,19 @@ def test_one_warm_up_is_not_separable_whatever_the_drift(rng):
     assert maps.attrs["verdict"] == "not separable"
     assert maps.attrs["excitation"] == "warm-up only"
     assert (maps["verdict"] == NOT_SEPARABLE).all()
-    assert float(maps["warm_up_share"]) > 0.98
+    assert float(maps["warm_up_share"]) > 0.99
+
+
+def test_a_small_switched_part_beside_a_warm_up_must_carry_the_evidence(rng):
+    warm = simulator.source_responses("warm", rng)[1]
+    switched = simulator.source_responses("duty", rng)[1]
+    temperatures = simulator.film("duty", rng, warm + 0.4 * switched)
+    made = simulator.session(temperatures, 3.0 * warm[:, 0] + 1.2 * switched[:, 0], 2.0 * warm[:, 0], rng)
+    maps = correlate(made.fused, thin(made.field), draws=99, checks=1)
+    assert maps.attrs["excitation"] == "mostly warm-up"
+    assert maps.attrs["verdict"] == "attributable"
+    row, column = peak(maps, "common")
+    assert simulator.distance_cells(2 * row, 2 * column, 0) <= 7
 
 
 def test_the_map_says_what_it_could_have_found(rng):
