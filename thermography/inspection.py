@@ -215,7 +215,7 @@ def _warned_parameters(p: CameraParameters, references: Sequence[FrameReference]
     if varying:
         yield Warned(
             "parameters_vary",
-            f"{', '.join(varying)} change between frames.",
+            f"not the same in all frames: {', '.join(varying)}.",
             "Override them if the scene did not change.",
         )
     for name in ("reflected_temperature_K", "atmospheric_temperature_K"):

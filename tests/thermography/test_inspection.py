@@ -112,7 +112,7 @@ def test_changes_within_a_file_are_warned_of(tmp_path: Path) -> None:
     write_sequence(tmp_path / "a.seq", [first, second, other])
     found = {each.code: each.message for each in inspect(tmp_path / "a.seq").warnings}
     assert set(found) == {"parameters_vary", "several_cameras"}
-    assert found["parameters_vary"] == "emissivity change between frames."
+    assert found["parameters_vary"] == "not the same in all frames: emissivity."
 
 
 def test_damage_is_warned_of(tmp_path: Path) -> None:
