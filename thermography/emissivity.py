@@ -13,6 +13,7 @@ from thermography.radiometry import (
     RadiometryError,
     black_body_signal,
     check,
+    signal_slope,
     temperature_of_signal,
     transmission,
 )
@@ -85,7 +86,7 @@ def estimate_emissivity(first: KnownState, second: KnownState, parameters: Camer
             f"both states have {first.temperature_degC:g} degC: heat the surface between them, 10 K or more"
         )
     emissivity = (second.counts - first.counts) / (path * contrast)
-    slopes = _slope(kelvin, parameters)
+    slopes = signal_slope(kelvin, parameters)
     relative_to_temperature = emissivity * slopes / contrast
     u = float(
         np.hypot(
@@ -102,13 +103,6 @@ def _quality(emissivity: float, u: float) -> Literal["usable", "too_reflective",
     if u > _LARGEST_USEFUL_U or emissivity - 2 * u > 1 or emissivity + 2 * u <= 0:
         return "undetermined"
     return "too_reflective" if emissivity - 2 * u < _MORE_REFLECTION_THAN_SURFACE else "usable"
-
-
-def _slope(kelvin: np.ndarray, parameters: CameraParameters) -> np.ndarray:
-    """Return dS/dT, counts per kelvin."""
-    step = 0.01
-    high, low = black_body_signal(kelvin + step, parameters), black_body_signal(kelvin - step, parameters)
-    return (high - low) / (2 * step)
 
 
 def _reflected(state: KnownState, emissivity: float, signal: float, parameters: CameraParameters) -> float:

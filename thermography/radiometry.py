@@ -106,6 +106,13 @@ def black_body_signal(temperature_K: ArrayLike, parameters: CameraParameters) ->
     return p.planck_r1 / (p.planck_r2 * (exponential - p.planck_f)) - p.planck_o
 
 
+def signal_slope(temperature_K: ArrayLike, parameters: CameraParameters) -> NDArray[np.float64]:
+    """Return dS/dT of a black body, counts per kelvin."""
+    p, kelvin = parameters, np.asarray(temperature_K, np.float64)
+    exponential = np.exp(p.planck_b / kelvin)
+    return p.planck_r1 / p.planck_r2 * exponential * p.planck_b / (kelvin * (exponential - p.planck_f)) ** 2
+
+
 def count_line(
     parameters: CameraParameters, emissivity: ArrayLike | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

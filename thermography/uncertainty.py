@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thermography.flir import CameraParameters
-from thermography.radiometry import ZERO_CELSIUS_K, black_body_signal, count_line, override
+from thermography.radiometry import ZERO_CELSIUS_K, black_body_signal, count_line, override, signal_slope
 
 _Array = NDArray[np.float64]
 #: Parameters of the formula that may be uncertain, with their range.
@@ -122,7 +122,7 @@ def temperature_uncertainty(
     inputs = inputs or InputUncertainty()
     kelvin = np.asarray(temperature, np.float64) + ZERO_CELSIUS_K
     signal = black_body_signal(kelvin, parameters)
-    kelvin_per_count = 1 / _slope(kelvin, parameters)
+    kelvin_per_count = 1 / signal_slope(kelvin, parameters)
     gain, _ = count_line(parameters)
     common = {}
     for name in _RANGES:
@@ -135,7 +135,7 @@ def temperature_uncertainty(
     if inputs.camera_scale > 0:
         common["camera_scale"] = kelvin_per_count * (signal + parameters.planck_o) * inputs.camera_scale
     # The noise of a pixel in counts does not depend on what it looks at.
-    noise = inputs.netd_K * _slope(np.float64(inputs.netd_temperature_degC + ZERO_CELSIUS_K), parameters)
+    noise = inputs.netd_K * signal_slope(inputs.netd_temperature_degC + ZERO_CELSIUS_K, parameters)
     per_count = kelvin_per_count / (gain * np.sqrt(frames))
     return Budget(common, {"noise": per_count * noise, "quantisation": per_count / 12**0.5})
 
@@ -178,14 +178,6 @@ def temperature_rise_uncertainty(
 
 def _root_sum_square(parts: dict[str, _Array]) -> _Array:
     return np.sqrt(np.sum([part**2 for part in parts.values()], axis=0))
-
-
-def _slope(kelvin: ArrayLike, parameters: CameraParameters) -> _Array:
-    """Return dS/dT of a black body, counts per kelvin."""
-    kelvin = np.asarray(kelvin, np.float64)
-    exponential = np.exp(parameters.planck_b / kelvin)
-    scale = parameters.planck_r1 / parameters.planck_r2
-    return scale * exponential * parameters.planck_b / (kelvin * (exponential - parameters.planck_f)) ** 2
 
 
 def _line_slopes(parameters: CameraParameters, name: str, u: float) -> tuple[_Array, _Array]:

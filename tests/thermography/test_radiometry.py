@@ -20,6 +20,7 @@ from thermography.radiometry import (
     counts_from_temperature,
     override,
     path_transmission,
+    signal_slope,
     temperature_from_counts,
     transmission,
 )
@@ -60,6 +61,13 @@ def test_formula_at_hand_calculated_points() -> None:
     grey = replace(black, emissivity=0.3, object_distance_m=10.0, window_transmission=0.8)
     warm = {f"{name}_temperature_K": 300.0 for name in ("reflected", "atmospheric", "window")}
     assert float(temperature_from_counts(expected, replace(grey, **warm))) == pytest.approx(26.85, abs=1e-9)
+
+
+def test_slope_is_the_derivative_of_the_signal() -> None:
+    kelvin = np.array([250.0, 293.15, 400.0])
+    difference = black_body_signal(kelvin + 0.01, PARAMETERS) - black_body_signal(kelvin - 0.01, PARAMETERS)
+    # The second difference of a 0.02 K step leaves 1e-8 of the slope, cancellation of 18000 counts 1e-9.
+    np.testing.assert_allclose(signal_slope(kelvin, PARAMETERS), difference / 0.02, rtol=1e-7)
 
 
 def test_calibrate_is_the_float64_formula_within_float32() -> None:
