@@ -25,6 +25,8 @@ from thermography.plan import Fiducial, PlanGrid, read_fiducials
 
 #: So many left-out things are named in a message; all of them are in the products.
 _NAMED = 5
+#: What the closed loop and the correlation need at least.
+_LEAST_CYCLES, _LEAST_TARGETS, _LEAST_FRAMES = 12, 3, 12
 
 
 @dataclass(frozen=True)
@@ -135,12 +137,7 @@ def correct_dead_path(
 def _notices(source: Source) -> list[Notice]:
     """Everything that is left out of the input or missing from it."""
     notices = frames_notices(source.frames_rejected)
-    if len(source.frames) < 2:
-        reasons = "; ".join(item["reason"] for item in source.frames_rejected[:_NAMED])
-        raise SourceError(
-            f"{source.campaign.path}: {len(source.frames)} usable frames, at least 2 are needed for a rise ({reasons or 'none rejected'}); "
-            "check thermography.frames"
-        )
+    _refuse_too_few(source)
     notices += check_clocks(
         source.deviations,
         source.frame_times,
@@ -148,9 +145,6 @@ def _notices(source: Source) -> list[Notice]:
         source=str(source.campaign.path),
     )
     notices += left_out_notices(source.deviations, "readings_left_out")
-    missing = int(np.isnan(source.deviations["deviation"].values).sum())
-    if missing:
-        notices.append(_missing_notice(source.deviations, missing))
     for table, code in ((source.environment, "environment_rows_left_out"), (source.drivers, "driver_rows_left_out")):
         if table is not None:
             notices += left_out_notices(table, code)
@@ -163,6 +157,25 @@ def _notices(source: Source) -> list[Notice]:
             )
         )
     return notices
+
+
+def _refuse_too_few(source: Source) -> None:
+    """Refuse a campaign that is too small for what is made of it, before the long work."""
+    sizes = source.deviations.sizes
+    if sizes["cycle"] < _LEAST_CYCLES or sizes["target"] < _LEAST_TARGETS:
+        raise SourceError(
+            f"{source.interferometry.deviations}: {counted(sizes['cycle'], 'cycle')} at {counted(sizes['target'], 'target')}; "
+            f"a model of the drift needs at least {_LEAST_CYCLES} cycles (better 50) at {_LEAST_TARGETS} targets, "
+            "thermofuse iso230 evaluates shorter tests"
+        )
+    if len(source.frames) < _LEAST_FRAMES:
+        reasons = (
+            listed(_reason(item) for item in source.frames_rejected) if source.frames_rejected else "none rejected"
+        )
+        raise SourceError(
+            f"{source.campaign.path}: {counted(len(source.frames), 'usable frame')}, at least {_LEAST_FRAMES} are needed "
+            f"({reasons}); check thermography.frames"
+        )
 
 
 class SourceError(ValueError):
@@ -202,16 +215,6 @@ def left_out_notices(dataset: xr.Dataset, code: str) -> list[Notice]:
             f"Correct these lines in {lines[0]['path']} and run again; the estimates allow for the gaps.",
         )
     ]
-
-
-def _missing_notice(deviations: xr.Dataset, missing: int) -> Notice:
-    gaps = np.isnan(deviations["deviation"].values)
-    cycles = [str(cycle) for cycle in deviations["cycle"].values[gaps.any(axis=(1, 2))]]
-    return Notice(
-        "readings_missing",
-        f"{counted(missing, 'reading')} of {gaps.size} missing, in {counted(len(cycles), 'cycle')}: {listed(cycles)}.",
-        "Nothing has to be done: the joint estimate allows for gaps; conventional values are taken from the readings that are there.",
-    )
 
 
 def counted(number: int, noun: str) -> str:

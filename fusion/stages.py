@@ -27,6 +27,7 @@ from fusion.sources import Source, counted, listed
 from interferometry import iso230, neighbours
 from interferometry.anomalies import Anomaly, detect_anomalies
 from interferometry.drift import estimate_drift, flag_outliers
+from interferometry.flags import OUTLIER
 from thermography.hotspots import Hotspot, detect_hotspots
 
 #: What each stage is called in progress and provenance.
@@ -73,7 +74,40 @@ def evaluate_interferometry(source: Source) -> Outcome:
             "scatter_um": by_direction(drift["scatter"]),
         },
     }
-    return Outcome(dataset, parts)
+    return Outcome(dataset, parts, tuple(reading_notices(deviations, drift)))
+
+
+def reading_notices(deviations: xr.Dataset, drift: xr.Dataset) -> list[Notice]:
+    """Return notices for missing readings, with what they cost the profile, and for readings that were given little weight."""
+    notices = []
+    gaps = np.isnan(deviations["deviation"].values)
+    if gaps.any():
+        cycles = [str(cycle) for cycle in deviations["cycle"].values[gaps.any(axis=(1, 2))]]
+        share = np.sqrt(1.0 - gaps.mean(axis=0))
+        wider = float(np.nanmax(drift["profile_u"].values * (1.0 - share)))
+        notices.append(
+            Notice(
+                "readings_missing",
+                f"{counted(int(gaps.sum()), 'reading')} of {gaps.size} missing, in {counted(len(cycles), 'cycle')}: {listed(cycles)}. "
+                f"This widens the profile's standard uncertainty by up to {wider:.3f} µm.",
+                "Nothing has to be done: the joint estimate allows for gaps; conventional values use the readings that are there.",
+                effect_um=wider,
+            )
+        )
+    outliers = (deviations["quality_flag"].values & OUTLIER.mask) > 0
+    if outliers.any():
+        named = [
+            f"cycle {deviations['cycle'].values[c]} {deviations['direction'].values[d]} target {deviations['target'].values[t]}"
+            for c, d, t in np.argwhere(outliers)
+        ]
+        notices.append(
+            Notice(
+                "outliers",
+                f"{counted(len(named), 'reading')} far from the joint estimate given little weight: {listed(named)}.",
+                "Look at what happened there; flagged in deviations.nc, still in the conventional values.",
+            )
+        )
+    return notices
 
 
 def iso_part(windows: xr.Dataset) -> dict[str, Any]:

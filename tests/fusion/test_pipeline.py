@@ -20,6 +20,7 @@ from fusion.products import OutputError, file_sha256, read_dataset
 from fusion.progress import silent
 from fusion.results import results_schema
 from fusion.sources import SourceError, read_source
+from fusion.stages import evaluate_interferometry
 from fusion.stages_thermal import reduce_thermography
 from fusion.twin import simulate_campaign
 from thermography.contract import FIELDS
@@ -164,7 +165,11 @@ def test_damaged_frames_and_lines_are_left_out_by_name(copied: Path) -> None:
     assert str(copied) not in messages["frames_rejected"]
     assert "2 lines of laser.csv left out: line 11 ('abc' is not a number)" in messages["readings_left_out"]
     assert "line 21 ('upward'" in messages["readings_left_out"]
-    assert "2 readings of 288 missing" in messages["readings_missing"]
+    outcome = evaluate_interferometry(source)
+    missing = {notice.code: notice for notice in outcome.notices}["readings_missing"]
+    assert missing.message.startswith("2 readings of 288 missing, in ")
+    # One reading of 24 at two cells: u grows by 1 - sqrt(23 / 24) = 2.1 %.
+    assert missing.effect_um == pytest.approx(0.021 * float(outcome.dataset["drift_profile_u"].max()), rel=0.2)
 
 
 def test_clocks_in_two_time_zones_are_refused_with_the_offset_to_write(copied: Path) -> None:
@@ -187,7 +192,19 @@ def test_recordings_of_two_days_are_refused(copied: Path) -> None:
 def test_a_single_frame_is_not_enough(copied: Path) -> None:
     for frame in sorted((copied / "thermal").glob("*.jpg"))[1:]:
         frame.unlink()
-    with pytest.raises(SourceError, match="1 usable frames, at least 2 are needed for a rise"):
+    message = r"1 usable frame, at least 12 are needed \(none rejected\); check thermography.frames"
+    with pytest.raises(SourceError, match=message):
+        read_source(load_campaign(copied / "campaign.toml"))
+
+
+def test_a_short_test_is_refused_before_the_long_work(copied: Path) -> None:
+    lines = (copied / "laser.csv").read_text().splitlines()
+    short = [line for line in lines if line.split(",")[0] in {"cycle", "1", "2", "3", "4", "5"}]
+    (copied / "laser.csv").write_text("\n".join(short) + "\n")
+    message = (
+        r"laser.csv: 5 cycles at 6 targets; a model of the drift needs at least 12 cycles \(better 50\) at 3 targets"
+    )
+    with pytest.raises(SourceError, match=message):
         read_source(load_campaign(copied / "campaign.toml"))
 
 
@@ -205,8 +222,8 @@ def test_residuals_lie_at_their_own_reading(results_folder: Path) -> None:
 def test_the_clock_of_a_camera_that_sees_the_table_move_is_found(tmp_path: Path) -> None:
     """The camera's clock is 37 s ahead and nobody says so; 0.2 s is a tenth of the dwell at a target."""
     (tmp_path / "recipe.toml").write_text(
-        "[campaign]\nseed = 3\n[test]\ncycles = 4\ntargets = 7\nspacing_mm = 40\nperiod_s = 200\n"
-        '[camera]\ntable = "moving"\nfile = "seq"\ncolumns = 320\nrows = 240\nfocal_px = 600.0\ndistance_mm = 1900.0\n'
+        "[campaign]\nseed = 3\n[test]\ncycles = 12\ntargets = 7\nspacing_mm = 40\nperiod_s = 200\n"
+        '[camera]\ntable = "moving"\nfile = "seq"\ncolumns = 320\nrows = 240\nfocal_px = 600.0\ndistance_mm = 1900.0\nframe_interval_s = 20.0\n'
         "clock_offset_s = 37.0\nstate_clock_offset = false\n"
     )
     campaign = simulate_campaign(tmp_path / "recipe.toml", tmp_path / "campaign")
