@@ -220,11 +220,11 @@ def test_residuals_lie_at_their_own_reading(results_folder: Path) -> None:
 
 
 def test_the_clock_of_a_camera_that_sees_the_table_move_is_found(tmp_path: Path) -> None:
-    """The camera's clock is 37 s ahead and nobody says so; 0.2 s is a tenth of the dwell at a target."""
+    """The clock is 37 s ahead and nobody says so; 13 s between frames do not divide the cycle, 0.2 s is a tenth of the dwell."""
     (tmp_path / "recipe.toml").write_text(
         "[campaign]\nseed = 3\n[test]\ncycles = 12\ntargets = 7\nspacing_mm = 40\nperiod_s = 200\n"
-        '[camera]\ntable = "moving"\nfile = "seq"\ncolumns = 320\nrows = 240\nfocal_px = 600.0\ndistance_mm = 1900.0\nframe_interval_s = 20.0\n'
-        "clock_offset_s = 37.0\nstate_clock_offset = false\n"
+        '[camera]\ntable = "moving"\nfile = "seq"\ncolumns = 320\nrows = 240\nfocal_px = 600.0\ndistance_mm = 1900.0\n'
+        "frame_interval_s = 13.0\nclock_offset_s = 37.0\nstate_clock_offset = false\n"
     )
     campaign = simulate_campaign(tmp_path / "recipe.toml", tmp_path / "campaign")
     campaign.write_text(campaign.read_text().replace('cell_size = "5 mm"', 'cell_size = "20 mm"'))
