@@ -188,7 +188,9 @@ def _add(counts: Array, total: Array, squares: Array, lowest: Array, highest: Ar
             highest[start + i] = max(highest[start + i], high[i])
 
 
-def mean_temperature(statistics: CountStatistics, parameters: CameraParameters) -> MeanTemperature:
+def mean_temperature(
+    statistics: CountStatistics, parameters: CameraParameters, *, used: NDArray[np.bool_] | None = None
+) -> MeanTemperature:
     """Return mean and variance of the temperature from sums of counts, without going through the frames again.
 
     The mean of a curved function is the function of the mean plus half its curvature times the variance; the rest is bounded by
@@ -201,6 +203,8 @@ def mean_temperature(statistics: CountStatistics, parameters: CameraParameters) 
         Sums over frames that share `parameters`.
     parameters
         Of these frames.
+    used
+        Pixels to work out, of the same shape; the others come back as zero.
 
     Returns
     -------
@@ -213,32 +217,35 @@ def mean_temperature(statistics: CountStatistics, parameters: CameraParameters) 
     total, squares, lowest, highest = (
         values.ravel() for values in (statistics.total, statistics.squares, statistics.lowest, statistics.highest)
     )
-    mean, variance, bound = _mean_temperature(statistics.frames, total, squares, lowest, highest, curve)
     shape = statistics.total.shape
+    wanted = np.ones(total.shape, bool) if used is None else used.ravel()
+    mean, variance, bound = _mean_temperature(statistics.frames, total, squares, lowest, highest, curve, wanted)
     return MeanTemperature(statistics.frames, mean.reshape(shape), variance.reshape(shape), bound.reshape(shape))
 
 
 @numba.njit(cache=True, nogil=True)
 def _mean_temperature(
-    frames: int, total: Array, squares: Array, lowest: Array, highest: Array, curve: Array
+    frames: int, total: Array, squares: Array, lowest: Array, highest: Array, curve: Array, wanted: Array
 ) -> tuple[Array, Array, Array]:
     pixels = len(total)
-    mean, variance, bound = np.empty(pixels), np.empty(pixels), np.empty(pixels)
+    mean, variance, bound = np.zeros(pixels), np.zeros(pixels), np.zeros(pixels)
     n = np.uint64(frames)
-    steepest = abs(_derivatives(float(lowest.min()), curve)[3])
+    steepest = abs(_third_derivative(float(lowest.min()), curve))
     for i in range(pixels):
+        if not wanted[i]:
+            continue
         low = np.uint64(lowest[i])
         first_moment = float(total[i] - n * low) / frames
         counts = float(low) + first_moment
         spread = max(float(squares[i] + n * low * low - np.uint64(2) * low * total[i]) / frames - first_moment**2, 0.0)
-        temperature, first, second, _ = _derivatives(counts, curve)
+        temperature, first, second = _derivatives(counts, curve)
         reach = max(highest[i] - counts, counts - float(low))
         limit = steepest / 6 * spread * reach
         if not limit <= AVERAGING_LIMIT_K:
             # The smallest count of the whole window is a coarse bound; only where it does not do, the pixel's own is worked out.
-            own = _derivatives(float(low), curve)
-            limit = abs(own[3]) / 6 * spread * reach
-            if np.isnan(own[0]):
+            own = abs(_third_derivative(float(low), curve))
+            limit = own / 6 * spread * reach
+            if np.isnan(own):
                 temperature = np.nan
         mean[i] = temperature + 0.5 * second * spread
         variance[i] = first**2 * spread
@@ -247,16 +254,29 @@ def _mean_temperature(
 
 
 @numba.njit(cache=True, nogil=True)
-def _derivatives(counts: float, curve: Array) -> tuple[float, float, float, float]:
-    """Temperature (degC) and its first three derivatives by the counts, K per count to their power; NaN below any temperature."""
+def _derivatives(counts: float, curve: Array) -> tuple[float, float, float]:
+    """Temperature (degC) and its first two derivatives by the counts, K per count to their power; NaN below any temperature."""
     a, b, f, gain, offset = curve
     s = (counts - offset) / gain
     if s <= 0 or a / s + f <= 1:
-        return np.nan, np.nan, np.nan, np.nan
+        return np.nan, np.nan, np.nan
+    inverse_log = 1 / np.log(a / s + f)
+    inverse_d = 1 / (s * (a + f * s))
+    g = a * inverse_d
+    g1 = -g * (a + 2 * f * s) * inverse_d
+    first = b * g * inverse_log**2
+    second = b * inverse_log**2 * (g1 + 2 * g * g * inverse_log)
+    return b * inverse_log - ZERO_CELSIUS_K, first / gain, second / gain**2
+
+
+@numba.njit(cache=True, nogil=True)
+def _third_derivative(counts: float, curve: Array) -> float:
+    """Third derivative of the temperature by the counts, K per count cubed; it falls as the counts rise."""
+    a, b, f, gain, offset = curve
+    s = (counts - offset) / gain
+    if s <= 0 or a / s + f <= 1:
+        return np.nan
     log = np.log(a / s + f)
     d, d1, d2 = s * (a + f * s), a + 2 * f * s, 2 * f
     g, g1, g2 = a / d, -a * d1 / d**2, -a * d2 / d**2 + 2 * a * d1**2 / d**3
-    first = b * g / log**2
-    second = b * (g1 / log**2 + 2 * g**2 / log**3)
-    third = b * (g2 / log**2 + 6 * g * g1 / log**3 + 6 * g**3 / log**4)
-    return b / log - ZERO_CELSIUS_K, first / gain, second / gain**2, third / gain**3
+    return b * (g2 / log**2 + 6 * g * g1 / log**3 + 6 * g**3 / log**4) / gain**3

@@ -30,8 +30,6 @@ Override = Callable[[FrameReference], CameraParameters]
 
 #: Most frames of one block: what a cluster computes at once, and what is lost when a run is broken off.
 BLOCK_FRAMES = 512
-#: Rows either side of the middle of a frame from which its noise is taken.
-NOISE_ROWS = 24
 #: Corrections within a block differ by no more than this.
 CORRECTION_STEP_K = 2e-3
 
@@ -116,21 +114,19 @@ def reduce_block(
     window = camera.weights.window
     sums = Accumulator(camera.weights.used.shape)
     shifts, noise, counts = [], np.nan, np.empty((0, 0, 0), np.uint16)
+    # One buffer for all chunks: fresh memory for each costs more than reading into it.
+    buffer = np.empty((min(CHUNK_FRAMES, len(frames)), *camera.weights.used.shape), np.uint16)
     for start in range(0, len(frames), CHUNK_FRAMES):
-        counts = read_window(frames[start : start + CHUNK_FRAMES], window)
+        counts = read_window(frames[start : start + CHUNK_FRAMES], window, buffer)
         sums.add(counts)
-        # The middle rows of one frame give the noise well enough to tell whether a disc shows.
-        middle = slice(max(counts.shape[1] // 2 - NOISE_ROWS, 0), counts.shape[1] // 2 + NOISE_ROWS)
-        noise = (
-            noise_of_differences(counts[0, middle].astype(float), camera.weights.whole[middle]) if start == 0 else noise
-        )
+        noise = noise_of_differences(counts[0], camera.weights.whole) if start == 0 else noise
         shifts.append(camera.watch.shifts(counts, noise))
     statistics = sums.statistics()
     if len(frames) == 1:
         mean = calibrate(counts[0], parameters).astype(float)
         reduced = MeanTemperature(1, mean, np.zeros_like(mean), np.zeros_like(mean))
     else:
-        reduced = mean_temperature(statistics, parameters)
+        reduced = mean_temperature(statistics, parameters, used=camera.weights.used)
         _calibrate_one_by_one(
             reduced, (reduced.bound_K > AVERAGING_LIMIT_K) & camera.weights.used, frames, parameters, window
         )
@@ -159,10 +155,16 @@ def _calibrate_one_by_one(
     reduced.variance[wild] = np.maximum(squares / len(frames) - (total / len(frames)) ** 2, 0.0)
 
 
-def read_window(frames: Sequence[FrameReference], window: tuple[slice, slice]) -> NDArray[np.uint16]:
-    """Counts of a window of the sensor, (time, row, column) uint16; raw samples are read row-wise where they lie."""
+def read_window(
+    frames: Sequence[FrameReference], window: tuple[slice, slice], buffer: NDArray[np.uint16] | None = None
+) -> NDArray[np.uint16]:
+    """Counts of a window of the sensor, (time, row, column) uint16; raw samples are read row-wise where they lie.
+
+    With a `buffer` (frames or more, row, column) they are read into it, and a view of it is returned.
+    """
     rows, columns = window
-    counts = np.empty((len(frames), rows.stop - rows.start, columns.stop - columns.start), np.uint16)
+    shape = (len(frames), rows.stop - rows.start, columns.stop - columns.start)
+    counts = np.empty(shape, np.uint16) if buffer is None else buffer[: len(frames)]
     path, file = None, -1
     try:
         for i, frame in enumerate(frames):

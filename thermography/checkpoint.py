@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from thermography.flir import CameraParameters
 from thermography.knocks import RegisteredFrom
 from thermography.plan import PlanGrid
 from thermography.resampling import plan_weights
+from thermography.scheduling import THREADS
 
 Array = NDArray[Any]
 
@@ -180,21 +182,24 @@ def recalibrate(
         The folder holds no sums.
     """
     weights = [plan_weights(span.registration, grid) for span in registrations]
-    parts = []
-    for path in sorted(Path(folder).glob("frames_*.npz")):
+
+    def calibrated(path: Path) -> CyclePart:
         finished = _load(path)
         if not finished.groups:
             raise CheckpointError(
                 f"{path}: holds no sums of counts; reduce the frames again with their statistics kept"
             )
         part = finished.part
-        part.pixels = None
+        own = weights[part.span]
         for group in finished.groups:
-            reduced = mean_temperature(group.statistics, change(group.parameters))
+            reduced = mean_temperature(group.statistics, change(group.parameters), used=own.used)
             reduced.mean[...] += group.correction_K
             part.pixels = reduced if part.pixels is None else part.pixels.merge(reduced)
-        part.finish(weights[part.span])
-        parts.append(part)
+        part.finish(own)
+        return part
+
+    with ThreadPoolExecutor(THREADS) as executor:
+        parts = list(executor.map(calibrated, sorted(Path(folder).glob("frames_*.npz"))))
     if not parts:
         raise CheckpointError(f"{folder}: holds no finished cycle; reduce the frames first")
     covariances = [position_covariance(span.registration, grid) for span in registrations]

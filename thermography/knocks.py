@@ -93,7 +93,7 @@ def _disc_weights(
     to_mm = np.linalg.inv(jacobian)
     radius = disc.diameter_mm / 2
     pixel_mm = float(np.linalg.norm(to_mm, 2))
-    half = np.ceil((2 * radius + 6 * pixel_mm) * np.linalg.norm(jacobian, axis=1)).astype(int)
+    half = np.ceil((1.5 * radius + 5.5 * pixel_mm) * np.linalg.norm(jacobian, axis=1)).astype(int)
     low = np.maximum(np.round(centre).astype(int) - half, 0)
     high = np.minimum(np.round(centre).astype(int) + half + 1, np.array(shape[::-1]))
     columns, rows = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
@@ -101,7 +101,7 @@ def _disc_weights(
     plan = offsets @ to_mm.T + place
     distance = np.linalg.norm(plan - place, axis=1)
     counted = distance < radius + 3.5 * pixel_mm
-    ring = ~counted & (distance < 1.8 * radius + 5 * pixel_mm) & grid.contains(plan, margin_mm=1.5 * pixel_mm)
+    ring = ~counted & (distance < 1.5 * radius + 5.5 * pixel_mm) & grid.contains(plan, margin_mm=1.5 * pixel_mm)
     # Every other pixel of the ring is enough for its plane, and halves the cost of the look.
     ring &= ((columns + rows).ravel() & 1) == 0
     if ring.sum() < 12 or counted.sum() < 12:

@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from thermography.averaging import CHUNK_FRAMES
 from thermography.blocks import Block, Override, cut_blocks, read_window
 from thermography.cycles import NOT_NUMBERED, CyclePart, annotate, assemble, pixel_noise, position_covariance
 from thermography.fields import BLOCK_S, FieldError, check_bounds, check_correction, check_frames, cycle_of
@@ -30,6 +31,9 @@ Array = NDArray[Any]
 SAMPLES = 4
 #: Frames whose table is known no better than this take no part in the fields, mm.
 LARGEST_U_MM = 1.0
+
+#: Counts within a cell up to which they are averaged before they are calibrated.
+NARROW = 600.0
 
 MOVING_ATTRIBUTES: dict[str, dict[str, Any]] = {
     "table_position": {
@@ -186,15 +190,19 @@ def reduce_moving_block(
 ) -> MovingResult:
     """Place the table in every frame of a block and add its temperature to the cells."""
     rows, columns = tracker.registration.shape
-    counts = read_window(frames, (slice(0, rows), slice(0, columns)))
-    table = temperature_from_counts(np.arange(65536.0), parameters).astype(np.float32)
+    window = (slice(0, rows), slice(0, columns))
+    buffer = np.empty((min(CHUNK_FRAMES, len(frames)), rows, columns), np.uint16)
+    table = temperature_from_counts(np.arange(65536.0), parameters)
     cells = len(samples.valid)
     result = MovingResult(
         np.zeros(cells, np.int64), np.zeros(cells), np.zeros(cells), np.full((len(frames), 2), np.nan), np.full(len(frames), np.nan),
         np.zeros(len(frames), np.int64),
     )  # fmt: skip
     near = None
-    for i, frame in enumerate(counts):
+    for i in range(len(frames)):
+        if i % CHUNK_FRAMES == 0:
+            counts = read_window(frames[i : i + CHUNK_FRAMES], window, buffer)
+        frame = counts[i % CHUNK_FRAMES]
         place = locate_table(frame, tracker, near)
         near = None if place is None else place.shift_mm
         if place is None:
@@ -209,30 +217,63 @@ def reduce_moving_block(
 
 
 @numba.njit(cache=True, nogil=True)
+def _between(counts: Array, column: float, row: float) -> float:
+    """Counts between four pixels, bilinear."""
+    j, i = int(column), int(row)
+    u, v = column - j, row - i
+    upper = (1 - u) * counts[i, j] + u * counts[i, j + 1]
+    lower = (1 - u) * counts[i + 1, j] + u * counts[i + 1, j + 1]
+    return (1 - v) * upper + v * lower
+
+
+@numba.njit(cache=True, nogil=True)
+def _temperature(table: Array, counts: float) -> float:
+    """Temperature of counts that need not be whole numbers."""
+    low = min(int(counts), 65534)
+    part = counts - low
+    return (1 - part) * table[low] + part * table[low + 1]
+
+
+@numba.njit(cache=True, nogil=True)
 def _add_frame(
     counts: Array, table: Array, points: Array, valid: Array, shift: Array, lens: Array, offset: float,
     count: Array, mean: Array, squares: Array,
 ) -> None:  # fmt: skip
     """Sample one frame and add it to every cell whose unmasked samples are all in view (Welford's update)."""
     rows, columns = counts.shape
+    middle = points.shape[1] // 2
     for cell in range(len(points)):
-        total, used, lost = 0.0, 0, False
+        total, used, lost, low, high = 0.0, 0, False, 1e9, -1e9
+        # Within a cell the projection is as good as affine: to a thousandth of a pixel for cells of 5 mm.
+        x0, y0 = points[cell, middle, 0], points[cell, middle, 1]
+        c0, r0 = projected(x0 + shift[0], y0 + shift[1], lens)
+        c1, r1 = projected(x0 + shift[0] + 1.0, y0 + shift[1], lens)
+        c2, r2 = projected(x0 + shift[0], y0 + shift[1] + 1.0, lens)
         for k in range(points.shape[1]):
             if not valid[cell, k]:
                 continue
-            c, r = projected(points[cell, k, 0] + shift[0], points[cell, k, 1] + shift[1], lens)
-            column, row = int(np.floor(c)), int(np.floor(r))
-            if column < 0 or row < 0 or column >= columns - 1 or row >= rows - 1:
+            x, y = points[cell, k, 0] - x0, points[cell, k, 1] - y0
+            c, r = c0 + x * (c1 - c0) + y * (c2 - c0), r0 + x * (r1 - r0) + y * (r2 - r0)
+            if c < 0 or r < 0 or c >= columns - 1 or r >= rows - 1:
                 lost = True
                 break
-            u, v = c - column, r - row
-            upper = (1 - u) * table[counts[row, column]] + u * table[counts[row, column + 1]]
-            lower = (1 - u) * table[counts[row + 1, column]] + u * table[counts[row + 1, column + 1]]
-            total += (1 - v) * upper + v * lower
+            value = _between(counts, c, r)
+            total += value
+            low, high = min(low, value), max(high, value)
             used += 1
         if lost or used == 0:
             continue
-        value = total / used + offset
+        # A few hundred counts apart, the temperature of the mean count is the mean temperature to a few hundredths of a millikelvin.
+        value = _temperature(table, total / used)
+        if high - low > NARROW:
+            total = 0.0
+            for k in range(points.shape[1]):
+                if valid[cell, k]:
+                    x, y = points[cell, k, 0] - x0, points[cell, k, 1] - y0
+                    c, r = c0 + x * (c1 - c0) + y * (c2 - c0), r0 + x * (r1 - r0) + y * (r2 - r0)
+                    total += _temperature(table, _between(counts, c, r))
+            value = total / used
+        value += offset
         count[cell] += 1
         step = value - mean[cell]
         mean[cell] += step / count[cell]

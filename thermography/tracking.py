@@ -40,6 +40,9 @@ class Tracker:
         How far the table may be displaced either way.
     registration
         Of the table where it stood when it was registered.
+    bias_px
+        By how much perspective shifts the centroid of every disc's image from the image of its centre, (n, 2): nearly the same
+        wherever the table is.
     common_mm, common_u_mm
         Displacements along the direction, and what the registration's own uncertainty adds there for all discs together.
     """
@@ -50,6 +53,7 @@ class Tracker:
     size_mm: tuple[float, float]
     reach_mm: float
     registration: Registration
+    bias_px: Array
     common_mm: Array
     common_u_mm: Array
 
@@ -71,7 +75,9 @@ def make_tracker(registration: Registration, grid: PlanGrid, direction: Array, *
     places = discs[:, :2] + (along[:, None] * unit)[:, None, :]
     common = np.sqrt(np.mean(registration.position_u(places) ** 2, axis=1))
     size = (grid.width_mm, grid.height_mm)
-    return Tracker(discs, lens_array(registration), unit, size, reach_mm, registration, along, common)
+    projection = registration.projection
+    bias = projection.disc_centroids(discs[:, :2], discs[:, 2]) - projection.to_sensor(discs[:, :2])
+    return Tracker(discs, lens_array(registration), unit, size, reach_mm, registration, bias, along, common)
 
 
 def lens_array(registration: Registration) -> Array:
@@ -116,12 +122,7 @@ def _refined(counts: NDArray[np.uint16], tracker: Tracker, near_mm: Array) -> Ta
     seen = np.flatnonzero(found[:, 2] > 0)
     if len(seen) < 2:
         return None
-    centres, radii = tracker.discs[seen, :2], tracker.discs[seen, 2]
-    projection = tracker.registration.projection
-    moved = centres + near_mm
-    # Perspective shifts a disc's centroid from the image of its centre; near enough to the place to be corrected for there.
-    bias = projection.disc_centroids(moved, radii) - projection.to_sensor(moved)
-    shifts = projection.to_plan(found[seen, :2] - bias) - centres
+    shifts = tracker.registration.to_plan(found[seen, :2] - tracker.bias_px[seen]) - tracker.discs[seen, :2]
     median = np.median(shifts, axis=0)
     distance = np.linalg.norm(shifts - median, axis=1)
     kept = distance <= max(ODD_MM, 5 * float(np.median(distance)))
@@ -188,7 +189,7 @@ def _locate(counts: Array, discs: Array, lens: Array, size: tuple[float, float],
         j00, j10, j01, j11 = 2 * (cx - c0), 2 * (rx - r0), 2 * (cy - c0), 2 * (ry - r0)
         det = j00 * j11 - j01 * j10
         blur = 1.5 * max(np.hypot(j11, j10), np.hypot(j01, j00)) / abs(det)
-        outer = 2.2 * radius + blur
+        rim, outer = radius + blur, 2.2 * radius + blur
         half_c, half_r = int(outer * np.hypot(j00, j01)) + 2, int(outer * np.hypot(j10, j11)) + 2
         column, row = c0, r0
         for _ in range(8):
@@ -204,14 +205,14 @@ def _locate(counts: Array, discs: Array, lens: Array, size: tuple[float, float],
                 for j in range(left, left + 2 * half_c + 1):
                     u, v = j - column, i - row
                     px, py = (j11 * u - j01 * v) / det, (j00 * v - j10 * u) / det
-                    distance = np.hypot(px, py)
+                    distance = px * px + py * py
                     value = float(counts[i, j])
-                    if distance < cut:
+                    if distance < cut * cut:
                         inner_sum += value
                         inner_c += u
                         inner_r += v
                         inner_n += 1
-                    elif radius + blur < distance < outer:
+                    elif rim * rim < distance < outer * outer:
                         tx, ty = discs[d, 0] + px, discs[d, 1] + py
                         if blur < tx < size[0] - blur and blur < ty < size[1] - blur:
                             basis = (1.0, u, v)
@@ -235,7 +236,7 @@ def _locate(counts: Array, discs: Array, lens: Array, size: tuple[float, float],
                 for j in range(left, left + 2 * half_c + 1):
                     u, v = j - column, i - row
                     px, py = (j11 * u - j01 * v) / det, (j00 * v - j10 * u) / det
-                    if np.hypot(px, py) < radius + blur:
+                    if px * px + py * py < rim * rim:
                         part = (counts[i, j] - plane[0] - plane[1] * u - plane[2] * v) / contrast
                         # The disc has one temperature; the table around it a slope. Coverage is taken against their difference.
                         part /= 1 - (plane[1] * u + plane[2] * v) / contrast
@@ -249,7 +250,8 @@ def _locate(counts: Array, discs: Array, lens: Array, size: tuple[float, float],
             column += moment_c / total
             row += moment_r / total
             found[d, 0], found[d, 1], found[d, 2] = column, row, 1
-            if abs(moment_c / total) + abs(moment_r / total) < 2e-3:
+            # What is left of a step this small is less than a thousandth of it.
+            if abs(moment_c / total) + abs(moment_r / total) < 0.03:
                 break
         if abs(column - c0) + abs(row - r0) > 2.5 * radius * np.sqrt(abs(det)):
             found[d, 2] = 0

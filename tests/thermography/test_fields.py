@@ -235,9 +235,10 @@ def test_a_single_shaken_frame_is_reported_and_no_warm_up_is_taken_for_a_knock(s
     image, registration, still = scene
     shaken = replace(still, shift_px=(1.5, 0.0)).render()
 
+    hot = Scene(disc_K=-4.0, field=lambda x, y: smooth_field(x, y) + 0.015 * x).render()
+
     def warm(n):
-        gradient = Scene(disc_K=-4.0, field=lambda x, y: smooth_field(x, y) + 0.002 * n * x).render()
-        return (shaken if n == 3 else gradient) + rng.normal(0, 0.05, image.shape)
+        return (shaken if n == 3 else image + (hot - image) * n / 7) + rng.normal(0, 0.05, image.shape)
 
     frames = record(tmp_path / "a.seq", (warm(n) for n in range(7)))
     fields = reduce_frames(frames, registration, GRID, edges(0, 7))
