@@ -10,7 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fusion.effects import Effect, Member, warm_up
+from fusion.effects import Effect
+from fusion.members import Member, warm_up
 from fusion.model import ModelFit
 from fusion.readings import Readings, Series
 from fusion.scoring import FamilyScore

@@ -91,7 +91,7 @@ def close_loop(
                 models.append(search.fit([*models[-1].terms, Term(asked.name, member_of(asked))]))
             break
         chosen.append((best, scores))
-        models.append(search.fit([*models[-1].terms, Term(best.name, member_of(best))], models[-1]))
+        models.append(search.fit([*models[-1].terms, Term(best.name, member_of(best))]))
         models, chosen = _re_examine(search, models, chosen)
         if sum(score.name == "step_event" for score, _ in chosen) > MOST_EVENTS:
             models, chosen = _without_events(search, models, chosen)
@@ -222,7 +222,7 @@ def _rebuild(search: Search, declared: ModelFit, kept: Chosen) -> tuple[list[Mod
     """Fit the declared model and the kept effects again, one after the other."""
     models = [declared]
     for score, _ in kept:
-        models.append(search.fit([*models[-1].terms, Term(score.name, member_of(score))], models[-1]))
+        models.append(search.fit([*models[-1].terms, Term(score.name, member_of(score))]))
     return models, kept
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.effects import Member
+from fusion.members import Member
 from fusion.readings import Readings
 from interferometry.statespace import Array, DriftFit, DriftSystem, estimate, fit_fixed_effects
 
@@ -118,26 +118,18 @@ def fit_model(
     terms: Sequence[Term],
     *,
     used: NDArray[np.bool_] | None = None,
-    like: DriftFit | None = None,
 ) -> ModelFit:
-    """Fit profile, terms and drift to the used readings; outliers and noisy sites count less.
-
-    Parameters
-    ----------
-    like : an earlier fit to the same used readings, whose kind of drift and whose weights of readings are kept.
-    """
+    """Fit profile, terms and drift to the used readings; outliers and noisy sites count less."""
     used = np.ones(readings.seconds.size, bool) if used is None else used
     profile = readings.profile
     profile = profile[:, _determined(profile[used])]
     design = np.column_stack([profile, *(term.member.columns for term in terms)])[used]
     seconds, loadings, response = readings.seconds[used], readings.loadings[used], readings.response[used]
-    if like is not None:
-        order, variance, start = like.system.order, like.system.variance, like.system.ratios
-    else:
-        fit = estimate(seconds, loadings, response, design, robust=True)
-        order, start = fit.system.order, fit.system.ratios
-        variance = _site_variance(readings.subset(used), fit) * fit.system.variance
-    fit = estimate(seconds, loadings, response, design, order=order, start=start, variance=variance)
+    first = estimate(seconds, loadings, response, design, robust=True)
+    variance = _site_variance(readings.subset(used), first) * first.system.variance
+    fit = estimate(
+        seconds, loadings, response, design, order=first.system.order, start=first.system.ratios, variance=variance
+    )
     return ModelFit(readings, used, tuple(terms), fit, profile)
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.effects import Member
+from fusion.members import Member
 from interferometry.statespace import Array, DriftFit, DriftSystem, fit_fixed_effects
 
 #: log10 factors on the two drift variances: as estimated, less drift in one or both down to none, and as much more as the simulated

@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.effects import Effect, Member
+from fusion.effects import Effect
 from fusion.episodes import cycle_starts
 from fusion.gates import blocked_reason
+from fusion.members import Member
 from fusion.model import ModelFit, Term, fit_model
 from fusion.readings import Readings
 from fusion.scoring import DRAWS, FamilyScore, Judge, ask_sealed, simulate_null
@@ -49,9 +50,9 @@ class Search:
         self.blocked: dict[str, str] = {}
         self.asked: dict[str, float | str] = {}
 
-    def fit(self, terms: Sequence[Term], like: ModelFit | None = None) -> ModelFit:
+    def fit(self, terms: Sequence[Term]) -> ModelFit:
         """Fit terms to the readings that are not sealed."""
-        return fit_model(self.readings, terms, used=self.used, like=like.fit if like else None)
+        return fit_model(self.readings, terms, used=self.used)
 
     def _families(self, model: ModelFit) -> dict[str, list[Member]]:
         present = {term.effect for term in model.terms}

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from fusion.alignment import AxisGeometry, align
-from fusion.effects import Effect, Member, library
+from fusion.effects import Effect, library
 from fusion.loop import LoopError, close_loop, set_aside_sites
+from fusion.members import Member
 from fusion.readings import Readings, ReadingsError, read_fused
 from fusion.twin import Recipe, deviations_of, driver_log, environment_log, fields_of, simulate
 from fusion.twin.recipe import EffectRecipe
