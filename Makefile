@@ -27,8 +27,9 @@ lint: $(VENV)/.test
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# One process per core, each with one thread for linear algebra: more would only wait for one another.
 test: lint
-	$(BIN)/pytest
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist loadfile
 
 # Long simulations: the figures that the documentation quotes come from here.
 soak: $(VENV)/.test
