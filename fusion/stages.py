@@ -12,7 +12,7 @@ from fusion import cf
 from fusion.alignment import align
 from fusion.attribution import LEVEL
 from fusion.collinearity import cluster_cells, evidence_at
-from fusion.correlation import correlate
+from fusion.correlation import CorrelationError, correlate
 from fusion.diagnosis import Diagnosis, diagnose
 from fusion.effects import library
 from fusion.groups import joined
@@ -21,6 +21,7 @@ from fusion.model import ModelFit, fit_model
 from fusion.outcome import Outcome
 from fusion.progress import Report
 from fusion.readings import Readings, read_fused
+from fusion.regions import correlate_modes
 from fusion.results import Notice
 from fusion.sensors import SensorSet, choose_sensors
 from fusion.sources import Source, counted, listed
@@ -141,9 +142,18 @@ def correlate_field(fields: xr.Dataset, fused: xr.Dataset, *, report: Report) ->
     maps = correlate(fused, film, progress=lambda part: report("correlation", round(100 * part), 100))
     report("correlation", 100, 100)
     report("sensor places", 0, 1)
-    maps = joined(maps, clusters=cluster_cells(film), sensors=sensor_variables(choose_sensors(fused, film)))
+    places = sensor_variables(choose_sensors(fused, film))
+    maps = joined(maps, clusters=cluster_cells(film), sensors=places, modes=mode_findings(fused, film))
     report("sensor places", 1, 1)
     return Outcome(maps, {"hotspots": hotspot_part(fields, maps, fused)})
+
+
+def mode_findings(fused: xr.Dataset, film: xr.DataArray) -> xr.Dataset:
+    """Return the test of the localised thermal modes, which find lagged sources better than cells; empty for a still field."""
+    try:
+        return correlate_modes(fused, film)
+    except CorrelationError:
+        return xr.Dataset()
 
 
 def sensor_variables(sets: Sequence[SensorSet]) -> xr.Dataset:
