@@ -18,6 +18,7 @@ from thermography.flir import FrameReference
 from thermography.knocks import KNOCK_PX, SUSPECT_PX, RegisteredFrom, fiducial_shift, register_anew, watch
 from thermography.plan import PlanGrid
 from thermography.radiometry import calibrate
+from thermography.refinement import image_shift, shifted
 from thermography.registration import Registration
 from thermography.resampling import plan_weights
 
@@ -86,21 +87,27 @@ class Reduction:
         """Look for a knock in a block; register anew from its first moved frame and return True, so that the block is cut again."""
         for i, seen in zip(range(block.first, block.stop), result.shift_px, strict=True):
             shift = seen - self.baseline_px
-            if np.hypot(*shift) > SUSPECT_PX:
+            if np.isnan(seen).any() or np.hypot(*shift) > SUSPECT_PX:
                 exact = self._exact_shift(i, block.span)
                 if np.hypot(*exact) > KNOCK_PX:
                     if i + 1 == len(self.references) or _alike(self._exact_shift(i + 1, block.span), exact):
                         self._renew_from(i, block.span, exact)
                         return True
                     self.shaken.add(i)
-                elif np.isfinite(exact).all():
+                elif np.isfinite(exact + seen).all():
                     self.baseline_px = seen - exact
                 shift = exact
             self.shift_px[i] = np.hypot(*shift)
         return False
 
     def _exact_shift(self, i: int, span: int) -> Array:
-        return fiducial_shift(self._temperature(i), self.spans[span].registration, self.grid)
+        """Shift by the fiducials, or where they have no contrast by the picture of the table."""
+        own = self.spans[span]
+        frame = self._temperature(i)
+        shift = fiducial_shift(frame, own.registration, self.grid)
+        if np.isnan(shift).any() and i != own.first:
+            shift = image_shift(self._temperature(own.first), frame, own.registration, self.grid)
+        return shift
 
     def _temperature(self, i: int) -> Array:
         return calibrate(self.references[i].read().counts, self.override(self.references[i]))
@@ -112,7 +119,11 @@ class Reduction:
             if self._same_place(j, i, span, shift)
         ]
         frame = np.mean([self._temperature(j) for j in [i, *later]], axis=0, dtype=float)
-        registration = register_anew(frame, self.spans[span].registration, shift, self.grid, where=self._name(i))
+        old = self.spans[span].registration
+        if np.isfinite(fiducial_shift(frame, old, self.grid)).all():
+            registration = register_anew(frame, old, shift, self.grid, where=self._name(i))
+        else:
+            registration = shifted(old, shift)
         if self.checkpoint is not None:
             self.checkpoint.note_knock(i, span, shift.tolist())
         self.spans.insert(span + 1, RegisteredFrom(i, registration, (float(shift[0]), float(shift[1]))))

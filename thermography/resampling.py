@@ -19,7 +19,7 @@ Array = NDArray[Any]
 #: Every pixel is cut in this many parts squared, each of which goes to the cell that it lies in.
 PARTS = 4
 #: Cells of which less than this part is seen unmasked are NaN.
-LEAST_COVERAGE = 0.3
+LEAST_COVERAGE = 0.5
 
 
 @dataclass(frozen=True)
