@@ -267,8 +267,13 @@ def _uncertainty(results: Mapping[str, Any], fields: xr.Dataset | None) -> list[
     if results.get("loop"):
         sentences.append(
             "The verdict says what these data can show, not what is true of the machine: an effect that moves all positions "
-            "alike, slowly and unlogged, looks like drift without a cause. Held-out cycles were not used to choose or fit the "
-            "model."
+            "alike, slowly and unlogged, looks like drift without a cause. The errors before and after come from coefficients "
+            "fitted without the held-out cycles."
+        )
+        sentences.extend(
+            f"{wording.effect_name(step['effect']).capitalize()}: {step['confirmed']}."
+            for step in results["loop"]["steps"]
+            if "confirmed" in step
         )
     sentences.append("p-values are corrected for everything that was tried (family-wise), at a level of 5 %.")
     return sentences

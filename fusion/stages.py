@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,8 @@ LABELS = {
     "model": "anomalies and closed loop",
 }
 _CORRELATION_CELL_MM = 10.0
+#: Largest family-wise p of an anomaly for which a cause is named.
+_CAUSE_LEVEL = 0.02
 
 
 def effect_names() -> tuple[str, ...]:
@@ -193,7 +196,14 @@ def model_drift(source: Source, fused: xr.Dataset, deviations: xr.Dataset, *, re
     cleaned = deviations.assign(deviation=deviations["deviation"].copy(data=(fused["deviation"] - explained).values))
     # Scatter that is only unequal, as it naturally is, makes no position a machine's anomaly; one that stands out does.
     anomalies = [one for one in detect_anomalies(estimate_drift(cleaned), cleaned) if one.stands_out]
-    diagnoses = diagnose(anomalies, fused.assign(deviation=fused["deviation"].copy(data=cleaned["deviation"].values)))
+    diagnoses = [
+        temper(anomaly, found_cause)
+        for anomaly, found_cause in zip(
+            anomalies,
+            diagnose(anomalies, fused.assign(deviation=fused["deviation"].copy(data=cleaned["deviation"].values))),
+            strict=True,
+        )
+    ]
     found = set_aside_sites(found, sites_of(anomalies, deviations.sizes["target"]))
     report("anomalies", 1, 1)
     parts = {
@@ -208,6 +218,14 @@ def join_fusion(fused: xr.Dataset, maps: xr.Dataset, loop: xr.Dataset) -> xr.Dat
     dataset = joined(fused, correlation=maps, loop=loop)
     own = {name: value for name, value in maps.attrs.items() if name not in cf.GLOBAL_ATTRIBUTES}
     return dataset.assign_attrs({f"correlation_{name}": value for name, value in own.items()})
+
+
+def temper(anomaly: Anomaly, diagnosis: Diagnosis) -> Diagnosis:
+    """Name no cause for a position that is itself flagged only at the limit: two doubts make no verdict."""
+    if diagnosis.cause == "undetermined" or anomaly.p_value <= _CAUSE_LEVEL:
+        return diagnosis
+    doubt = f"the position itself is flagged only at the limit (p = {anomaly.p_value:.2g}); before a cause, it needs more cycles"
+    return replace(diagnosis, cause="undetermined", against_it=(doubt, *diagnosis.against_it))
 
 
 def sites_of(anomalies: Sequence[Anomaly], targets: int) -> list[tuple[int, str]]:

@@ -159,7 +159,7 @@ def make_step(
         rms_um=_size(model, term),
         tied=tied,
         runner_up=runner_up,
-        confirmed=f"{way}, coefficients frozen",
+        confirmed=f"confirmed {way}, coefficients frozen",
         event_cycle=_event_cycle(model.readings, term),
     )
 
