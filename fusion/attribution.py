@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from fusion.attribution_kernel import (
     Array32,
@@ -84,6 +85,7 @@ class Tested:
     banks: tuple[NullBank, ...]
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def evaluate_film(
     series: Sequence[DriftSeries],
     film: Film,

@@ -14,6 +14,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 import xarray as xr
+from threadpoolctl import threadpool_limits
 
 from fusion.explanations import (
     LAGS_S,
@@ -38,7 +39,7 @@ THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "st
 #: What an effect bound to the approach must gain beyond scatter that is alike in both directions before it counts as likely (nats):
 #: amounts that follow the motion, more scatter in one direction, a slow walk in one direction (beside its parameter). Plain scatter
 #: exceeds one of them by chance in about one case of twenty.
-APPROACH_NATS = {"along": 1.9, "one_direction": 4.0, "slow": 1.5}
+APPROACH_NATS = {"along": 1.9, "one_direction": 4.0, "slow": 2.0}
 #: A local temperature of which at least this share follows the exponentials of one warm-up explains whatever else is slow as well.
 WARM_UP_SHARE = 0.98
 #: Level of the bootstrap test that a lasting cause must pass; local temperature is the name that costs most when it is wrong.
@@ -102,6 +103,7 @@ class _Case:
     warm_up_share: float
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def diagnose(anomalies: Sequence[Flagged], fused: xr.Dataset, *, seed: int = 0) -> list[Diagnosis]:
     """Name the cause of every anomaly.
 
@@ -150,7 +152,8 @@ def weigh(case: _Case) -> dict[str, float]:
     """Probabilities of the causes and of "slow" (a walk without a name), equal before the data.
 
     Likelihoods are at their maximum; each free parameter costs half the logarithm of the number of cycles (Schwarz 1978, Ann.
-    Stat. 6, 461) and each searched member the logarithm of their number.
+    Stat. 6, 461) and each searched member the logarithm of their number. A lasting cause whose own test does not reject chance has
+    no weight.
     """
     cycles = case.residual.seconds.size
     one = 0.5 * float(np.log(cycles))
@@ -172,10 +175,18 @@ def weigh(case: _Case) -> dict[str, float]:
     }
     if case.temperature is not None:
         score["local_temperature"] = case.temperature.log_likelihood - one - float(np.log(len(LAGS_S)))
+    for name, fitted in _lasting(case).items():
+        if fitted.p_value > LEVELS[name]:
+            score[name] = -np.inf
     highest = max(score.values())
     weight = {name: float(np.exp(value - highest)) for name, value in score.items()}
     total = sum(weight.values())
     return {name: value / total for name, value in weight.items()}
+
+
+def _lasting(case: _Case) -> dict[str, Lasting]:
+    """The explanations with a bootstrap test of their own."""
+    return {"step": case.step} | ({"local_temperature": case.temperature} if case.temperature is not None else {})
 
 
 def _judge(case: _Case, direction: str) -> Diagnosis:
@@ -185,6 +196,11 @@ def _judge(case: _Case, direction: str) -> Diagnosis:
     cause: Cause = "undetermined" if against or leading == "slow" else leading  # type: ignore[assignment]
     runner_up = max((name for name in probability if name != leading), key=lambda name: probability[name])
     against.append(f"next best explanation: {runner_up}, probability {probability[runner_up]:.2f}")
+    against += [
+        f"{name}: p = {fitted.p_value:.3f}, a slow walk alone looks like this too often"
+        for name, fitted in _lasting(case).items()
+        if fitted.p_value > LEVELS[name]
+    ]
     return Diagnosis(
         target=case.residual.target,
         direction=direction,
@@ -203,14 +219,9 @@ def _objections(case: _Case, leading: str, probability: float) -> list[str]:
     threshold = THRESHOLDS.get(leading, 0.0)
     if probability < threshold:
         reasons.append(f"probability {probability:.2f} of {leading} is below its threshold {threshold:.2f}")
-    lasting = {"step": case.step, "local_temperature": case.temperature}.get(leading)
-    if lasting is not None:
-        if lasting.p_value > LEVELS[leading]:
-            reasons.append(f"p = {lasting.p_value:.3f}: a slow walk alone looks like this too often")
-        if lasting.held_out <= 0:
-            reasons.append(
-                f"what one direction teaches does not predict the other ({lasting.held_out:+.1f} nats held out)"
-            )
+    lasting = _lasting(case).get(leading)
+    if lasting is not None and lasting.held_out <= 0:
+        reasons.append(f"what one direction teaches does not predict the other ({lasting.held_out:+.1f} nats held out)")
     if leading == "local_temperature" and case.temperature is not None:
         first, second = case.temperature.by_direction
         if first * second < 0:

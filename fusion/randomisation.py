@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from fusion.attribution_kernel import NullBank, estimate_effects, likelihood_ratios, null_bank, whiten_series
 from fusion.channels import Array, DriftSeries, read_clock, reduce_channels, respond
@@ -75,6 +76,7 @@ def duty_responses(seconds: Array, courses: Array) -> Array:
     return np.stack(responses, axis=2)
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def randomisation_test(
     fused_readings: xr.Dataset,
     duty: xr.DataArray,

@@ -13,7 +13,7 @@ from fusion.explanations import Residual
 #: Natural spread of the targets' scatter around their typical value (standard deviation of its logarithm).
 _SIGMA_SPREAD = 0.1
 #: Share of readings that a scatter with rare large values disturbs.
-_RARE_SHARE = 0.1
+_RARE_SHARE = 0.2
 
 
 @dataclass(frozen=True)

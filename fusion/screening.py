@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from fusion.attribution import LAGS_S, Film, nuisance_columns
 from fusion.attribution_kernel import Array32, Grid, NullBank, fit_null, whitening_grid
@@ -80,6 +81,7 @@ def _keep_best(
             best_weight[j] = weight[j]
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def screen(
     values: Array,
     seconds: Array,

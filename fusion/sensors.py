@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from fusion.attribution import LAGS_S
 from fusion.attribution_kernel import NullBank, null_bank
@@ -44,6 +45,7 @@ class SensorSet:
     loss_um: float
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def choose_sensors(
     fused_readings: xr.Dataset,
     field: xr.DataArray,
