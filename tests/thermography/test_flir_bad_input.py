@@ -123,8 +123,9 @@ def test_thousands_of_damaged_pictures_leave_the_interpreter_alone(tmp_path: Pat
     for _ in range(2000):
         with pytest.raises(FlirFormatError, match="expected PNG chunk b'IDAT' with its CRC"):
             frame.read_counts()
-    # A decoder that loses references to None ends Python 3.11 after some ten thousand damaged frames.
-    assert sys.getrefcount(None) > before - 100
+    # A decoder that loses references to None ends Python 3.11 after some ten thousand damaged frames. It would lose one per picture,
+    # 2,000 here; pytest itself lets a few hundred come and go.
+    assert sys.getrefcount(None) > before - 1000
 
 
 def test_segments_must_be_complete_and_single(tmp_path: Path) -> None:
