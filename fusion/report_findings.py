@@ -165,10 +165,20 @@ def spaced(name: str) -> str:
     return name.replace("_", " ")
 
 
+#: Kind of an anomaly -> what `extra_um` is the size of.
+_KINDS = {
+    "scatter": "extra scatter",
+    "slow": "slow motion beyond the other positions",
+    "step": "a step",
+    "periodic": "a periodic motion",
+}
+
+
 def evidence(found: Mapping[str, Any]) -> dict[str, Any]:
     """Return the evidence of an anomaly as sentences for and against, what to check, and the numbers behind them."""
     numbers = {name: value for name, value in found.items() if name not in {"for", "against", "check"}}
     return {
+        "stands_out": f"{_KINDS.get(str(found.get('kind')), 'excess')} of {number(found.get('extra_um'), 2)} µm",
         "for": [readable(text) for text in found.get("for", [])],
         "against": [readable(text) for text in found.get("against", [])],
         "check": readable(found.get("check", "")),
