@@ -125,14 +125,17 @@ def simulate(
 @app.command()
 def inspect(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="FLIR, laser or environment files.")],
+    thumbnails: Annotated[Path | None, typer.Option(help="Folder for a small PNG of every thermal file.")] = None,
 ) -> None:
     """Tell what files hold and what looks wrong."""
-    from fusion.inspection import describe_file
+    from fusion.inspection import describe_file, write_thumbnail
 
     with _answering():
         for path in files:
             for line in describe_file(path):
                 console.print(line, soft_wrap=True, highlight=False, markup=False)
+            if thumbnails is not None and (picture := write_thumbnail(path, thumbnails)) is not None:
+                console.print(f"  thumbnail: {picture}", soft_wrap=True, highlight=False, markup=False)
 
 
 @app.command()

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from fusion.products import write_atomically
 from fusion.sources import counted, left_out_notices
 from fusion.wording import moment
 from interferometry.readers import read_deviations, read_environment
-from thermography.inspection import inspect_file, is_flir_file
+from thermography.inspection import inspect_file, is_flir_file, thumbnail
 
 
 def describe_file(path: Path) -> list[str]:
@@ -28,6 +29,16 @@ def describe_file(path: Path) -> list[str]:
     if b"air_temperature" in start and b"deviation_um" not in start:
         return _describe_log(path, read_environment(path))
     return _describe_deviations(path, read_deviations(path))
+
+
+def write_thumbnail(path: Path, folder: Path) -> Path | None:
+    """Write a small picture of a thermal file's first frame as ``<file>.png`` into a folder; None for a file without frames."""
+    if not is_flir_file(path):
+        return None
+    folder.mkdir(parents=True, exist_ok=True)
+    target = folder / f"{path.name}.png"
+    write_atomically(target, lambda part: part.write_bytes(thumbnail(path)))
+    return target
 
 
 def _describe_deviations(path: Path, deviations: xr.Dataset) -> list[str]:

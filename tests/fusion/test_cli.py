@@ -155,3 +155,17 @@ def test_simulate_writes_a_campaign_once(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     assert result.output.rstrip().endswith(f"campaign: {tmp_path / 'campaign' / 'campaign.toml'}")
     assert invoke("simulate", recipe, "--out", tmp_path / "campaign").exit_code == 2
+
+
+def test_a_thumbnail_is_written_where_it_is_asked_for(campaign_folder: Path, tmp_path: Path) -> None:
+    import cv2
+
+    frame = sorted((campaign_folder / "thermal").iterdir())[0]
+    result = invoke("inspect", frame, campaign_folder / "laser.csv", "--thumbnails", tmp_path)
+    assert result.exit_code == 0, result.output
+    (picture,) = tmp_path.iterdir()
+    assert picture.name == f"{frame.name}.png"
+    image = cv2.imread(str(picture))
+    # 4 : 3 as the sensor, and not one colour.
+    assert image.shape[1] * 3 == image.shape[0] * 4
+    assert image.std() > 5
