@@ -76,26 +76,7 @@ def close_loop(
     terms = _declare(readings, declared, effects)
     report(0, MOST_EFFECTS + 2, "fitting the declared model")
     search = Search(readings, used, effects, rng)
-    models, rounds = [search.fit(terms)], list[list[FamilyScore]]()
-    chosen: Chosen = []
-    # Effects may be dropped again, so rounds are counted, not effects.
-    for number in range(1, MOST_EFFECTS + 1):
-        report(number, MOST_EFFECTS + 2, f"searching for effect {number}")
-        scores = search.scores(models[-1])
-        rounds.append(scores)
-        best = search.choose(scores, models[-1])
-        if best is None:
-            asked = search.ask_sealed(scores, models[-1])
-            if asked is not None:
-                chosen.append((asked, scores))
-                models.append(search.fit([*models[-1].terms, Term(asked.name, member_of(asked))]))
-            break
-        chosen.append((best, scores))
-        models.append(search.fit([*models[-1].terms, Term(best.name, member_of(best))]))
-        models, chosen = _re_examine(search, models, chosen)
-        if sum(score.name == "step_event" for score, _ in chosen) > MOST_EVENTS:
-            models, chosen = _without_events(search, models, chosen)
-            break
+    models, chosen, rounds = _search_before_seal(search, terms, report)
     report(MOST_EFFECTS, MOST_EFFECTS + 2, "opening the sealed cycles")
     models, chosen, errors = _open_seal(search, models, chosen)
     whole = fit_model(readings, models[-1].terms)
@@ -131,6 +112,33 @@ def close_loop(
         after=whole,
         sealed=~used,
     )
+
+
+def _search_before_seal(
+    search: Search, terms: list[Term], report: Progress
+) -> tuple[list[ModelFit], Chosen, list[list[FamilyScore]]]:
+    """Add effects one by one on the cycles that are not sealed: every model in turn, what was added, and all scores."""
+    models, rounds = [search.fit(terms)], list[list[FamilyScore]]()
+    chosen: Chosen = []
+    # Effects may be dropped again, so rounds are counted, not effects.
+    for number in range(1, MOST_EFFECTS + 1):
+        report(number, MOST_EFFECTS + 2, f"searching for effect {number}")
+        scores = search.scores(models[-1])
+        rounds.append(scores)
+        best = search.choose(scores, models[-1])
+        if best is None:
+            asked = search.ask_sealed(scores, models[-1])
+            if asked is not None:
+                chosen.append((asked, scores))
+                models.append(search.fit([*models[-1].terms, Term(asked.name, member_of(asked))]))
+            break
+        chosen.append((best, scores))
+        models.append(search.fit([*models[-1].terms, Term(best.name, member_of(best))]))
+        models, chosen = _re_examine(search, models, chosen)
+        if sum(score.name == "step_event" for score, _ in chosen) > MOST_EVENTS:
+            models, chosen = _without_events(search, models, chosen)
+            break
+    return models, chosen, rounds
 
 
 def set_aside_sites(found: LoopResult, sites: Collection[tuple[int, str]], *, seed: int = 1) -> LoopResult:
