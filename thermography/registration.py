@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -196,13 +196,24 @@ def register(
 
 
 def register_points(
-    points_px: dict[str, tuple[float, float]],
+    points_px: Mapping[str, tuple[float, float]] | None,
     fiducials: Sequence[Fiducial],
     shape: tuple[int, int],
     *,
     lens: Lens | None = None,
 ) -> Registration:
-    """Register by points picked by hand (column, row) px, by fiducial name, in place of discs found in the image.
+    """Register by points picked by hand in place of discs found in the image.
+
+    Parameters
+    ----------
+    points_px
+        (column, row) px by fiducial name; None takes the pixel positions of the fiducial file as picked.
+    fiducials
+        As listed in the plan.
+    shape
+        (rows, columns) of the frames.
+    lens
+        Intrinsics from a calibration.
 
     Raises
     ------
@@ -210,6 +221,8 @@ def register_points(
         A name is not listed, or fewer than four points are given.
     """
     listed, left_out = _without_duplicates(fiducials)
+    if points_px is None:
+        points_px = {disc.name: disc.hint_px for disc in listed if disc.hint_px is not None}
     unknown = sorted(set(points_px) - {disc.name for disc in listed})
     if unknown:
         raise RegistrationError(

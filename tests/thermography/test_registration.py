@@ -26,8 +26,7 @@ def hinted(scene, rng, error_px):
     return [replace(d, column_px=c, row_px=r) for d, (c, r) in zip(DISCS, places, strict=True)]
 
 
-@pytest.mark.parametrize("k1", [0.0, -1.2])
-@pytest.mark.parametrize("disc_K", [-4.0, 4.0])
+@pytest.mark.parametrize(("k1", "disc_K"), [(0.0, -4.0), (-1.2, 4.0)])
 def test_plan_is_found_without_hints_at_both_contrasts(rng, k1, disc_K):
     scene = Scene(k1=k1, disc_K=disc_K)
     registration = register(scene.render(rng), DISCS, grid=GRID)
@@ -86,11 +85,11 @@ def test_uncertainty_map_covers_the_true_error(rng):
     image = scene.render()
     places = np.array([(20.0, 20.0), (350.0, 90.0), (680.0, 160.0), (350.0, 10.0)])
     ratios = []
-    for _ in range(12):
+    for _ in range(8):
         registration = register(image + rng.normal(0, 0.2, image.shape), hinted(scene, rng, 2), grid=GRID)
         error = np.linalg.norm(scene.to_plan(registration.to_sensor(places)) - places, axis=1)
         ratios.append(error / registration.position_u(places))
-    # u states the root of the mean square error; 48 ratios that share 12 registrations give it to about 20 %.
+    # u states the root of the mean square error; 32 ratios that share 8 registrations give it to about 25 %.
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.6
 
 
@@ -140,6 +139,10 @@ def test_picked_points_register_without_an_image():
     # The image of a disc's centre is not the centroid of its image, by up to 0.03 px here.
     assert scene.registration_rms_mm(registration) < 0.1
     assert registration.left_out["F9"] == "was not picked"
+    pairs = [
+        replace(d, column_px=picked[d.name][0], row_px=picked[d.name][1]) if d.name in picked else d for d in DISCS
+    ]
+    assert register_points(None, pairs, (480, 640)).located == registration.located
     with pytest.raises(RegistrationError, match="picked points G1 are not in the list of fiducials"):
         register_points({"G1": (1.0, 1.0)}, DISCS, (480, 640))
 
