@@ -18,6 +18,10 @@ Array = NDArray[Any]
 COARSE_STEP = 0.25
 #: Discs that disagree with the median by more than this (and by five times the median deviation) are left out, mm.
 ODD_MM = 0.5
+#: A place near that of the frame before is taken without a search if its discs agree to this, and so many of those in view are found.
+SURE_MM, SURE_SHARE = 0.3, 0.7
+#: Places of the coarse search that are looked at closely.
+CANDIDATES = 5
 #: A disc needs this many times the noise of one pixel as contrast.
 LEAST_CONTRAST = 3.0
 
@@ -103,18 +107,28 @@ def locate_table(counts: NDArray[np.uint16], tracker: Tracker, near_mm: Array | 
     TablePlace or None
         None where fewer than two discs show.
     """
-    if near_mm is not None:
-        place = _refined(counts, tracker, near_mm)
-        if place is not None and place.discs >= 3:
-            return place
+    near = None if near_mm is None else _refined(counts, tracker, near_mm)
+    if near is not None and near.u_mm < SURE_MM and near.discs >= SURE_SHARE * _in_view(counts, tracker, near.shift_mm):
+        return near
     step = COARSE_STEP * 2 * float(tracker.discs[:, 2].min())
     along = np.arange(-tracker.reach_mm, tracker.reach_mm + step, step)
     scores = _coarse(counts, tracker.discs, tracker.lens, tracker.direction, along)
-    for best in np.argsort(-scores)[:3]:
-        place = _refined(counts, tracker, along[best] * tracker.direction)
-        if place is not None:
-            return place
-    return None
+    peaks = np.flatnonzero((scores >= np.r_[-1.0, scores[:-1]]) & (scores >= np.r_[scores[1:], -1.0]))
+    places = [near]
+    for best in peaks[np.argsort(-scores[peaks])][:CANDIDATES]:
+        places.append(_refined(counts, tracker, along[best] * tracker.direction))
+    # Discs at equal distances pass for each other: the place at which the most agree, and agree best, is the right one.
+    found = [place for place in places if place is not None]
+    return max(found, key=lambda place: (place.u_mm < SURE_MM, place.discs, -place.u_mm), default=None)
+
+
+def _in_view(counts: NDArray[np.uint16], tracker: Tracker, shift_mm: Array) -> int:
+    """How many discs lie within the frame with the table displaced, a disc's width from its edge."""
+    centres = tracker.discs[:, :2] + shift_mm
+    places = tracker.registration.to_sensor(centres)
+    margin = 3 * np.linalg.norm(tracker.registration.projection.jacobian(centres), axis=-1) * tracker.discs[:, 2:]
+    size = np.array(counts.shape[::-1])
+    return int(((places > margin) & (places < size - margin)).all(axis=1).sum())
 
 
 def _refined(counts: NDArray[np.uint16], tracker: Tracker, near_mm: Array) -> TablePlace | None:

@@ -35,7 +35,7 @@ def travel(tmp_path_factory):
 def test_place_of_the_table_is_known_in_every_frame(travel):
     _, _, _, fields = travel
     error = fields["table_position"].values - PLACES_MM
-    # The aim is 0.3 mm per frame; a pixel is 1.7 mm.
+    # The aim is 0.3 mm per frame; a pixel is 1.7 mm. From 160.2 to 5.5 mm most discs land near the place of their neighbour.
     assert np.abs(error).max() < 0.1
     assert np.abs(fields["table_across"].values).max() < 0.1
     assert (np.abs(error) < 4 * fields["table_position_u"].values).all()
