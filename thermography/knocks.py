@@ -107,7 +107,7 @@ def _disc_weights(
     if ring.sum() < 12 or counted.sum() < 12:
         return None
     basis = np.column_stack([offsets, np.ones(len(offsets))])
-    plane = np.linalg.pinv(basis[ring])
+    plane = np.linalg.solve(basis[ring].T @ basis[ring], basis[ring].T)
     moments = np.column_stack([np.ones(len(offsets)), offsets])
     weights = np.where(counted[:, None], moments, 0.0)
     weights[ring] -= (moments[counted].T @ basis[counted] @ plane).T

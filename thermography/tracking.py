@@ -47,6 +47,8 @@ class Tracker:
     bias_px
         By how much perspective shifts the centroid of every disc's image from the image of its centre, (n, 2): nearly the same
         wherever the table is.
+    margin_px
+        How far from the frame's edge a disc must lie to be found, (n, 2).
     common_mm, common_u_mm
         Displacements along the direction, and what the registration's own uncertainty adds there for all discs together.
     """
@@ -58,6 +60,7 @@ class Tracker:
     reach_mm: float
     registration: Registration
     bias_px: Array
+    margin_px: Array
     common_mm: Array
     common_u_mm: Array
 
@@ -81,7 +84,8 @@ def make_tracker(registration: Registration, grid: PlanGrid, direction: Array, *
     size = (grid.width_mm, grid.height_mm)
     projection = registration.projection
     bias = projection.disc_centroids(discs[:, :2], discs[:, 2]) - projection.to_sensor(discs[:, :2])
-    return Tracker(discs, lens_array(registration), unit, size, reach_mm, registration, bias, along, common)
+    margin = 3 * np.linalg.norm(projection.jacobian(discs[:, :2]), axis=-1) * discs[:, 2:]
+    return Tracker(discs, lens_array(registration), unit, size, reach_mm, registration, bias, margin, along, common)
 
 
 def lens_array(registration: Registration) -> Array:
@@ -126,9 +130,8 @@ def _in_view(counts: NDArray[np.uint16], tracker: Tracker, shift_mm: Array) -> i
     """How many discs lie within the frame with the table displaced, a disc's width from its edge."""
     centres = tracker.discs[:, :2] + shift_mm
     places = tracker.registration.to_sensor(centres)
-    margin = 3 * np.linalg.norm(tracker.registration.projection.jacobian(centres), axis=-1) * tracker.discs[:, 2:]
-    size = np.array(counts.shape[::-1])
-    return int(((places > margin) & (places < size - margin)).all(axis=1).sum())
+    inside = (places > tracker.margin_px) & (places < np.array(counts.shape[::-1]) - tracker.margin_px)
+    return int(inside.all(axis=1).sum())
 
 
 def _refined(counts: NDArray[np.uint16], tracker: Tracker, near_mm: Array) -> TablePlace | None:
