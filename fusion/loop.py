@@ -248,6 +248,7 @@ def _second_look(
         if best is None or _events(steps) + (best.name == "step_event") > MOST_EVENTS:
             return whole, steps
         term = Term(best.name, member_of(best))
+        before = whole
         whole = fit_model(search.readings, [*whole.terms, term])
         sealed_from = search.readings.seconds[~search.used].min()
         if term.member.event_s is not None and term.member.event_s >= sealed_from - _cycle_length(search.readings):
@@ -256,6 +257,12 @@ def _second_look(
         else:
             after = rmse(search.fit(whole.terms).open_loop_errors()[0])
             confirmed = "named with the sealed cycles in view, coefficients from the cycles before: the error after is optimistic"
+        if after > _WORSE * error:
+            search.blocked[best.name] = (
+                f"withdrawn: the error on the sealed cycles rose from {error:.3f} to {after:.3f} um with it"
+            )
+            whole = before
+            continue
         step = make_step(whole, term, best, scores, error, after)
         steps = [*steps, replace(step, confirmed=confirmed)]
         whole, steps = _drop_superfluous(search, whole, steps)

@@ -168,30 +168,54 @@ class Judge:
         return best - best_null[None, :] - (widths - 1.0)[:, None], best_grid, separable
 
     def _held_out(self, member: Member, place: int) -> tuple[float, float]:
-        """Gain in squared whitened error on unused readings, coefficients frozen, and its chance where nothing is missing."""
-        system = self._systems()[place]
+        """Gain in predictive log-density on unused readings, coefficients frozen, and its chance where nothing is missing."""
         responses = np.column_stack([self.fit.response, self.draws])
-        everything, _ = system.whiten(np.column_stack([responses, self.fit.design, member.columns]))
-        y, x, c = np.split(everything, [responses.shape[1], responses.shape[1] + self.fit.design.shape[1]], axis=1)
-        across = member.event_s is not None
-        gain = _gain_across(_without(x, y), _without(x, c), self.halves) if across else self._gain_in_time(y, x, c)
-        noise = _without(x, y[:, :1]).var()
-        return float(gain[0] / (2.0 * noise)), float((1 + (gain[1:] >= gain[0]).sum()) / gain.size)
+        if member.event_s is not None:
+            whitened, _ = self._systems()[place].whiten(np.column_stack([responses, self.fit.design, member.columns]))
+            y, x, c = _split(whitened, responses.shape[1], self.fit.design.shape[1])
+            gain = _gain_across(_without(x, y), _without(x, c), self.halves) / (2.0 * _without(x, y[:, :1]).var())
+        else:
+            gain = self._gain_in_time(responses, member)
+        return float(gain[0]), float((1 + (gain[1:] >= gain[0]).sum()) / gain.size)
 
-    def _gain_in_time(self, y: Array, x: Array, c: Array) -> Array:
-        """Forward chaining: coefficients from all blocks before, error on the next one, summed over the later half.
+    def _gain_in_time(self, responses: Array, member: Member) -> Array:
+        """Forward chaining over the later half: coefficients from all blocks before, log-density of the next one.
 
-        Before that, a load that has been switched only a few times leaves the coefficients undetermined.
+        Before that, a load that has been switched only a few times leaves the coefficients undetermined. Each model has the drift that
+        suits it best, so that a wandering drift is not punished for explaining what it can.
         """
-        both, k, last = np.column_stack([x, c]), x.shape[1], int(self.blocks.max())
-        gain = np.zeros(y.shape[1])
+        known: dict[bool, list[Array]] = {False: [], True: []}
+        ahead: dict[bool, list[Array]] = {False: [], True: []}
+        columns = np.column_stack([responses, self.fit.design, member.columns])
+        for system in self._systems():
+            errors, spread = system.innovations(columns)
+            y, x, c = _split(errors / np.sqrt(spread)[:, None], responses.shape[1], self.fit.design.shape[1])
+            for with_member, design in ((False, x), (True, np.column_stack([x, c]))):
+                variance = (_without(design, y) ** 2).mean(axis=0)
+                known[with_member].append(-0.5 * (y.shape[0] * np.log(variance) + np.log(spread).sum()))
+                ahead[with_member].append(self._density_ahead(y, design, spread))
+        chosen = {
+            key: np.take_along_axis(np.array(ahead[key]), np.argmax(known[key], axis=0)[None, :], axis=0)[0]
+            for key in known
+        }
+        return np.asarray(chosen[True] - chosen[False])
+
+    def _density_ahead(self, y: Array, x: Array, spread: Array) -> Array:
+        """Log-density of every later block from the coefficients and the noise of all blocks before it (responses,)."""
+        last = int(self.blocks.max())
+        total = np.zeros(y.shape[1])
         for block in range(max(1, last // 2) + 1, last + 1):
             train, test = self.blocks < block, self.blocks == block
-            normal, moment = both[train].T @ both[train], both[train].T @ y[train]
-            without = y[test] - x[test] @ _solve(normal[:k, :k], moment[:k])
-            with_member = y[test] - both[test] @ _solve(normal, moment)
-            gain += (without**2).sum(axis=0) - (with_member**2).sum(axis=0)
-        return gain
+            beta = _solve(x[train].T @ x[train], x[train].T @ y[train])
+            variance = ((y[train] - x[train] @ beta) ** 2).mean(axis=0)
+            squares = ((y[test] - x[test] @ beta) ** 2).sum(axis=0)
+            total -= 0.5 * (squares / variance + test.sum() * np.log(variance) + np.log(spread[test]).sum())
+        return total
+
+
+def _split(columns: Array, responses: int, design: int) -> tuple[Array, Array, Array]:
+    """Responses, design and member's columns of a stacked matrix."""
+    return columns[:, :responses], columns[:, responses : responses + design], columns[:, responses + design :]
 
 
 def _gain_across(y: Array, c: Array, half: NDArray[np.bool_]) -> Array:

@@ -19,6 +19,9 @@ from fusion.scoring import DRAWS, FamilyScore, Judge, ask_sealed, simulate_null
 ENTRY_LEVEL = 0.05
 #: Chance that an effect which is not there passes its confirmation on unused readings; the search has been paid for already.
 CONFIRMATION_LEVEL = 0.2
+#: Evidence so strong that an inconclusive confirmation does not stop it: few switchings of a load leave early blocks without a say.
+#: The sealed cycles then decide, because an effect that makes their error larger is withdrawn.
+STRONG_LEVEL = 0.001
 #: An effect with a larger p-value, uncorrected, is not worth the one question to the sealed readings.
 _WORTH_ASKING = 0.1
 #: Chance that the one question to the sealed readings is answered with yes where the effect is not there.
@@ -100,7 +103,7 @@ class Search:
             if reason is not None:
                 self.blocked[score.name] = reason
                 continue
-            if score.held_out_p <= CONFIRMATION_LEVEL:
+            if score.held_out_p <= CONFIRMATION_LEVEL or score.family_wise_p <= STRONG_LEVEL:
                 return self._refined(score, model)
             strongest = max(strongest, score.excess)
         return None

@@ -12,7 +12,7 @@ from fusion.adequacy import Remainder
 from fusion.model import ModelFit, Term
 from fusion.readings import Readings
 from fusion.scoring import FamilyScore
-from fusion.search import TIE_GAIN
+from fusion.search import CONFIRMATION_LEVEL, ENTRY_LEVEL, TIE_GAIN
 from interferometry.statespace import Array
 
 #: An effect that is not even significant alone is no rival.
@@ -147,21 +147,37 @@ def make_step(
             "behind_by": score.excess - others[0].excess,
             "p_value": others[0].family_wise_p,
         }
-    way = "on the other half of the targets" if term.member.event_s is not None else "on later blocks of cycles"
     return Step(
         effect=term.effect,
         parameters=term.member.parameters,
         coefficients=coefficients_of(model, term),
-        p_value=score.family_wise_p,
+        p_value=_entry_p(score),
         held_out_p=score.held_out_p,
         rmse_before_um=before,
         rmse_after_um=after,
         rms_um=_size(model, term),
         tied=tied,
         runner_up=runner_up,
-        confirmed=f"confirmed {way}, coefficients frozen",
+        confirmed=_confirmation(term, score),
         event_cycle=_event_cycle(model.readings, term),
     )
+
+
+def _entry_p(score: FamilyScore) -> float:
+    """The p-value that let an effect in: of the search, or of the one question that was put to the sealed cycles."""
+    return score.family_wise_p if score.family_wise_p <= ENTRY_LEVEL else score.held_out_p
+
+
+def _confirmation(term: Term, score: FamilyScore) -> str:
+    """How an effect was confirmed, in words."""
+    if score.family_wise_p > ENTRY_LEVEL:
+        return (
+            "the strongest candidate of a search that could not decide; the sealed cycles, asked once about it, agree"
+        )
+    if score.held_out_p > CONFIRMATION_LEVEL:
+        return f"later blocks of cycles do not decide (p = {score.held_out_p:.2g}); its evidence in all of them does, and the sealed cycles agree"
+    way = "on the other half of the targets" if term.member.event_s is not None else "on later blocks of cycles"
+    return f"confirmed {way}, coefficients frozen"
 
 
 def _event_cycle(readings: Readings, term: Term) -> int | None:
