@@ -175,7 +175,8 @@ def _confirmation(term: Term, score: FamilyScore) -> str:
             "the strongest candidate of a search that could not decide; the sealed cycles, asked once about it, agree"
         )
     if score.held_out_p > CONFIRMATION_LEVEL:
-        return f"later blocks of cycles do not decide (p = {score.held_out_p:.2g}); its evidence in all of them does, and the sealed cycles agree"
+        undecided = f"later blocks of cycles do not decide (p = {score.held_out_p:.2g})"
+        return f"{undecided}; its evidence in all of them does, and the sealed cycles agree"
     way = "on the other half of the targets" if term.member.event_s is not None else "on later blocks of cycles"
     return f"confirmed {way}, coefficients frozen"
 
