@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.effects import Effect
+from fusion.effects import LIBRARY, Effect
 from fusion.episodes import cycle_starts
 from fusion.gates import blocked_reason
 from fusion.members import Member
@@ -30,6 +30,9 @@ ASKED_LEVEL = 0.02
 TIE_GAIN = 3.0
 _BLOCKS = 10
 _MAY_REPEAT = frozenset({"step_event", "camera_offset", "sensor_fault", "periodic_disturbance"})
+
+
+_BUILT_IN = frozenset(effect.name for effect in LIBRARY)
 
 
 class SearchError(ValueError):
@@ -65,7 +68,13 @@ class Search:
                 continue
             if name in present and name not in _MAY_REPEAT:
                 continue
-            families[name] = list(effect.members(self.readings, model.coefficients(), None))
+            try:
+                families[name] = list(effect.members(self.readings, model.coefficients(), None))
+            except Exception as fault:
+                # A user's effect must not end the search for the others; a fault of our own must be seen.
+                if name in _BUILT_IN:
+                    raise
+                self.not_tried[name] = f"its columns cannot be computed: {type(fault).__name__}: {fault}"
         return families
 
     def scores(self, model: ModelFit) -> list[FamilyScore]:

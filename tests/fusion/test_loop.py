@@ -141,6 +141,19 @@ def test_a_users_effect_enters_the_search():
     assert "loose_scale" in [step.effect for step in found.steps]
 
 
+def test_a_users_effect_that_raises_is_named_and_the_rest_goes_on():
+    def members(readings, coefficients, near):
+        raise KeyError("no such series")
+        yield
+
+    broken = Effect("broken", "None.", "none", members)
+    effects = {name: library()[name] for name in (*DECLARED, "reversal_drift")}
+    hidden = readings_of(EffectRecipe("reversal_drift", amplitude_um=0.8))
+    found = close_loop(hidden, DECLARED, effects={"broken": broken, **effects})
+    assert "KeyError: 'no such series'" in found.not_tried["broken"]
+    assert [step.effect for step in found.steps] == ["reversal_drift"]
+
+
 @pytest.mark.parametrize(
     ("declared", "message"),
     [
