@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusion.readings import Array, Readings, Series
+from fusion.readings import ENVIRONMENT, Array, Readings, Series
 
 #: Instants per cycle at which an event is tried: a knock may come at any target, and is dated to a quarter of a cycle.
 _EVENTS_PER_CYCLE = 4
@@ -60,8 +60,7 @@ def jumps(series: Series) -> list[tuple[float, float, float]]:
 
 def sensor_jumps(readings: Readings) -> list[tuple[str, float, float, float]]:
     """Isolated jumps in the environment log: sensor, time before and after (s), size in the sensor's unit."""
-    logged = ("air_temperature", "air_pressure", "relative_humidity", "material_temperature")
-    present = [name for name in logged if name in readings.series]
+    present = [name for name in ENVIRONMENT if name in readings.series]
     return [(name, *jump) for name in present for jump in jumps(readings.series[name])]
 
 

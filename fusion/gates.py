@@ -6,15 +6,12 @@ A lagged copy of a noisy temperature is a smoother copy, and wins by denoising; 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from fusion.effects import Effect
 from fusion.members import Member, warm_up
 from fusion.model import ModelFit
 from fusion.readings import Readings, Series
-from fusion.scoring import FamilyScore
 from interferometry.statespace import Array, fit_fixed_effects
 
 #: Temperature noise over range beyond which a lag is not believed: where the machine is switched, and for one warm-up only.
@@ -27,9 +24,7 @@ _SMOOTH_GAIN = 2.0
 _PROTECTION_MIN = (10.0, 30.0, 90.0, 170.0)
 
 
-def blocked_reason(
-    effect: Effect, member: Member, part: Readings, model: ModelFit, scores: Sequence[FamilyScore]
-) -> str | None:
+def blocked_reason(effect: Effect, member: Member, part: Readings, model: ModelFit) -> str | None:
     """Why this effect must not be named although it fits, or None.
 
     Parameters
@@ -37,7 +32,6 @@ def blocked_reason(
     effect, member : the candidate, with columns for the readings the model was fitted to
     part : those readings
     model : the model without the candidate
-    scores : of the whole library, for the effects that need no protection
     """
     if not effect.excited_by:
         return None
@@ -51,20 +45,20 @@ def blocked_reason(
                 f"the noise of the mean rise is {100 * noise:.2f} % of its range; above {100 * limit:.1f} % a lagged, smoother copy "
                 "wins by its smoothness alone"
             )
-    gain = _gain(part, model, member, protection(part) if single else None)
+    gain = _gain(model, member, protection(part) if single else None)
     if single and gain < _PROTECTED_GAIN:
         return (
             f"one warm-up only excited the machine ({100 * share:.1f} % of the candidate is a plain warm-up), and beside free "
             f"warm-ups it gains only {gain:.1f} in log-likelihood; switch the load on purpose to tell"
         )
-    if effect.excited_by == "field" and _follows_the_rate(part, model, member):
+    if effect.excited_by == "field" and _follows_the_rate(model, member):
         return (
             "beside it the field's own coefficient takes the opposite sign and nearly cancels it: the readings follow the rate at "
             "which the table warms, which is the power of a source, not a lag"
         )
     if effect.excited_by == "field":
         smoothed = smoothed_copy(part, float(member.parameters["time_constant_min"]))
-        advantage = _gain(part, model, member, None) - _gain(part, model, smoothed, None)
+        advantage = _gain(model, member, None) - _gain(model, smoothed, None)
         if advantage < _SMOOTH_GAIN:
             return (
                 f"a copy of the field that is only smoothed, not delayed, fits as well (log-likelihood {advantage:+.1f}): the lag "
@@ -117,7 +111,7 @@ def _residual_share(course: Array, curve: Array) -> float:
     return float(left @ left) / max(float(((course - course.mean()) ** 2).sum()), 1e-300)
 
 
-def _follows_the_rate(part: Readings, model: ModelFit, member: Member) -> bool:
+def _follows_the_rate(model: ModelFit, member: Member) -> bool:
     """True where the field and its delayed copy enter with opposite signs and little is left in the long run."""
     fit = fit_fixed_effects(model.fit.system, model.fit.response, np.column_stack([model.fit.design, member.columns]))
     at_once = dict(zip(("table_offset", "axis_expansion"), ("um/K", "ppm/K"), strict=True))
@@ -132,7 +126,7 @@ def _follows_the_rate(part: Readings, model: ModelFit, member: Member) -> bool:
     return False
 
 
-def _gain(part: Readings, model: ModelFit, member: Member, beside: Array | None) -> float:
+def _gain(model: ModelFit, member: Member, beside: Array | None) -> float:
     """Log-likelihood that the candidate gains beside the model and further columns, the drift's variances kept."""
     base = model.fit.design if beside is None else np.column_stack([model.fit.design, beside])
     without = fit_fixed_effects(model.fit.system, model.fit.response, base)

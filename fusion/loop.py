@@ -110,7 +110,6 @@ def close_loop(
         nuisance=nuisance_size(whole),
         before=models[0],
         after=whole,
-        sealed=~used,
     )
 
 

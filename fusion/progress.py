@@ -12,19 +12,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 #: ``report(label, done, total)``; called first with done = 0 and last with done = total.
 Report = Callable[[str, int, int], None]
-#: ``step(done, total)``: the same for a pure function, which knows its numbers and not its name.
-Step = Callable[[int, int], None]
 
 _SECONDS_BETWEEN_LINES = 10.0
 
 
 def silent(label: str, done: int, total: int) -> None:
     """Report nothing."""
-
-
-def step_of(report: Report, label: str) -> Step:
-    """Return the callback of one step, for a function that does not know what it is called."""
-    return lambda done, total: report(label, done, total)
 
 
 class Reporter(AbstractContextManager["Reporter"]):

@@ -67,7 +67,7 @@ class Readings:
     position_mm, sign : (n,) axis position, and +1 or -1 for a positive or negative approach
     positions_mm : (targets,) axis position of each target
     series : what was seen and logged, by name
-    declared_series : names of the series that the camera provides
+    drivers : names of the series that were logged as drivers
     left_out : how many readings could not be used, by reason
     """
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +54,6 @@ class Search:
             name: reason for name, effect in effects.items() if (reason := effect.needs(readings)) is not None
         }
         self.blocked: dict[str, str] = {}
-        self.asked: dict[str, float | str] = {}
 
     def fit(self, terms: Sequence[Term]) -> ModelFit:
         """Fit terms to the readings that are not sealed."""
@@ -80,22 +79,22 @@ class Search:
     def scores(self, model: ModelFit) -> list[FamilyScore]:
         """Score the whole library against the model, on the readings the model was fitted to."""
         families = {
-            name: [
-                _on(member, model.used) for member in members if member.event_s is None or self._inside(member, model)
-            ]
+            name: [_on(member, model.used) for member in self._inside(members, model)]
             for name, members in self._families(model).items()
         }
         return self._judge(model).score({name: members for name, members in families.items() if members})
 
-    def _inside(self, member: Member, model: ModelFit) -> bool:
+    def _inside(self, members: Iterable[Member], model: ModelFit) -> list[Member]:
+        """Members whose event, if they have one, has enough cycles on both sides."""
         starts = cycle_starts(self.readings.subset(model.used))
-        return member.event_s is not None and starts[2] <= member.event_s <= starts[-2]
+        return [member for member in members if member.event_s is None or starts[2] <= member.event_s <= starts[-2]]
 
     def _judge(self, model: ModelFit, *, draws: int = DRAWS) -> Judge:
         part = self.readings.subset(model.used)
         numbers = np.unique(part.cycle)
         blocks = np.searchsorted(numbers, part.cycle) * _BLOCKS // numbers.size
-        return Judge(model.fit, simulate_null(model.fit, self.rng, draws=draws), blocks, part.target_index % 2 == 0)
+        null = simulate_null(model.fit, self.rng, draws=draws) if draws else np.empty((part.seconds.size, 0))
+        return Judge(model.fit, null, blocks, part.target_index % 2 == 0)
 
     def choose(
         self, scores: Sequence[FamilyScore], model: ModelFit, *, level: float = ENTRY_LEVEL
@@ -108,7 +107,7 @@ class Search:
             # Where a stronger effect could not be confirmed, a much weaker one only stands in for it.
             if score.excess < strongest - TIE_GAIN:
                 return None
-            reason = self._blocked(score, model, scores)
+            reason = self._blocked(score, model)
             if reason is not None:
                 self.blocked[score.name] = reason
                 continue
@@ -120,9 +119,9 @@ class Search:
     def _withdrawn(self, score: FamilyScore) -> bool:
         return self.blocked.get(score.name, "").startswith("withdrawn")
 
-    def _blocked(self, score: FamilyScore, model: ModelFit, scores: Sequence[FamilyScore]) -> str | None:
+    def _blocked(self, score: FamilyScore, model: ModelFit) -> str | None:
         part = self.readings.subset(model.used)
-        return blocked_reason(self.effects[score.name], member_of(score), part, model, scores)
+        return blocked_reason(self.effects[score.name], member_of(score), part, model)
 
     def ask_sealed(self, scores: Sequence[FamilyScore], model: ModelFit) -> FamilyScore | None:
         """Put the strongest candidate that the search could not decide on to the sealed readings, as a single question.
@@ -132,7 +131,7 @@ class Search:
         for score in scores:
             if score.member is None or score.p_value > _WORTH_ASKING or score.name in self.blocked:
                 continue
-            reason = self._blocked(score, model, scores)
+            reason = self._blocked(score, model)
             if reason is not None:
                 self.blocked[score.name] = reason
                 continue
@@ -145,7 +144,6 @@ class Search:
                 member_of(asked),
                 self.rng,
             )
-            self.asked = {"effect": score.name, "rmse_before_um": before, "rmse_after_um": after, "p_value": p_value}
             if after < before and p_value <= ASKED_LEVEL:
                 return FamilyScore(**{**vars(asked), "held_out_p": p_value})
             return None
@@ -154,11 +152,8 @@ class Search:
     def _refined(self, score: FamilyScore, model: ModelFit) -> FamilyScore:
         """The best member in the neighbourhood of the one that was found, with its columns for all readings."""
         found = member_of(score)
-        near = [
-            member
-            for member in self.effects[score.name].members(self.readings, model.coefficients(), found)
-            if _same_kind(member, found) and (member.event_s is None or self._inside(member, model))
-        ]
+        offered = self.effects[score.name].members(self.readings, model.coefficients(), found)
+        near = self._inside((member for member in offered if _same_kind(member, found)), model)
         if not near:
             raise SearchError(
                 f"effect {score.name!r} offers no member near one it offered before: {dict(found.parameters)}"

@@ -70,7 +70,6 @@ class LoopResult:
     nuisance: dict[str, float | str]
     before: ModelFit
     after: ModelFit
-    sealed: NDArray[np.bool_]
 
     def as_json(self) -> dict[str, object]:
         """The ``loop`` part of results.json."""

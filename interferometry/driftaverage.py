@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from interferometry import kalman
 from interferometry.statespace import DriftSystem
 
 Array = NDArray[np.float64]
@@ -40,22 +41,11 @@ def _accumulate(
     gains = np.zeros((n, size))
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        for c in range(components):
-            level = c * order
-            if order == 2:
-                rate = level + 1
+        if order == 2:
+            for c in range(components):
                 for j in range(p):
-                    state[level, j] += step * state[rate, j]
-                for j in range(size):
-                    covariance[level, j] += step * covariance[rate, j]
-                for j in range(size):
-                    covariance[j, level] += step * covariance[j, rate]
-                covariance[level, level] += ratios[c] * step**3 / 3.0
-                covariance[level, rate] += ratios[c] * step**2 / 2.0
-                covariance[rate, level] += ratios[c] * step**2 / 2.0
-                covariance[rate, rate] += ratios[c] * step
-            else:
-                covariance[level, level] += ratios[c] * step
+                    state[2 * c, j] += step * state[2 * c + 1, j]
+        kalman.predict(covariance, order, ratios, step)
         kept[k] = covariance
         if observed[k]:
             spread = variance[k]

@@ -14,6 +14,26 @@ Array = NDArray[np.float64]
 
 
 @njit(cache=True)
+def predict(covariance: Array, order: int, ratios: Array, step: float) -> None:
+    """Carry the state's covariance over a step in s, in place."""
+    m = covariance.shape[0]
+    for c in range(ratios.size):
+        level = c * order
+        if order == 2:
+            rate = level + 1
+            for j in range(m):
+                covariance[level, j] += step * covariance[rate, j]
+            for j in range(m):
+                covariance[j, level] += step * covariance[j, rate]
+            covariance[level, level] += ratios[c] * step**3 / 3.0
+            covariance[level, rate] += ratios[c] * step**2 / 2.0
+            covariance[rate, level] += ratios[c] * step**2 / 2.0
+            covariance[rate, rate] += ratios[c] * step
+        else:
+            covariance[level, level] += ratios[c] * step
+
+
+@njit(cache=True)
 def gains(
     seconds: Array, loadings: Array, order: int, ratios: Array, variance: Array, observed: NDArray[np.bool_], keep: bool
 ) -> tuple[Array, Array, Array]:
@@ -27,20 +47,7 @@ def gains(
     seen = np.zeros(m)
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        for c in range(components):
-            level = c * order
-            if order == 2:
-                rate = level + 1
-                for j in range(m):
-                    covariance[level, j] += step * covariance[rate, j]
-                for j in range(m):
-                    covariance[j, level] += step * covariance[j, rate]
-                covariance[level, level] += ratios[c] * step**3 / 3.0
-                covariance[level, rate] += ratios[c] * step**2 / 2.0
-                covariance[rate, level] += ratios[c] * step**2 / 2.0
-                covariance[rate, rate] += ratios[c] * step
-            else:
-                covariance[level, level] += ratios[c] * step
+        predict(covariance, order, ratios, step)
         if keep:
             kept[k] = covariance
         spread[k] = variance[k]
