@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.members import Member
-from interferometry.statespace import Array, DriftFit, DriftSystem, fit_fixed_effects
+from fusion.nulls import least_ratio, simulate_null, tail_probability
+from fusion.projections import block_moments, by_width, densities, gain_across, reductions, solve, without
+from interferometry.statespace import Array, DriftFit, DriftSystem
 
 #: log10 factors on the two drift variances: as estimated, less drift in one or both down to none, and as much more as the simulated
 #: campaigns may hold, so that a strong drift is not mistaken for an effect there.
@@ -33,11 +35,6 @@ _GRID = (
     (0.0, 1.0),
     (1.0, 1.0),
 )
-#: A candidate of which the model explains all but this share adds nothing that these data can show.
-_SEPARABLE_SHARE = 1e-4
-DRAWS = 200
-#: log10 factors on a drift variance among which the plausible ones are drawn.
-_PLAUSIBLE = np.array([-2.0, -1.0, -0.5, 0.0, 0.5, 1.0])
 #: Effects with a larger p-value are not confirmed on unused readings, because they will not enter anyway.
 _WORTH_CONFIRMING = 0.1
 
@@ -91,10 +88,9 @@ class Judge:
         named = [(name, member) for name, members in families.items() for member in members]
         if not named:
             return []
-        columns = np.concatenate([member.columns for _, member in named], axis=1)
-        widths = np.array([member.columns.shape[1] for _, member in named])
-        gains, best_grid, separable = self._gains(columns, widths)
-        scores = []
+        gains, best_grid, separable = self._gains([member for _, member in named])
+        scores: list[FamilyScore] = []
+        worth: dict[int, tuple[Member, int]] = {}
         for name in families:
             rows = np.array([k for k, (family, _) in enumerate(named) if family == name], int)
             if rows.size == 0:
@@ -108,220 +104,110 @@ class Judge:
             null = gains[usable, 1:].max(axis=0)
             gain = float(gains[best, 0])
             p_value = tail_probability(gain, null)
-            held_out, held_out_p = (0.0, 1.0)
             if p_value < _WORTH_CONFIRMING:
-                held_out, held_out_p = self._held_out(named[best][1], int(best_grid[best]))
-            scores.append(
-                FamilyScore(
-                    name,
-                    named[best][1],
-                    gain,
-                    gain - float(null.mean()),
-                    p_value,
-                    np.nan,
-                    held_out,
-                    held_out_p,
-                    collinear,
-                )
-            )
+                worth[len(scores)] = (named[best][1], int(best_grid[best]))
+            excess = gain - float(null.mean())
+            scores.append(FamilyScore(name, named[best][1], gain, excess, p_value, np.nan, 0.0, 1.0, collinear))
+        for place, (held_out, chance) in zip(worth, self._held_out(list(worth.values())), strict=True):
+            scores[place] = replace(scores[place], held_out_gain=held_out, held_out_p=chance)
         tried = len(scores)
         corrected = [replace(score, family_wise_p=1.0 - (1.0 - score.p_value) ** tried) for score in scores]
         return sorted(corrected, key=lambda score: -score.excess)
 
     def strongest(self, members: Sequence[Member]) -> int:
         """Place of the member with the largest gain."""
-        columns = np.concatenate([member.columns for member in members], axis=1)
-        widths = np.array([member.columns.shape[1] for member in members])
-        gains, _, separable = self._gains(columns, widths)
+        gains, _, separable = self._gains(members)
         return int(np.argmax(np.where(separable, gains[:, 0], -np.inf)))
 
     def _systems(self) -> list[DriftSystem]:
         system = self.fit.system
-        centre = np.maximum(system.ratios, _least_ratio(system))
+        centre = np.maximum(system.ratios, least_ratio(system))
         return [replace(system, ratios=centre * np.resize(10.0 ** np.asarray(pair), centre.size)) for pair in _GRID]
 
-    def _gains(self, columns: Array, widths: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
+    def _responses(self) -> Array:
+        """The response and every draw, (n, 1 + draws)."""
+        return np.column_stack([self.fit.response, self.draws])
+
+    def _gains(self, members: Sequence[Member]) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
         """Log-likelihood gain of every member for the response and every draw (members, 1 + draws)."""
-        responses = np.column_stack([self.fit.response, self.draws])
-        n = responses.shape[0]
-        starts = np.concatenate([[0], np.cumsum(widths)[:-1]])
-        best_null = np.full(responses.shape[1], -np.inf)
-        best = np.full((widths.size, responses.shape[1]), -np.inf)
-        best_grid = np.zeros(widths.size, int)
-        separable = np.zeros(widths.size, bool)
+        groups = by_width(members)
+        columns = np.concatenate([group.columns for group in groups], axis=1)
+        known = np.column_stack([self._responses(), self.fit.design])
+        n, count = known.shape[0], known.shape[1] - self.fit.design.shape[1]
+        best_null = np.full(count, -np.inf)
+        best = np.full((count, len(members)), -np.inf)
+        best_grid = np.zeros(len(members), int)
+        separable = np.zeros(len(members), bool)
         for place, system in enumerate(self._systems()):
-            everything, log_determinant = system.whiten(np.column_stack([responses, self.fit.design, columns]))
-            y, x, c = np.split(everything, [responses.shape[1], responses.shape[1] + self.fit.design.shape[1]], axis=1)
-            q, _ = np.linalg.qr(x)
-            own = np.linalg.norm(c, axis=0)
-            y = y - q @ (q.T @ y)
-            c = c - q @ (q.T @ c)
+            c, spread = system.innovations(columns)
+            root, log_determinant = np.sqrt(spread)[:, None], float(np.log(spread).sum())
+            c /= root
+            whitened = system.innovations(known)[0] / root
+            q, _ = np.linalg.qr(whitened[:, count:])
+            y = whitened[:, :count] - q @ (q.T @ whitened[:, :count])
             rss = (y**2).sum(axis=0)
-            reduced, separate = _reductions(c, y, starts, widths, own)
-            likelihood = -0.5 * (n * np.log(np.maximum(rss[None, :] - reduced, 1e-12 * rss)) + log_determinant)
+            reduced, separate = reductions(c, y, q, groups)
+            # In place: these matrices are large, and fetching memory for new ones takes as long as the sums.
+            likelihood = np.subtract(rss[:, None], reduced, out=reduced)
+            np.log(np.maximum(likelihood, 1e-12 * rss[:, None], out=likelihood), out=likelihood)
+            likelihood *= -0.5 * n
+            likelihood -= 0.5 * log_determinant
             best_null = np.maximum(best_null, -0.5 * (n * np.log(rss) + log_determinant))
-            better = likelihood[:, 0] > best[:, 0]
+            better = likelihood[0] > best[0]
             best_grid[better] = place
-            best = np.maximum(best, likelihood)
+            np.maximum(best, likelihood, out=best)
             separable |= separate
         # A further coefficient must earn its keep (Akaike): the simpler of two members that fit alike is preferred.
-        return best - best_null[None, :] - (widths - 1.0)[:, None], best_grid, separable
+        widths = np.array([member.columns.shape[1] for member in members])
+        return (best - best_null[:, None] - (widths - 1.0)).T, best_grid, separable
 
-    def _held_out(self, member: Member, place: int) -> tuple[float, float]:
-        """Gain in predictive log-density on unused readings, coefficients frozen, and its chance where nothing is missing."""
-        responses = np.column_stack([self.fit.response, self.draws])
-        if member.event_s is not None:
-            whitened, _ = self._systems()[place].whiten(np.column_stack([responses, self.fit.design, member.columns]))
-            y, x, c = _split(whitened, responses.shape[1], self.fit.design.shape[1])
-            gain = _gain_across(_without(x, y), _without(x, c), self.halves) / (2.0 * _without(x, y[:, :1]).var())
-        else:
-            gain = self._gain_in_time(responses, member)
-        return float(gain[0]), float((1 + (gain[1:] >= gain[0]).sum()) / gain.size)
+    def _held_out(self, found: Sequence[tuple[Member, int]]) -> list[tuple[float, float]]:
+        """Gain in predictive log-density on unused readings, coefficients frozen, and its chance where nothing is missing.
 
-    def _gain_in_time(self, responses: Array, member: Member) -> Array:
+        ``found`` holds members, each with its place in the grid of drift variances.
+        """
+        lasting = [member for member, _ in found if member.event_s is None]
+        in_time = iter(self._gains_in_time(lasting) if lasting else ())
+        gains = [
+            next(in_time) if member.event_s is None else self._event_gain(member, place) for member, place in found
+        ]
+        return [(float(gain[0]), float((1 + (gain[1:] >= gain[0]).sum()) / gain.size)) for gain in gains]
+
+    def _event_gain(self, member: Member, place: int) -> Array:
+        """Gain of an event whose size comes from one half of the targets on the other half, (1 + draws,)."""
+        responses = self._responses()
+        whitened, _ = self._systems()[place].whiten(np.column_stack([responses, self.fit.design, member.columns]))
+        y, x, c = np.split(whitened, [responses.shape[1], responses.shape[1] + self.fit.design.shape[1]], axis=1)
+        return gain_across(without(x, y), without(x, c), self.halves) / (2.0 * without(x, y[:, :1]).var())
+
+    def _gains_in_time(self, members: Sequence[Member]) -> list[Array]:
         """Forward chaining over the later half: coefficients from all blocks before, log-density of the next one.
 
         Before that, a load that has been switched only a few times leaves the coefficients undetermined. Each model has the drift that
         suits it best, so that a wandering drift is not punished for explaining what it can.
         """
-        known: dict[bool, list[Array]] = {False: [], True: []}
-        ahead: dict[bool, list[Array]] = {False: [], True: []}
-        columns = np.column_stack([responses, self.fit.design, member.columns])
+        responses = self._responses()
+        count, p = responses.shape[1], self.fit.design.shape[1]
+        widths = [member.columns.shape[1] for member in members]
+        ends = p + np.cumsum(widths)
+        designs = [np.arange(p), *(np.r_[:p, end - width : end] for end, width in zip(ends, widths, strict=True))]
+        columns = np.column_stack([responses, self.fit.design, *(member.columns for member in members)])
+        known: list[list[Array]] = [[] for _ in designs]
+        ahead: list[list[Array]] = [[] for _ in designs]
         for system in self._systems():
             errors, spread = system.innovations(columns)
-            y, x, c = _split(errors / np.sqrt(spread)[:, None], responses.shape[1], self.fit.design.shape[1])
-            for with_member, design in ((False, x), (True, np.column_stack([x, c]))):
-                variance = (_without(design, y) ** 2).mean(axis=0)
-                known[with_member].append(-0.5 * (y.shape[0] * np.log(variance) + np.log(spread).sum()))
-                ahead[with_member].append(self._density_ahead(y, design, spread))
-        chosen = {
-            key: np.take_along_axis(np.array(ahead[key]), np.argmax(known[key], axis=0)[None, :], axis=0)[0]
-            for key in known
-        }
-        return np.asarray(chosen[True] - chosen[False])
-
-    def _density_ahead(self, y: Array, x: Array, spread: Array) -> Array:
-        """Log-density of every later block from the coefficients and the noise of all blocks before it (responses,)."""
-        last = int(self.blocks.max())
-        total = np.zeros(y.shape[1])
-        for block in range(max(1, last // 2) + 1, last + 1):
-            train, test = self.blocks < block, self.blocks == block
-            beta = _solve(x[train].T @ x[train], x[train].T @ y[train])
-            variance = ((y[train] - x[train] @ beta) ** 2).mean(axis=0)
-            squares = ((y[test] - x[test] @ beta) ** 2).sum(axis=0)
-            total -= 0.5 * (squares / variance + test.sum() * np.log(variance) + np.log(spread[test]).sum())
-        return total
-
-
-def _split(columns: Array, responses: int, design: int) -> tuple[Array, Array, Array]:
-    """Responses, design and member's columns of a stacked matrix."""
-    return columns[:, :responses], columns[:, responses : responses + design], columns[:, responses + design :]
-
-
-def _gain_across(y: Array, c: Array, half: NDArray[np.bool_]) -> Array:
-    """An event cannot be confirmed in time: its size from one half of the targets, its error on the other, and back."""
-    gain = np.zeros(y.shape[1])
-    for train, test in ((half, ~half), (~half, half)):
-        size = _solve(c[train].T @ c[train], c[train].T @ y[train])
-        gain += (y[test] ** 2).sum(axis=0) - ((y[test] - c[test] @ size) ** 2).sum(axis=0)
-    return gain
-
-
-def _without(x: Array, y: Array) -> Array:
-    """What the columns of x do not explain of y, by least squares."""
-    return y - x @ _solve(x.T @ x, x.T @ y)
-
-
-def _solve(normal: Array, moment: Array) -> Array:
-    """Normal equations of several responses; a ridge of 1e-9 keeps columns that a part of the readings lacks at zero."""
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-24))
-    scaled = normal / np.outer(scale, scale) + 1e-9 * np.eye(scale.size)
-    return np.asarray(np.linalg.solve(scaled, moment / scale[:, None]) / scale[:, None])
-
-
-def _reductions(
-    c: Array, y: Array, starts: NDArray[np.int64], widths: NDArray[np.int64], own: Array
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Reduction of the residual sum of squares by every member (members, responses), and which members are separable."""
-    scaled = c / np.maximum(own, 1e-300)
-    moments = scaled.T @ y
-    reduced = np.zeros((widths.size, y.shape[1]))
-    separable = np.zeros(widths.size, bool)
-    for width in np.unique(widths):
-        rows = np.flatnonzero(widths == width)
-        index = starts[rows][:, None] + np.arange(width)
-        blocks = scaled[:, index]
-        gram = np.einsum("nmi,nmj->mij", blocks, blocks)
-        smallest = np.linalg.eigvalsh(gram)[:, 0]
-        good = smallest > _SEPARABLE_SHARE
-        moment = moments[index[good]]
-        if good.any():
-            reduced[rows[good]] = (moment * np.linalg.solve(gram[good], moment)).sum(axis=1)
-        separable[rows] = good
-    return reduced, separable
-
-
-def tail_probability(value: float, null: Array) -> float:
-    """Chance of a null gain at least as large: counted, and beyond the upper tenth of the draws with an exponential tail.
-
-    The mean excess of a log-likelihood gain is at least 1 (chi-squared tail), which keeps few draws from making a bold claim.
-    """
-    threshold = float(np.quantile(null, 0.9))
-    if value <= threshold:
-        return float((1 + (null >= value).sum()) / (1 + null.size))
-    excess = max(1.0, float((null[null > threshold] - threshold).mean()))
-    return float(0.1 * np.exp(-(value - threshold) / excess))
-
-
-def plausible_ratios(fit: DriftFit, rng: np.random.Generator, *, draws: int) -> Array:
-    """Drift variance ratios (draws, components) that the readings leave possible, drawn by their restricted likelihood.
-
-    A drift that was estimated as zero may well be there; simulating none would make every slow chance look like a find.
-    """
-    centre = np.maximum(fit.system.ratios, _least_ratio(fit.system))
-    components = centre.size
-    exponents = np.stack(np.meshgrid(*[_PLAUSIBLE] * components, indexing="ij"), axis=-1).reshape(-1, components)
-    candidates = centre * 10.0**exponents
-    likelihood = np.array(
-        [
-            fit_fixed_effects(replace(fit.system, ratios=ratios), fit.response, fit.design).log_likelihood
-            for ratios in candidates
+            whitened = errors / np.sqrt(spread)[:, None]
+            y, x = whitened[:, :count], whitened[:, count:]
+            parts = block_moments(y, x, spread, self.blocks)
+            for k, design in enumerate(designs):
+                density = densities(y, x, parts, self.blocks, design)
+                known[k].append(density[0])
+                ahead[k].append(density[1])
+        chosen = [
+            np.take_along_axis(np.array(after), np.argmax(before, axis=0)[None, :], axis=0)[0]
+            for before, after in zip(known, ahead, strict=True)
         ]
-    )
-    weight = np.exp(likelihood - likelihood.max())
-    return candidates[rng.choice(weight.size, size=draws, p=weight / weight.sum())]
-
-
-def _least_ratio(system: DriftSystem) -> float:
-    """Variance ratio of a drift that ends a quarter of one reading's noise away: less can hardly be told from none."""
-    span = float(system.seconds[-1] - system.seconds[0])
-    return 0.0625 / span if system.order == 1 else 3.0 * 0.0625 / span**3
-
-
-def simulate_null(
-    fit: DriftFit, rng: np.random.Generator, *, draws: int = DRAWS, over: DriftSystem | None = None
-) -> Array:
-    """Responses (n, draws) in which only the model's drift and noise act; the noise is drawn from the fit's residuals.
-
-    Fixed effects are left out, because every score is the same whatever they are. ``over`` names other readings than the fit's own.
-    """
-    noise, share = fit.noise()
-    system = fit.system if over is None else over
-    relative = noise / np.sqrt(np.maximum(share, 1e-12))
-    drawn = rng.choice(relative, size=(system.seconds.size, draws)) * np.sqrt(system.variance)[:, None]
-    steps = np.diff(system.seconds, prepend=system.seconds[0])
-    ratios = plausible_ratios(fit, rng, draws=draws)
-    for ratio, loading in zip(ratios.T, system.loadings.T, strict=True):
-        shocks = rng.standard_normal(drawn.shape) * np.sqrt(steps)[:, None]
-        if system.order == 1:
-            drift = np.cumsum(shocks, axis=0)
-        else:
-            rate = np.cumsum(shocks, axis=0)
-            before = np.vstack([np.zeros(draws), rate[:-1]])
-            own = 0.5 * shocks + rng.standard_normal(shocks.shape) * np.sqrt(steps / 12.0)[:, None]
-            drift = np.cumsum((before + own) * steps[:, None], axis=0)
-        drawn += fit.sigma * np.sqrt(ratio) * drift * loading[:, None]
-    return drawn
+        return [np.asarray(one - chosen[0]) for one in chosen[1:]]
 
 
 def ask_sealed(
@@ -346,7 +232,7 @@ def ask_sealed(
     null = simulate_null(fit, rng, over=replace(whole, observed=np.ones_like(train)))
     responses = np.column_stack([response, null])
     p, count = design.shape[1], responses.shape[1]
-    centre = np.maximum(fit.system.ratios, _least_ratio(fit.system))
+    centre = np.maximum(fit.system.ratios, least_ratio(fit.system))
     likelihood: dict[bool, list[Array]] = {False: [], True: []}
     error: dict[bool, list[Array]] = {False: [], True: []}
     for pair in _GRID:
@@ -356,7 +242,7 @@ def ask_sealed(
         for with_member in (False, True):
             used = slice(count, count + p + (member.columns.shape[1] if with_member else 0))
             y, x = errors[train, :count] / root, errors[train, used] / root
-            beta = _solve(x.T @ x, x.T @ y)
+            beta = solve(x.T @ x, x.T @ y)
             variance = ((y - x @ beta) ** 2).mean(axis=0)
             likelihood[with_member].append(-0.5 * (y.shape[0] * np.log(variance) + np.log(spread[train]).sum()))
             error[with_member].append(((errors[~train, :count] - errors[~train, used] @ beta) ** 2).mean(axis=0))

@@ -12,8 +12,9 @@ from fusion.episodes import cycle_starts
 from fusion.gates import blocked_reason
 from fusion.members import Member
 from fusion.model import ModelFit, Term, fit_model
+from fusion.nulls import DRAWS, simulate_null
 from fusion.readings import Readings
-from fusion.scoring import DRAWS, FamilyScore, Judge, ask_sealed, simulate_null
+from fusion.scoring import FamilyScore, Judge, ask_sealed
 
 #: Chance of adding an effect where nothing is missing, over the whole search.
 ENTRY_LEVEL = 0.05
