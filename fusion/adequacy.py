@@ -8,12 +8,14 @@ not from the whitened noise: the drift swallows a part of slow patterns (statist
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.model import unexplained_drift
 from fusion.readings import Readings
 from interferometry.statespace import Array, DriftFit
 
@@ -21,6 +23,8 @@ _PERMUTATIONS = 400
 _BLOCK = 5
 #: Chance at which "a shape remains" is said though nothing does, over all statistics together.
 LEVEL = 0.02
+#: A drift without a name counts as a remainder from this share of a reading's noise on.
+_DRIFT_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,8 @@ class Remainder:
     shape : in words, empty where nothing remains
     rms_um : root mean square of the described shape over the readings
     along_time, along_sites : the leading pattern (cycles,) in um and its weight per site, at most 1
+    series : what is left at every reading (n,), um
+    free : takes from columns (n, q) what could not have been left
     """
 
     p_value: float
@@ -44,6 +50,14 @@ class Remainder:
     along_time: Array
     sites: list[tuple[int, str]]
     along_sites: Array
+    series: Array
+    free: Callable[[Array], Array]
+
+    def share_of(self, columns: Array) -> float:
+        """Share of the remainder's variance that columns (n, q) explain beside what the model has already."""
+        beside = self.free(columns)
+        left = self.series - beside @ np.linalg.lstsq(beside, self.series, rcond=None)[0]
+        return float(1.0 - left @ left / max(float(self.series @ self.series), 1e-300))
 
 
 def examine(
@@ -77,24 +91,26 @@ def examine(
         name: float((1 + (null[:, k] >= observed[k]).sum()) / (1 + _PERMUTATIONS)) for k, name in enumerate(names)
     }
     p_value = float((1 + (largest >= values.max()).sum()) / (1 + _PERMUTATIONS))
-    unwhitened = _unwhitened(readings, fit)
+    unwhitened = _freed(readings, fit.residual()[:, None])[:, 0]
     _, _, residual = _matrix(readings, unwhitened)
     along_time, along_sites, rms = _leading(residual[:, kept])
     named_sites = [sites[k] for k in kept]
     shape = _describe(cycles, along_time, named_sites, along_sites, readings) if p_value < LEVEL else ""
-    return Remainder(p_value, p_values, shape, rms if shape else 0.0, cycles, along_time, named_sites, along_sites)
+    free = partial(_freed, readings)
+    series = free(_at_readings(readings, cycles, along_time, named_sites, along_sites)[:, None])[:, 0]
+    rms = rms if shape else 0.0
+    return Remainder(p_value, p_values, shape, rms, cycles, along_time, named_sites, along_sites, series, free)
 
 
 def with_drift(found: Remainder, fit: DriftFit) -> Remainder:
-    """Count a common drift or a stretch as a remainder where it is larger than the noise of a reading.
+    """Count a common drift or a stretch as a remainder where it is larger than half the noise of a reading.
 
     The fit lets both wander freely, so no test of the residual can see them; their size is what the model leaves unexplained.
     """
-    drift, _ = fit.drift()
-    loaded = drift * fit.system.loadings
-    sizes = np.sqrt(np.mean((loaded - loaded.mean(axis=0)) ** 2, axis=0))
+    drift, basis = unexplained_drift(fit)
+    sizes = np.sqrt(np.mean(drift**2, axis=0))
     largest = int(np.argmax(sizes))
-    if sizes[largest] <= fit.sigma:
+    if sizes[largest] <= _DRIFT_SHARE * fit.sigma:
         return found
     course = "smooth" if fit.system.order == 2 else "irregular"
     where = ("all positions alike", "growing along the axis")[largest] if sizes.size == 2 else f"channel {largest + 1}"
@@ -102,7 +118,19 @@ def with_drift(found: Remainder, fit: DriftFit) -> Remainder:
         found,
         shape=f"a slow, {course} drift that no effect of the library follows; {where}, both directions",
         rms_um=float(sizes[largest]),
+        series=drift[:, largest],
+        free=lambda columns: columns - basis @ (basis.T @ columns),
     )
+
+
+def _at_readings(
+    readings: Readings, cycles: NDArray[np.int64], along_time: Array, sites: list[tuple[int, str]], along_sites: Array
+) -> Array:
+    """The leading pattern at every reading, (n,); zero at sites that were set aside."""
+    by_site = dict(zip(sites, along_sites, strict=True))
+    direction = np.where(readings.sign > 0, "positive", "negative")
+    weight = [by_site.get((int(t), str(d)), 0.0) for t, d in zip(readings.target, direction, strict=True)]
+    return np.asarray(along_time[np.searchsorted(cycles, readings.cycle)] * np.array(weight))
 
 
 def _matrix(readings: Readings, values: Array) -> tuple[NDArray[np.int64], list[tuple[int, str]], Array]:
@@ -149,14 +177,13 @@ def _slowness(series: Array) -> float:
     return 1.0 - 0.5 * float(np.diff(series) @ np.diff(series)) / total * series.size / (series.size - 1)
 
 
-def _unwhitened(readings: Readings, fit: DriftFit) -> Array:
-    """Readings minus fixed effects, freed of an offset and a stretch per cycle, (n,)."""
-    residual = fit.residual()
-    free = np.empty_like(residual)
+def _freed(readings: Readings, columns: Array) -> Array:
+    """Columns (n, q) freed of an offset and a stretch per cycle, which the drift would take."""
+    free = np.empty_like(columns)
     for number in np.unique(readings.cycle):
         here = readings.cycle == number
         basis = np.column_stack([np.ones(here.sum()), readings.share[here]])
-        free[here] = residual[here] - basis @ np.linalg.lstsq(basis, residual[here], rcond=None)[0]
+        free[here] = columns[here] - basis @ np.linalg.lstsq(basis, columns[here], rcond=None)[0]
     return free
 
 

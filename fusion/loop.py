@@ -107,6 +107,7 @@ def close_loop(
         rounds=rounds,
         not_tried=search.not_tried,
         blocked=search.blocked,
+        question=search.question,
         nuisance=nuisance_size(whole),
         before=models[0],
         after=whole,

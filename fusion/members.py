@@ -25,6 +25,8 @@ LAGS_MIN = (5.0, 7.5, 11.0, 17.0, 25.0, 38.0, 57.0, 86.0, 130.0, 195.0)
 _STATE_LAGS_MIN = (10.0, 20.0, 40.0, 80.0, 160.0)
 WARM_UPS_MIN = (15.0, 30.0, 60.0, 120.0)
 LASER_WARM_UPS_MIN = (3.0, 6.0, 12.0, 24.0)
+#: Shortest lead of a screw that is tried where the targets are spaced unevenly.
+SHORTEST_LEAD_MM = 4.0
 
 
 @dataclass(frozen=True)
@@ -78,21 +80,29 @@ def _near(near: Member | None, parameter: str, grid: Iterable[float], *, ratio: 
     return (0.0,) if found == 0.0 else tuple(float(found * factor) for factor in np.geomspace(1 / ratio, ratio, 11))
 
 
-#: Time constants of a second body, as shares of the first one's, that a closer look tries: heat may reach a part through another.
+#: Time constants of a second body, as shares of the first one's: heat may reach a part through another. The search tries one, a closer
+#: look these.
 _SECOND_BODY = (0.25, 0.5, 1.0)
+_SECOND_BODY_TRIED = (0.25,)
 
 
 def _responses(
-    series: Series, near: Member | None, grid: Iterable[float], *, ratio: float, at_rest: float | None = None
+    series: Series,
+    near: Member | None,
+    grid: Iterable[float],
+    *,
+    ratio: float,
+    at_rest: float | None = None,
+    second: Iterable[float] = (),
 ) -> Iterator[tuple[Series, Parameters]]:
-    """First-order responses over a grid of time constants; near a found one also those of two bodies in series."""
+    """First-order responses over a grid of time constants, and those of two bodies in series where ``second`` names shares to try."""
+    shares = tuple(second) if near is None else _SECOND_BODY
     for minutes in _near(near, "time_constant_min", grid, ratio=ratio):
         first = series.lagged(60.0 * minutes, at_rest=at_rest)
         yield first, {"time_constant_min": minutes}
-        if near is not None:
-            for second in (share * minutes for share in _SECOND_BODY if minutes > 0.0):
-                found: Parameters = {"time_constant_min": minutes, "second_time_constant_min": second}
-                yield first.lagged(60.0 * second), found
+        for behind in (share * minutes for share in shares if minutes > 0.0):
+            found: Parameters = {"time_constant_min": minutes, "second_time_constant_min": behind}
+            yield first.lagged(60.0 * behind), found
 
 
 def _states(readings: Readings, near: Member | None) -> Iterator[tuple[Array, Parameters]]:
@@ -128,7 +138,7 @@ def unseen_heat_source_members(readings: Readings, _: Mapping[str, float], near:
     """Responses to the logged drivers."""
     for name in readings.drivers:
         unit = readings.series[name].units
-        for lagged, response in _responses(readings.series[name], near, LAGS_MIN, ratio=1.5):
+        for lagged, response in _responses(readings.series[name], near, LAGS_MIN, ratio=1.5, second=_SECOND_BODY_TRIED):
             settled = readings.at(lagged)
             # What the body was before the log began is not known; its memory of it dies away with the same time constant.
             memory = np.exp(-readings.seconds / (60.0 * float(response["time_constant_min"])))
@@ -218,16 +228,27 @@ def periodic_disturbance_members(readings: Readings, _: Mapping[str, float], nea
 
 
 def spatial_frequencies(readings: Readings) -> Array:
-    """Frequencies along the axis (1/mm) from two periods over the travel up to what the target spacing can show."""
+    """Frequencies along the axis (1/mm) from two periods over the travel up to what the targets can show.
+
+    Evenly spaced targets show every lead as one of the waves that are longer than two spacings; uneven ones tell leads apart, down to the
+    shortest lead that is tried, as long as the step between frequencies is no wider than half the resolution of the travel.
+    """
     positions = np.sort(readings.positions_mm)
     travel = positions[-1] - positions[0]
-    return np.arange(2.0, 0.5 * (positions.size - 1) + 1e-9, 0.5) / travel
+    highest = 0.5 * (positions.size - 1) if _evenly_spaced(readings) else travel / SHORTEST_LEAD_MM
+    return np.arange(2.0, highest + 1e-9, 0.5) / travel
+
+
+def _evenly_spaced(readings: Readings) -> bool:
+    """Whether targets are so even that a lead and its alias look alike: to a hundredth of the spacing."""
+    spacing = np.diff(np.sort(readings.positions_mm))
+    return bool(np.ptp(spacing) < 0.01 * spacing.mean())
 
 
 def aliased_lead_mm(readings: Readings, frequency: float) -> str:
     """Leads between 2 and 50 mm that evenly spaced targets show as the same frequency."""
     spacing = np.diff(np.sort(readings.positions_mm))
-    if np.ptp(spacing) > 1e-6 * spacing.mean():
+    if not _evenly_spaced(readings):
         return f"{1 / frequency:.3g} mm (targets unevenly spaced: no alias)"
     sampling = 1.0 / spacing.mean()
     orders = np.arange(0, int(0.5 / sampling) + 2)
@@ -243,8 +264,12 @@ def _close_periods(readings: Readings, found_min: float) -> Array:
 
 def pitch_error_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
     """Waves along the axis times slow states."""
-    slow = {0.0, 40.0, 60.0}
-    states = [pair for pair in _states(readings, near) if near is not None or pair[1]["time_constant_min"] in slow]
+    states = list(_states(readings, near))
+    if near is None:
+        states = [pair for pair in states if pair[1]["time_constant_min"] in {0.0, 40.0, 60.0}]
+    if near is None and not _evenly_spaced(readings):
+        # Uneven targets leave a hundred and more waves to try; each then follows one course of every kind only.
+        states = [p for p in states if p[1]["time_constant_min"] != 0.0 and p[1].get("start") != "at rest"]
     frequencies = spatial_frequencies(readings)
     if near is not None:
         frequencies = 1.0 / float(near.parameters["period_mm"]) + np.linspace(-0.25, 0.25, 5) / np.ptp(

@@ -133,6 +133,26 @@ def fit_model(
     return ModelFit(readings, used, tuple(terms), fit, profile)
 
 
+def unexplained_drift(fit: DriftFit) -> tuple[Array, Array]:
+    """Drift of each component at every reading, um, that no static profile and no effect of the model could make (n, components).
+
+    Beside it an orthonormal basis (n, k) of profile and effects.
+
+    A drift that wanders smoothly, its start rate and a slowly growing effect can stand in for one another, so their single sizes are
+    badly determined; what is left of the drift beside profile and effects is not.
+    """
+    levels, _ = fit.drift()
+    loadings = fit.system.loadings
+    named = fit.design
+    drift = levels * loadings
+    if fit.system.order == 2:
+        components = loadings.shape[1]
+        named, rates = fit.design[:, :-components], fit.design[:, -components:]
+        drift = drift + rates * fit.coefficients[-components:]
+    q, _ = np.linalg.qr(named)
+    return np.asarray(drift - q @ (q.T @ drift)), np.asarray(q)
+
+
 def refit_fixed(model: ModelFit, terms: Sequence[Term]) -> DriftFit:
     """Fit another set of terms with the drift's variances kept (for comparing likelihoods of nested models)."""
     design = np.column_stack([model.profile, *(term.member.columns for term in terms)])[model.used]

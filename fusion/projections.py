@@ -10,12 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaln
 
 from fusion.members import Member
 from interferometry.statespace import Array
 
 #: A candidate of which the model explains all but this share adds nothing that these data can show.
 _SEPARABLE_SHARE = 1e-4
+_RIDGE = 1e-9
 
 
 def gain_across(y: Array, c: Array, half: NDArray[np.bool_]) -> Array:
@@ -33,64 +35,66 @@ def without(x: Array, y: Array) -> Array:
 
 
 def solve(normal: Array, moment: Array) -> Array:
-    """Normal equations of several responses; a ridge of 1e-9 keeps columns that a part of the readings lacks at zero."""
+    """Normal equations of several responses; a small ridge keeps columns that a part of the readings lacks at zero."""
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-24))
-    scaled = normal / np.outer(scale, scale) + 1e-9 * np.eye(scale.size)
+    scaled = normal / np.outer(scale, scale) + _RIDGE * np.eye(scale.size)
     return np.asarray(np.linalg.solve(scaled, moment / scale[:, None]) / scale[:, None])
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Products of whitened columns in every chronological block: of the design, with the responses, of the responses."""
+    """Products of whitened columns over some readings: of the design (p, p), with the responses (p, r), of the responses (r,)."""
 
-    design: list[Array]
-    cross: list[Array]
-    squares: list[Array]
-    readings: list[int]
-    log_spread: list[float]
+    design: Array
+    cross: Array
+    squares: Array
+    readings: int
+    log_spread: float
 
-
-def block_moments(y: Array, x: Array, spread: Array, blocks: NDArray[np.int64]) -> Moments:
-    """Sum the products of responses y (n, r) and design x (n, p) over each block, so that no model has to do it again."""
-    moments = Moments([], [], [], [], [])
-    for block in range(int(blocks.max()) + 1):
-        here = blocks == block
-        own_x, own_y = x[here], y[here]
-        moments.design.append(own_x.T @ own_x)
-        moments.cross.append(own_x.T @ own_y)
-        moments.squares.append((own_y**2).sum(axis=0))
-        moments.readings.append(int(here.sum()))
-        moments.log_spread.append(float(np.log(spread[here]).sum()))
-    return moments
+    def of(self, columns: NDArray[np.int64]) -> Moments:
+        """The same for some of the design's columns."""
+        chosen = self.design[np.ix_(columns, columns)]
+        return Moments(chosen, self.cross[columns], self.squares, self.readings, self.log_spread)
 
 
-def densities(
-    y: Array, x: Array, parts: Moments, blocks: NDArray[np.int64], design: NDArray[np.int64]
-) -> tuple[Array, Array]:
-    """Log-density of all readings under coefficients from all, and of every later block under those of the blocks before it.
+def moments_of(y: Array, x: Array, spread: Array) -> Moments:
+    """Sum the products of responses y (n, r) and design x (n, p), so that no model has to do it again."""
+    return Moments(x.T @ x, x.T @ y, (y**2).sum(axis=0), y.shape[0], float(np.log(spread).sum()))
 
-    Noise comes from the readings that the coefficients come from. Both (responses,).
+
+def profile_likelihood(all_of: Moments) -> Array:
+    """Log-likelihood of the readings under the coefficients and the noise that suit them best (r,)."""
+    left = all_of.squares - (all_of.cross * solve(all_of.design, all_of.cross)).sum(axis=0)
+    return np.asarray(-0.5 * (all_of.readings * np.log(left / all_of.readings) + all_of.log_spread))
+
+
+def density_ahead(early: Moments, all_of: Moments, flat: int) -> Array:
+    """Log-density of the readings that are not early, predicted from the early ones (r,).
+
+    Coefficients enter with the uncertainty that the early readings leave them (a few switchings of a load determine them badly, and
+    must not be held against an effect), the noise likewise. The first ``flat`` coefficients have no prior; those after them one that
+    is worth a single reading (Kass and Wasserman 1995, J. Am. Stat. Assoc. 90, 928). Forward chaining one reading at a time gives
+    the same, because the densities multiply.
     """
-    last = len(parts.readings) - 1
-    normal = [part[np.ix_(design, design)] for part in parts.design]
-    cross = [part[design] for part in parts.cross]
+    prior = np.zeros_like(all_of.design)
+    if flat < all_of.design.shape[0]:
+        base, cross = all_of.design[:flat, :flat], all_of.design[:flat, flat:]
+        own = all_of.design[flat:, flat:] - cross.T @ solve(base, cross)
+        prior[flat:, flat:] = own / all_of.readings
+    return _evidence(all_of, prior, flat) - _evidence(early, prior, flat)
 
-    def left(beta: Array, first: int, end: int) -> Array:
-        """Residual sum of squares of the blocks from first to before end."""
-        chosen = slice(first, end)
-        gram, moment = np.sum(normal[chosen], axis=0), np.sum(cross[chosen], axis=0)
-        return np.asarray(np.sum(parts.squares[chosen], axis=0) - (beta * (2.0 * moment - gram @ beta)).sum(axis=0))
 
-    whole = solve(np.sum(normal, axis=0), np.sum(cross, axis=0))
-    n = sum(parts.readings)
-    known = -0.5 * (n * np.log(left(whole, 0, last + 1) / n) + sum(parts.log_spread))
-    ahead = np.zeros(y.shape[1])
-    for block in range(max(1, last // 2) + 1, last + 1):
-        beta = solve(np.sum(normal[:block], axis=0), np.sum(cross[:block], axis=0))
-        variance = left(beta, 0, block) / sum(parts.readings[:block])
-        squares = left(beta, block, block + 1)
-        ahead -= 0.5 * (squares / variance + parts.readings[block] * np.log(variance) + parts.log_spread[block])
-    return known, ahead
+def _evidence(moments: Moments, prior: Array, flat: int) -> Array:
+    """Log-density of the readings with coefficients and noise integrated out, up to a constant of the prior (r,)."""
+    normal = moments.design + prior
+    left = moments.squares - (moments.cross * solve(normal, moments.cross)).sum(axis=0)
+    freedom = moments.readings - flat
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-24))
+    _, log_determinant = np.linalg.slogdet(normal / np.outer(scale, scale) + _RIDGE * np.eye(scale.size))
+    log_determinant += 2.0 * float(np.log(scale).sum())
+    return np.asarray(
+        gammaln(0.5 * freedom) - 0.5 * (freedom * np.log(np.pi * left) + log_determinant + moments.log_spread)
+    )
 
 
 @dataclass(frozen=True)
@@ -102,13 +106,13 @@ class Group:
     columns: Array
 
 
-def by_width(members: Sequence[Member]) -> list[Group]:
-    """Members in groups of equal width, laid out so that products of their columns are products of whole matrices."""
+def by_width(members: Sequence[Member], used: NDArray[np.bool_]) -> list[Group]:
+    """Members at the used readings in groups of equal width, laid out so that products of their columns are products of whole matrices."""
     widths = np.array([member.columns.shape[1] for member in members])
     groups = []
     for width in np.unique(widths):
         places = np.flatnonzero(widths == width)
-        stacked = np.stack([members[k].columns for k in places], axis=2)
+        stacked = np.stack([members[k].columns[used] for k in places], axis=2)
         groups.append(Group(places, int(width), stacked.reshape(stacked.shape[0], -1)))
     return groups
 

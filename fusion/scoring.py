@@ -8,7 +8,7 @@ current model and its drift act, with noise drawn from the residuals; from them 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,16 @@ from numpy.typing import NDArray
 
 from fusion.members import Member
 from fusion.nulls import least_ratio, simulate_null, tail_probability
-from fusion.projections import block_moments, by_width, densities, gain_across, reductions, solve, without
+from fusion.projections import (
+    by_width,
+    density_ahead,
+    gain_across,
+    moments_of,
+    profile_likelihood,
+    reductions,
+    solve,
+    without,
+)
 from interferometry.statespace import Array, DriftFit, DriftSystem
 
 #: log10 factors on the two drift variances: as estimated, less drift in one or both down to none, and as much more as the simulated
@@ -35,8 +44,6 @@ _GRID = (
     (0.0, 1.0),
     (1.0, 1.0),
 )
-#: Effects with a larger p-value are not confirmed on unused readings, because they will not enter anyway.
-_WORTH_CONFIRMING = 0.1
 
 
 @dataclass(frozen=True)
@@ -53,6 +60,7 @@ class FamilyScore:
     family_wise_p : the same for the best of all effects that were tried
     held_out_gain, held_out_p : gain on blocks that were not used for the coefficients, and its chance where nothing is missing
     collinear : share of members that the model already contains
+    drift_place : which drift of the grid suits the member best
     """
 
     name: str
@@ -64,6 +72,7 @@ class FamilyScore:
     held_out_gain: float
     held_out_p: float
     collinear: float
+    drift_place: int = 0
 
 
 @dataclass(frozen=True)
@@ -74,23 +83,24 @@ class Judge:
     ----------
     fit : the current model on the training readings
     draws : (n, draws) responses simulated from its drift and noise alone
-    blocks : (n,) number of the chronological block of each reading, from 0
+    early : (n,) True for the cycles from which the others are predicted when an effect is confirmed in time
     halves : (n,) True for one half of the targets, for events that cannot be confirmed in time
+    used : (all readings,) the training readings among those that members have columns for
     """
 
     fit: DriftFit
     draws: Array
-    blocks: NDArray[np.int64]
+    early: NDArray[np.bool_]
     halves: NDArray[np.bool_]
+    used: NDArray[np.bool_]
 
-    def score(self, families: dict[str, Sequence[Member]]) -> list[FamilyScore]:
-        """Score all members of all effects, best excess first."""
+    def score(self, families: Mapping[str, Sequence[Member]]) -> list[FamilyScore]:
+        """Score all members of all effects; none is confirmed yet."""
         named = [(name, member) for name, members in families.items() for member in members]
         if not named:
             return []
-        gains, best_grid, separable = self._gains([member for _, member in named])
+        gains, places, separable = self._gains([member for _, member in named], self.draws)
         scores: list[FamilyScore] = []
-        worth: dict[int, tuple[Member, int]] = {}
         for name in families:
             rows = np.array([k for k, (family, _) in enumerate(named) if family == name], int)
             if rows.size == 0:
@@ -103,21 +113,36 @@ class Judge:
             best = usable[np.argmax(gains[usable, 0])]
             null = gains[usable, 1:].max(axis=0)
             gain = float(gains[best, 0])
-            p_value = tail_probability(gain, null)
-            if p_value < _WORTH_CONFIRMING:
-                worth[len(scores)] = (named[best][1], int(best_grid[best]))
-            excess = gain - float(null.mean())
-            scores.append(FamilyScore(name, named[best][1], gain, excess, p_value, np.nan, 0.0, 1.0, collinear))
-        for place, (held_out, chance) in zip(worth, self._held_out(list(worth.values())), strict=True):
-            scores[place] = replace(scores[place], held_out_gain=held_out, held_out_p=chance)
+            p_value, excess = tail_probability(gain, null), gain - float(null.mean())
+            place = int(places[best])
+            scores.append(FamilyScore(name, named[best][1], gain, excess, p_value, 1.0, 0.0, 1.0, collinear, place))
         tried = len(scores)
-        corrected = [replace(score, family_wise_p=1.0 - (1.0 - score.p_value) ** tried) for score in scores]
-        return sorted(corrected, key=lambda score: -score.excess)
+        return [replace(score, family_wise_p=1.0 - (1.0 - score.p_value) ** tried) for score in scores]
 
-    def strongest(self, members: Sequence[Member]) -> int:
-        """Place of the member with the largest gain."""
-        gains, _, separable = self._gains(members)
-        return int(np.argmax(np.where(separable, gains[:, 0], -np.inf)))
+    def refine(self, score: FamilyScore, near: Sequence[Member]) -> FamilyScore:
+        """The best of some members near the one that was found; the p-value stays that of the search."""
+        gains, places, separable = self._gains(near, np.empty((self.fit.response.size, 0)))
+        best = int(np.argmax(np.where(separable, gains[:, 0], -np.inf)))
+        gain = float(gains[best, 0])
+        if not separable[best] or gain < score.gain:
+            return score
+        excess = score.excess + gain - score.gain
+        return replace(score, member=near[best], gain=gain, excess=excess, drift_place=int(places[best]))
+
+    def confirm(self, scores: Sequence[FamilyScore]) -> list[FamilyScore]:
+        """The same scores with the gain in predictive log-density on unused readings, and its chance where nothing is missing."""
+        lasting = [score.member for score in scores if score.member is not None and score.member.event_s is None]
+        in_time = iter(self._gains_in_time(lasting) if lasting else ())
+        confirmed = []
+        for score in scores:
+            if score.member is None:
+                confirmed.append(score)
+                continue
+            event = score.member.event_s is not None
+            gain = self._event_gain(score.member, score.drift_place) if event else next(in_time)
+            chance = float((1 + (gain[1:] >= gain[0]).sum()) / gain.size)
+            confirmed.append(replace(score, held_out_gain=float(gain[0]), held_out_p=chance))
+        return confirmed
 
     def _systems(self) -> list[DriftSystem]:
         system = self.fit.system
@@ -128,11 +153,11 @@ class Judge:
         """The response and every draw, (n, 1 + draws)."""
         return np.column_stack([self.fit.response, self.draws])
 
-    def _gains(self, members: Sequence[Member]) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
+    def _gains(self, members: Sequence[Member], draws: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
         """Log-likelihood gain of every member for the response and every draw (members, 1 + draws)."""
-        groups = by_width(members)
+        groups = by_width(members, self.used)
         columns = np.concatenate([group.columns for group in groups], axis=1)
-        known = np.column_stack([self._responses(), self.fit.design])
+        known = np.column_stack([self.fit.response, draws, self.fit.design])
         n, count = known.shape[0], known.shape[1] - self.fit.design.shape[1]
         best_null = np.full(count, -np.inf)
         best = np.full((count, len(members)), -np.inf)
@@ -161,48 +186,36 @@ class Judge:
         widths = np.array([member.columns.shape[1] for member in members])
         return (best - best_null[:, None] - (widths - 1.0)).T, best_grid, separable
 
-    def _held_out(self, found: Sequence[tuple[Member, int]]) -> list[tuple[float, float]]:
-        """Gain in predictive log-density on unused readings, coefficients frozen, and its chance where nothing is missing.
-
-        ``found`` holds members, each with its place in the grid of drift variances.
-        """
-        lasting = [member for member, _ in found if member.event_s is None]
-        in_time = iter(self._gains_in_time(lasting) if lasting else ())
-        gains = [
-            next(in_time) if member.event_s is None else self._event_gain(member, place) for member, place in found
-        ]
-        return [(float(gain[0]), float((1 + (gain[1:] >= gain[0]).sum()) / gain.size)) for gain in gains]
-
     def _event_gain(self, member: Member, place: int) -> Array:
         """Gain of an event whose size comes from one half of the targets on the other half, (1 + draws,)."""
         responses = self._responses()
-        whitened, _ = self._systems()[place].whiten(np.column_stack([responses, self.fit.design, member.columns]))
+        whitened, _ = self._systems()[place].whiten(
+            np.column_stack([responses, self.fit.design, member.columns[self.used]])
+        )
         y, x, c = np.split(whitened, [responses.shape[1], responses.shape[1] + self.fit.design.shape[1]], axis=1)
         return gain_across(without(x, y), without(x, c), self.halves) / (2.0 * without(x, y[:, :1]).var())
 
     def _gains_in_time(self, members: Sequence[Member]) -> list[Array]:
-        """Forward chaining over the later half: coefficients from all blocks before, log-density of the next one.
+        """Gain in log-density of the later half, predicted forward from the readings before, of every member (1 + draws,).
 
-        Before that, a load that has been switched only a few times leaves the coefficients undetermined. Each model has the drift that
-        suits it best, so that a wandering drift is not punished for explaining what it can.
+        Each model has the drift that suits it best, so that a wandering drift is not punished for explaining what it can.
         """
         responses = self._responses()
         count, p = responses.shape[1], self.fit.design.shape[1]
         widths = [member.columns.shape[1] for member in members]
         ends = p + np.cumsum(widths)
         designs = [np.arange(p), *(np.r_[:p, end - width : end] for end, width in zip(ends, widths, strict=True))]
-        columns = np.column_stack([responses, self.fit.design, *(member.columns for member in members)])
+        columns = np.column_stack([responses, self.fit.design, *(member.columns[self.used] for member in members)])
         known: list[list[Array]] = [[] for _ in designs]
         ahead: list[list[Array]] = [[] for _ in designs]
         for system in self._systems():
             errors, spread = system.innovations(columns)
-            whitened = errors / np.sqrt(spread)[:, None]
-            y, x = whitened[:, :count], whitened[:, count:]
-            parts = block_moments(y, x, spread, self.blocks)
+            errors /= np.sqrt(spread)[:, None]
+            y, x = errors[:, :count], errors[:, count:]
+            whole, early = moments_of(y, x, spread), moments_of(y[self.early], x[self.early], spread[self.early])
             for k, design in enumerate(designs):
-                density = densities(y, x, parts, self.blocks, design)
-                known[k].append(density[0])
-                ahead[k].append(density[1])
+                known[k].append(profile_likelihood(whole.of(design)))
+                ahead[k].append(density_ahead(early.of(design), whole.of(design), p))
         chosen = [
             np.take_along_axis(np.array(after), np.argmax(before, axis=0)[None, :], axis=0)[0]
             for before, after in zip(known, ahead, strict=True)

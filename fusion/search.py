@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from fusion.episodes import cycle_starts
 from fusion.gates import blocked_reason
 from fusion.members import Member
 from fusion.model import ModelFit, Term, fit_model
-from fusion.nulls import DRAWS, simulate_null
+from fusion.nulls import simulate_null
 from fusion.readings import Readings
 from fusion.scoring import FamilyScore, Judge, ask_sealed
 
@@ -29,11 +30,26 @@ _WORTH_ASKING = 0.1
 ASKED_LEVEL = 0.02
 #: Effects whose log-likelihoods differ by less than this (odds of 20 to 1) are reported as a tie.
 TIE_GAIN = 3.0
-_BLOCKS = 10
+#: Effects with a larger p-value are not looked at more closely, because they will not enter anyway.
+_WORTH_CONFIRMING = 0.1
+#: Share of the cycles from which the later ones are predicted to confirm an effect.
+_EARLY_SHARE = 0.5
 _MAY_REPEAT = frozenset({"step_event", "camera_offset", "sensor_fault", "periodic_disturbance"})
 
 
 _BUILT_IN = frozenset(effect.name for effect in LIBRARY)
+
+
+@dataclass(frozen=True)
+class SealedQuestion:
+    """The one question to the sealed readings: is this effect there? Errors without and with it, their p-value, and the answer."""
+
+    effect: str
+    parameters: Mapping[str, float | str]
+    rmse_before_um: float
+    rmse_after_um: float
+    p_value: float
+    entered: bool
 
 
 class SearchError(ValueError):
@@ -55,6 +71,7 @@ class Search:
             name: reason for name, effect in effects.items() if (reason := effect.needs(readings)) is not None
         }
         self.blocked: dict[str, str] = {}
+        self.question: SealedQuestion | None = None
 
     def fit(self, terms: Sequence[Term]) -> ModelFit:
         """Fit terms to the readings that are not sealed."""
@@ -78,29 +95,34 @@ class Search:
         return families
 
     def scores(self, model: ModelFit) -> list[FamilyScore]:
-        """Score the whole library against the model, on the readings the model was fitted to."""
-        families = {
-            name: [_on(member, model.used) for member in self._inside(members, model)]
-            for name, members in self._families(model).items()
-        }
-        return self._judge(model).score({name: members for name, members in families.items() if members})
+        """Score the whole library against the model, on the readings the model was fitted to, best excess first.
+
+        Effects that are worth it are looked at more closely before they are compared, each at its best, and are confirmed.
+        """
+        judge = self._judge(model)
+        families = {name: self._inside(members, model) for name, members in self._families(model).items()}
+        scores = judge.score({name: members for name, members in families.items() if members})
+        worth = [k for k, score in enumerate(scores) if score.member is not None and score.p_value < _WORTH_CONFIRMING]
+        closer = judge.confirm([self._refined(scores[k], judge, model) for k in worth])
+        for k, score in zip(worth, closer, strict=True):
+            scores[k] = score
+        return sorted(scores, key=lambda score: -score.excess)
 
     def _inside(self, members: Iterable[Member], model: ModelFit) -> list[Member]:
         """Members whose event, if they have one, has enough cycles on both sides."""
         starts = cycle_starts(self.readings.subset(model.used))
         return [member for member in members if member.event_s is None or starts[2] <= member.event_s <= starts[-2]]
 
-    def _judge(self, model: ModelFit, *, draws: int = DRAWS) -> Judge:
+    def _judge(self, model: ModelFit) -> Judge:
         part = self.readings.subset(model.used)
         numbers = np.unique(part.cycle)
-        blocks = np.searchsorted(numbers, part.cycle) * _BLOCKS // numbers.size
-        null = simulate_null(model.fit, self.rng, draws=draws) if draws else np.empty((part.seconds.size, 0))
-        return Judge(model.fit, null, blocks, part.target_index % 2 == 0)
+        early = np.searchsorted(numbers, part.cycle) < _EARLY_SHARE * numbers.size
+        return Judge(model.fit, simulate_null(model.fit, self.rng), early, part.target_index % 2 == 0, model.used)
 
     def choose(
         self, scores: Sequence[FamilyScore], model: ModelFit, *, level: float = ENTRY_LEVEL
     ) -> FamilyScore | None:
-        """Best effect that is significant, confirmed and not blocked, its parameters refined."""
+        """Best effect that is significant, confirmed and not blocked."""
         strongest = -np.inf
         for score in scores:
             if score.member is None or score.family_wise_p > level or self._withdrawn(score):
@@ -113,7 +135,7 @@ class Search:
                 self.blocked[score.name] = reason
                 continue
             if score.held_out_p <= CONFIRMATION_LEVEL or score.family_wise_p <= STRONG_LEVEL:
-                return self._refined(score, model)
+                return score
             strongest = max(strongest, score.excess)
         return None
 
@@ -122,7 +144,7 @@ class Search:
 
     def _blocked(self, score: FamilyScore, model: ModelFit) -> str | None:
         part = self.readings.subset(model.used)
-        return blocked_reason(self.effects[score.name], member_of(score), part, model)
+        return blocked_reason(self.effects[score.name], _on(member_of(score), model.used), part, model)
 
     def ask_sealed(self, scores: Sequence[FamilyScore], model: ModelFit) -> FamilyScore | None:
         """Put the strongest candidate that the search could not decide on to the sealed readings, as a single question.
@@ -136,22 +158,21 @@ class Search:
             if reason is not None:
                 self.blocked[score.name] = reason
                 continue
-            asked = self._refined(score, model)
             before, after, p_value = ask_sealed(
                 model.fit,
                 model.whole_system(),
                 self.readings.response,
                 model.whole_design(),
-                member_of(asked),
+                member_of(score),
                 self.rng,
             )
-            if after < before and p_value <= ASKED_LEVEL:
-                return FamilyScore(**{**vars(asked), "held_out_p": p_value})
-            return None
+            entered = after < before and p_value <= ASKED_LEVEL
+            self.question = SealedQuestion(score.name, member_of(score).parameters, before, after, p_value, entered)
+            return replace(score, held_out_p=p_value) if entered else None
         return None
 
-    def _refined(self, score: FamilyScore, model: ModelFit) -> FamilyScore:
-        """The best member in the neighbourhood of the one that was found, with its columns for all readings."""
+    def _refined(self, score: FamilyScore, judge: Judge, model: ModelFit) -> FamilyScore:
+        """The best member in the neighbourhood of the one that was found."""
         found = member_of(score)
         offered = self.effects[score.name].members(self.readings, model.coefficients(), found)
         near = self._inside((member for member in offered if _same_kind(member, found)), model)
@@ -159,8 +180,7 @@ class Search:
             raise SearchError(
                 f"effect {score.name!r} offers no member near one it offered before: {dict(found.parameters)}"
             )
-        best = self._judge(model, draws=0).strongest([_on(member, model.used) for member in near])
-        return FamilyScore(**{**vars(score), "member": near[best]})
+        return judge.refine(score, near)
 
 
 def _same_kind(member: Member, found: Member) -> bool:

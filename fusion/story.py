@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.adequacy import Remainder
-from fusion.model import ModelFit, Term
+from fusion.model import ModelFit, Term, unexplained_drift
 from fusion.readings import Readings
 from fusion.scoring import FamilyScore
-from fusion.search import CONFIRMATION_LEVEL, ENTRY_LEVEL, TIE_GAIN
+from fusion.search import CONFIRMATION_LEVEL, ENTRY_LEVEL, TIE_GAIN, SealedQuestion
 from interferometry.statespace import Array
 
 #: An effect that is not even significant alone is no rival.
@@ -67,6 +67,7 @@ class LoopResult:
     rounds: list[list[FamilyScore]]
     not_tried: dict[str, str]
     blocked: dict[str, str]
+    question: SealedQuestion | None
     nuisance: dict[str, float | str]
     before: ModelFit
     after: ModelFit
@@ -87,13 +88,24 @@ class LoopResult:
                 "shape": self.remainder.shape,
                 "rms_um": self.remainder.rms_um,
                 "p_value": self.remainder.p_value,
-                "nearest": self.rounds[-1][0].name if self.remainder.shape and self.rounds and self.rounds[-1] else "",
+                **self._nearest(),
             },
             "nuisance": self.nuisance,
+            "sealed_question": vars(self.question) | {"parameters": dict(self.question.parameters)}
+            if self.question
+            else {},
             "search": [[_score_json(score) for score in scores] for scores in self.rounds],
             "not_tried": self.not_tried,
             "blocked": self.blocked,
         }
+
+    def _nearest(self) -> dict[str, object]:
+        """The effect that comes nearest to what is left, its p-value in the search, and the share of the remainder that it explains."""
+        score = next((score for score in self.rounds[-1] if score.member is not None), None) if self.rounds else None
+        if not self.remainder.shape or score is None or score.member is None:
+            return {"nearest": "", "nearest_p": None, "nearest_share": None}
+        share = self.remainder.share_of(score.member.columns)
+        return {"nearest": score.name, "nearest_p": score.family_wise_p, "nearest_share": share}
 
 
 def _step_json(step: Step) -> dict[str, object]:
@@ -206,14 +218,14 @@ def persistence(readings: Readings, used: NDArray[np.bool_]) -> float:
 
 
 def nuisance_size(model: ModelFit) -> dict[str, float | str]:
-    """Size of the drift that nobody explains: common part in um, stretch in um at the end of the travel."""
-    drift, _ = model.fit.drift()
+    """Size of the drift that nobody explains beside profile and effects: of its common part and of its stretch, um over the readings."""
+    drift, _ = unexplained_drift(model.fit)
     kind = "random walk" if model.fit.system.order == 1 else "integrated random walk"
     rate = model.fit.drift_rate
     return {
         "kind": kind,
-        "common_rms_um": float(np.std(drift[:, 0])),
-        "stretch_rms_um": float(np.std(drift[:, 1])),
+        "common_rms_um": float(np.sqrt(np.mean(drift[:, 0] ** 2))),
+        "stretch_rms_um": float(np.sqrt(np.mean(drift[:, 1] ** 2))),
         "common_um_per_sqrt_h" if model.fit.system.order == 1 else "common_um_in_1_h": float(rate[0]),
         "stretch_um_per_sqrt_h" if model.fit.system.order == 1 else "stretch_um_in_1_h": float(rate[1]),
     }
