@@ -16,11 +16,14 @@ Array = NDArray[Any]
 
 #: Where averaging counts may err by more than this, frames are calibrated one by one.
 AVERAGING_LIMIT_K = 0.5e-3
-#: Pixels per tile, and frames per chunk: the sums of a tile stay in the first cache, the frames of a chunk in the last.
-TILE_PX = 2048
-CHUNK_FRAMES = 16
-#: Counts over which the squared steps of one chunk might not fit 32 bits.
-WIDE = 8192
+#: Frames read and added at once, so that they are still in the cache when they are added and looked at.
+CHUNK_FRAMES = 8
+#: Pixels per tile, whose sums stay in the first cache while the frames of a chunk are added to them.
+TILE_PX = 4096
+#: Steps below this from the first frame are squared and added in 32 bits, ...
+NEAR = 2048
+#: ... which hold them, and the sums of all steps, for as many frames as this.
+MOST_FRAMES = 1000
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,7 @@ def accumulate(counts: NDArray[np.uint16]) -> CountStatistics:
     Raises
     ------
     ValueError
-        Not uint16, or no frame.
+        Not uint16, no frame, or more than `MOST_FRAMES`.
     """
     sums = Accumulator(counts.shape[1:])
     sums.add(counts)
@@ -118,6 +121,9 @@ def accumulate(counts: NDArray[np.uint16]) -> CountStatistics:
 
 class Accumulator:
     """Sums that grow by chunks of frames, so that a block of any length takes the memory of one chunk.
+
+    What is added up are the steps from the first frame: they and nearly all their squares fit 32 bits, of which a processor
+    adds twice as many at once as of 64. Where a pixel goes further, the squares of its tile are added in 64 bits.
 
     Parameters
     ----------
@@ -129,63 +135,106 @@ class Accumulator:
         self.shape = shape
         pixels = int(np.prod(shape))
         self.frames = 0
-        self.total, self.squares = np.zeros(pixels, np.uint64), np.zeros(pixels, np.uint64)
-        self.lowest, self.highest = np.full(pixels, 65535, np.uint16), np.zeros(pixels, np.uint16)
+        self.first, self.lowest, self.highest = (np.empty(pixels, np.uint16) for _ in range(3))
+        self.steps, self.squares, self.far_squares = (
+            np.zeros(pixels, kind) for kind in (np.int32, np.uint32, np.uint64)
+        )
 
     def add(self, counts: NDArray[np.uint16]) -> None:
         """Add frames of counts, shape (time, ...)."""
         if counts.dtype != np.uint16 or len(counts) == 0 or counts.shape[1:] != self.shape:
             raise ValueError(f"counts: expected frames of {self.shape} uint16, got {counts.shape} {counts.dtype}")
+        if self.frames + len(counts) > MOST_FRAMES:
+            raise ValueError(
+                f"counts: {self.frames + len(counts)} frames, but the sums hold {MOST_FRAMES}; merge the statistics of several"
+            )
         flat = np.ascontiguousarray(counts).reshape(len(counts), -1)
-        for start in range(0, len(flat), CHUNK_FRAMES):
-            _add(flat[start : start + CHUNK_FRAMES], self.total, self.squares, self.lowest, self.highest)
+        if self.frames == 0:
+            for start in (self.first, self.lowest, self.highest):
+                start[:] = flat[0]
+        _add(flat, self.first, self.steps, self.squares, self.far_squares, self.lowest, self.highest)
         self.frames += len(flat)
 
     def statistics(self) -> CountStatistics:
         """What has been added so far."""
         if self.frames == 0:
             raise ValueError("no frame has been added")
+        total, squares = _sums(self.frames, self.first, self.steps, self.squares, self.far_squares)
         shape = self.shape
         return CountStatistics(
             self.frames,
-            self.total.reshape(shape),
-            self.squares.reshape(shape),
-            self.lowest.reshape(shape),
-            self.highest.reshape(shape),
+            total.reshape(shape),
+            squares.reshape(shape),
+            self.lowest.reshape(shape).copy(),
+            self.highest.reshape(shape).copy(),
         )
 
 
 @numba.njit(cache=True, nogil=True)
-def _add(counts: Array, total: Array, squares: Array, lowest: Array, highest: Array) -> None:
+def _add(
+    counts: Array, first: Array, steps: Array, squares: Array, far_squares: Array, lowest: Array, highest: Array
+) -> None:
     frames, pixels = counts.shape
-    step_sum, step_squares = np.empty(TILE_PX, np.int32), np.empty(TILE_PX, np.uint32)
-    low, high = np.empty(TILE_PX, np.uint16), np.empty(TILE_PX, np.uint16)
     for start in range(0, pixels, TILE_PX):
-        width = min(TILE_PX, pixels - start)
-        first = counts[0, start : start + width]
-        for i in range(width):
-            step_sum[i], step_squares[i], low[i], high[i] = 0, 0, first[i], first[i]
-        # Steps from the chunk's first frame fit 32 bits, of which a processor adds twice as many at once as of 64.
-        for frame in range(1, frames):
-            row = counts[frame, start : start + width]
-            for i in range(width):
-                step = np.int32(row[i]) - np.int32(first[i])
-                step_sum[i] += step
-                step_squares[i] += np.uint32(step * step)
-                low[i] = min(low[i], row[i])
-                high[i] = max(high[i], row[i])
-        for i in range(width):
-            reference = np.int64(first[i])
-            own_squares = np.int64(step_squares[i])
-            if high[i] - low[i] >= WIDE:
-                own_squares = np.int64(0)
-                for frame in range(frames):
-                    own_squares += (np.int64(counts[frame, start + i]) - reference) ** 2
-            own_sum = np.int64(step_sum[i])
-            total[start + i] += np.uint64(frames * reference + own_sum)
-            squares[start + i] += np.uint64(own_squares + 2 * reference * own_sum + frames * reference * reference)
-            lowest[start + i] = min(lowest[start + i], low[i])
-            highest[start + i] = max(highest[start + i], high[i])
+        tile = slice(start, min(start + TILE_PX, pixels))
+        origin = first[tile]
+        for frame in range(0, frames, 4):
+            # Four at once, so that the sums are loaded and stored once for all of them; missing ones are the first, a step of zero.
+            a = counts[frame, tile]
+            b = counts[frame + 1, tile] if frame + 1 < frames else origin
+            c = counts[frame + 2, tile] if frame + 2 < frames else origin
+            d = counts[frame + 3, tile] if frame + 3 < frames else origin
+            if _add_limits(origin, a, b, c, d, lowest[tile], highest[tile]) < NEAR:
+                _add_near(origin, a, b, c, d, steps[tile], squares[tile])
+            else:
+                _add_far(origin, a, b, c, d, steps[tile], far_squares[tile])
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_limits(first: Array, a: Array, b: Array, c: Array, d: Array, lowest: Array, highest: Array) -> np.uint16:
+    """Update the limits; return a number that is below `NEAR`, a power of two, if all steps so far are."""
+    reach = np.uint16(0)
+    for i in range(len(first)):
+        low = min(lowest[i], min(min(a[i], b[i]), min(c[i], d[i])))
+        high = max(highest[i], max(max(a[i], b[i]), max(c[i], d[i])))
+        lowest[i], highest[i] = low, high
+        reach = np.uint16(reach | np.uint16(high - first[i]) | np.uint16(first[i] - low))
+    return reach
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_near(first: Array, a: Array, b: Array, c: Array, d: Array, steps: Array, squares: Array) -> None:
+    for i in range(len(first)):
+        w, x = np.int16(a[i] - first[i]), np.int16(b[i] - first[i])
+        y, z = np.int16(c[i] - first[i]), np.int16(d[i] - first[i])
+        steps[i] += np.int32(np.int16(np.int16(w + x) + np.int16(y + z)))
+        squares[i] += (
+            np.uint32(np.int32(w) * np.int32(w))
+            + np.uint32(np.int32(x) * np.int32(x))
+            + np.uint32(np.int32(y) * np.int32(y))
+            + np.uint32(np.int32(z) * np.int32(z))
+        )
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_far(first: Array, a: Array, b: Array, c: Array, d: Array, steps: Array, squares: Array) -> None:
+    for i in range(len(first)):
+        for value in (a[i], b[i], c[i], d[i]):
+            step = np.int64(value) - np.int64(first[i])
+            steps[i] += np.int32(step)
+            squares[i] += np.uint64(step * step)
+
+
+@numba.njit(cache=True, nogil=True)
+def _sums(frames: int, first: Array, steps: Array, squares: Array, far_squares: Array) -> tuple[Array, Array]:
+    """Sums of the counts and of their squares, from those of the steps."""
+    total, all_squares = np.empty(len(first), np.uint64), np.empty(len(first), np.uint64)
+    for i in range(len(first)):
+        origin, step = np.int64(first[i]), np.int64(steps[i])
+        total[i] = np.uint64(frames * origin + step)
+        own = 2 * origin * step + frames * origin * origin + np.int64(squares[i])
+        all_squares[i] = np.uint64(own) + far_squares[i]
+    return total, all_squares
 
 
 def mean_temperature(

@@ -1,9 +1,7 @@
-"""L3 - Blocks of frames: cut, read without detours, and reduced to the mean and variance of every pixel's temperature."""
+"""L3 - Blocks of frames: cut, and reduced to the mean and variance of every pixel's temperature."""
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,6 +21,7 @@ from thermography.cycles import noise_of_differences
 from thermography.flir import CameraParameters, FrameReference
 from thermography.knocks import RegisteredFrom, Watch
 from thermography.radiometry import calibrate
+from thermography.reading import WindowReader
 from thermography.resampling import PlanWeights
 
 Array = NDArray[Any]
@@ -111,24 +110,28 @@ def reduce_block(
     frames: Sequence[FrameReference], parameters: CameraParameters, camera: Camera, keep_statistics: bool = False
 ) -> BlockResult:
     """Read the frames of a block and reduce them; counts are averaged, and calibrated one by one only where they vary too much."""
-    window = camera.weights.window
     sums = Accumulator(camera.weights.used.shape)
-    shifts, noise, counts = [], np.nan, np.empty((0, 0, 0), np.uint16)
+    shifts, noise = [], np.nan
     # One buffer for all chunks: fresh memory for each costs more than reading into it.
     buffer = np.empty((min(CHUNK_FRAMES, len(frames)), *camera.weights.used.shape), np.uint16)
-    for start in range(0, len(frames), CHUNK_FRAMES):
-        counts = read_window(frames[start : start + CHUNK_FRAMES], window, buffer)
-        sums.add(counts)
-        noise = noise_of_differences(counts[0], camera.weights.whole) if start == 0 else noise
-        shifts.append(camera.watch.shifts(counts, noise))
+    with WindowReader(camera.weights.window) as reader:
+        for start in range(0, len(frames), CHUNK_FRAMES):
+            counts = reader.read(frames[start : start + CHUNK_FRAMES], buffer)
+            sums.add(counts)
+            noise = noise_of_differences(counts[0], camera.weights.whole) if start == 0 else noise
+            shifts.append(camera.watch.shifts(counts, noise))
     statistics = sums.statistics()
     if len(frames) == 1:
-        mean = calibrate(counts[0], parameters).astype(float)
+        mean = calibrate(buffer[0], parameters).astype(float)
         reduced = MeanTemperature(1, mean, np.zeros_like(mean), np.zeros_like(mean))
     else:
         reduced = mean_temperature(statistics, parameters, used=camera.weights.used)
         _calibrate_one_by_one(
-            reduced, (reduced.bound_K > AVERAGING_LIMIT_K) & camera.weights.used, frames, parameters, window
+            reduced,
+            (reduced.bound_K > AVERAGING_LIMIT_K) & camera.weights.used,
+            frames,
+            parameters,
+            camera.weights.window,
         )
     cells = camera.weights.resample(reduced.mean)
     return BlockResult(reduced, cells, np.concatenate(shifts), statistics if keep_statistics else None)
@@ -146,52 +149,12 @@ def _calibrate_one_by_one(
         return
     total, squares = np.zeros(int(wild.sum())), np.zeros(int(wild.sum()))
     reference = reduced.mean[wild]
-    for start in range(0, len(frames), CHUNK_FRAMES):
-        counts = read_window(frames[start : start + CHUNK_FRAMES], window)
-        step = calibrate(counts[:, wild], parameters).astype(float) - reference
-        total += step.sum(axis=0)
-        squares += (step**2).sum(axis=0)
+    buffer = np.empty((min(CHUNK_FRAMES, len(frames)), *wild.shape), np.uint16)
+    with WindowReader(window) as reader:
+        for start in range(0, len(frames), CHUNK_FRAMES):
+            counts = reader.read(frames[start : start + CHUNK_FRAMES], buffer)
+            step = calibrate(counts[:, wild], parameters).astype(float) - reference
+            total += step.sum(axis=0)
+            squares += (step**2).sum(axis=0)
     reduced.mean[wild] = reference + total / len(frames)
     reduced.variance[wild] = np.maximum(squares / len(frames) - (total / len(frames)) ** 2, 0.0)
-
-
-def read_window(
-    frames: Sequence[FrameReference], window: tuple[slice, slice], buffer: NDArray[np.uint16] | None = None
-) -> NDArray[np.uint16]:
-    """Counts of a window of the sensor, (time, row, column) uint16; raw samples are read row-wise where they lie.
-
-    With a `buffer` (frames or more, row, column) they are read into it, and a view of it is returned.
-    """
-    rows, columns = window
-    shape = (len(frames), rows.stop - rows.start, columns.stop - columns.start)
-    counts = np.empty(shape, np.uint16) if buffer is None else buffer[: len(frames)]
-    path, file = None, -1
-    try:
-        for i, frame in enumerate(frames):
-            samples = frame.samples
-            if samples.encoding != "raw" or len(frame.segments) != 1:
-                counts[i] = frame.read().counts[window]
-                continue
-            if frame.path != path:
-                if file >= 0:
-                    os.close(file)
-                path, file = frame.path, os.open(frame.path, os.O_RDONLY)
-            width = samples.shape[1] * 2
-            start = frame.segments[0][0] + samples.offset + rows.start * width
-            wanted = (
-                counts[i].reshape(-1)
-                if samples.shape[1] == counts.shape[2]
-                else np.empty(counts.shape[1] * width // 2, np.uint16)
-            )
-            if os.preadv(file, [memoryview(wanted.data).cast("B")], start) < wanted.nbytes:
-                raise OSError(
-                    f"{frame.path}: frame {frame.index} ends early; the file has become shorter since it was indexed"
-                )
-            if samples.little_endian != (sys.byteorder == "little"):
-                wanted.byteswap(inplace=True)
-            if wanted.size != counts[i].size:
-                counts[i] = wanted.reshape(-1, samples.shape[1])[:, columns]
-    finally:
-        if file >= 0:
-            os.close(file)
-    return counts

@@ -54,15 +54,7 @@ class Watch:
 
     def shifts(self, counts: NDArray[np.uint16], noise_counts: float) -> Array:
         """Median shift (column, row) px per frame of window counts (time, row, column); NaN where fewer than three discs show."""
-        sums = _disc_sums(counts, self.places, self.weights)
-        shows = np.abs(sums[..., 0]) > 10 * noise_counts * self.noise_gain
-        with np.errstate(invalid="ignore", divide="ignore"):
-            centroids = np.where(shows[..., None], sums[..., 1:] / sums[..., :1], np.nan)
-        enough = shows.sum(axis=1) >= 3
-        shifts = np.full((len(counts), 2), np.nan)
-        if enough.any():
-            shifts[enough] = np.nanmedian(centroids[enough], axis=1)
-        return shifts
+        return _shifts(_disc_sums(counts, self.places, self.weights), 10 * noise_counts * self.noise_gain)
 
 
 def watch(registration: Registration, grid: PlanGrid, window: tuple[slice, slice]) -> Watch:
@@ -114,32 +106,46 @@ def _disc_weights(
     return int(low[1]), int(low[0]), weights.T.reshape(3, *columns.shape)
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@numba.njit(cache=True, nogil=True)
 def _disc_sums(counts: Array, places: Array, weights: Array) -> Array:
     sums = np.zeros((len(counts), len(places), 3))
-    for frame in range(len(counts)):
-        for disc in range(len(places)):
-            top, left, height, width, start = places[disc]
-            total, moment_c, moment_r = 0.0, 0.0, 0.0
+    longest = 0
+    for disc in range(len(places)):
+        longest = max(longest, places[disc, 2] * places[disc, 3])
+    patch = np.empty(longest, np.float32)
+    for disc in range(len(places)):
+        top, left, height, width, start = places[disc]
+        size = height * width
+        for frame in range(len(counts)):
+            # About the patch's own level, so that single precision is enough; the weights of all sums are blind to it.
+            level = np.float32(counts[frame, top, left])
             for i in range(height):
                 row = counts[frame, top + i, left : left + width]
-                first = start + i * width
-                a, b, c = (
-                    weights[0, first : first + width],
-                    weights[1, first : first + width],
-                    weights[2, first : first + width],
-                )
-                row_total, row_c, row_r = np.float32(0), np.float32(0), np.float32(0)
-                # About the patch's own level, so that single precision is enough for a row; the weights of all sums are blind to it.
-                level = np.float32(counts[frame, top, left])
                 for j in range(width):
-                    value = np.float32(row[j]) - level
-                    row_total += a[j] * value
-                    row_c += b[j] * value
-                    row_r += c[j] * value
-                total, moment_c, moment_r = total + float(row_total), moment_c + float(row_c), moment_r + float(row_r)
-            sums[frame, disc, 0], sums[frame, disc, 1], sums[frame, disc, 2] = total, moment_c, moment_r
+                    patch[i * width + j] = np.float32(row[j]) - level
+            for k in range(3):
+                sums[frame, disc, k] = _dot(patch[:size], weights[k, start : start + size])
     return sums
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _dot(one: Array, other: Array) -> np.float32:
+    total = np.float32(0)
+    for i in range(len(one)):
+        total += one[i] * other[i]
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _shifts(sums: Array, least: Array) -> Array:
+    """Median over the discs of which the sum exceeds `least`, (frames, 2); NaN where those are fewer than three."""
+    shifts = np.full((len(sums), 2), np.nan)
+    for frame in range(len(sums)):
+        shows = np.abs(sums[frame, :, 0]) > least
+        if shows.sum() >= 3:
+            for k in range(2):
+                shifts[frame, k] = np.median(sums[frame, shows, k + 1] / sums[frame, shows, 0])
+    return shifts
 
 
 def fiducial_shift(frame: Array, registration: Registration, grid: PlanGrid) -> Array:

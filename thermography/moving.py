@@ -13,13 +13,14 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from thermography.averaging import CHUNK_FRAMES
-from thermography.blocks import Block, Override, cut_blocks, read_window
+from thermography.blocks import Block, Override, cut_blocks
 from thermography.cycles import NOT_NUMBERED, CyclePart, annotate, assemble, pixel_noise, position_covariance
 from thermography.fields import BLOCK_S, FieldError, check_bounds, check_correction, check_frames, cycle_of
 from thermography.flir import CameraParameters, FrameReference
 from thermography.knocks import RegisteredFrom
 from thermography.plan import PlanGrid, mask_discs
 from thermography.radiometry import temperature_from_counts
+from thermography.reading import WindowReader
 from thermography.registration import Registration
 from thermography.resampling import LEAST_COVERAGE, centring
 from thermography.scheduling import in_order, open_pool
@@ -199,20 +200,19 @@ def reduce_moving_block(
         np.zeros(len(frames), np.int64),
     )  # fmt: skip
     near = None
-    for i in range(len(frames)):
-        if i % CHUNK_FRAMES == 0:
-            counts = read_window(frames[i : i + CHUNK_FRAMES], window, buffer)
-        frame = counts[i % CHUNK_FRAMES]
-        place = locate_table(frame, tracker, near)
-        near = None if place is None else place.shift_mm
-        if place is None:
-            continue
-        result.shift_mm[i], result.u_mm[i], result.discs[i] = place.shift_mm, place.u_mm, place.discs
-        if place.u_mm <= LARGEST_U_MM:
-            _add_frame(
-                frame, table, samples.points_mm, samples.valid, place.shift_mm, tracker.lens, float(correction_K[i]),
-                result.count, result.mean, result.squares,
-            )  # fmt: skip
+    with WindowReader(window) as reader:
+        for start in range(0, len(frames), CHUNK_FRAMES):
+            for i, frame in enumerate(reader.read(frames[start : start + CHUNK_FRAMES], buffer), start):
+                place = locate_table(frame, tracker, near)
+                near = None if place is None else place.shift_mm
+                if place is None:
+                    continue
+                result.shift_mm[i], result.u_mm[i], result.discs[i] = place.shift_mm, place.u_mm, place.discs
+                if place.u_mm <= LARGEST_U_MM:
+                    _add_frame(
+                        frame, table, samples.points_mm, samples.valid, place.shift_mm, tracker.lens, float(correction_K[i]),
+                        result.count, result.mean, result.squares,
+                    )  # fmt: skip
     return result
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene, cell_truth, record, smooth_field
-from thermography.averaging import accumulate, mean_temperature
+from thermography.averaging import Accumulator, accumulate, mean_temperature
 from thermography.contract import FIELDS
 from thermography.fields import FieldError, RegisteredFrom, reduce_frames
 from thermography.plan import mask_discs
@@ -122,6 +122,36 @@ def test_guard_calibrates_a_transient_frame_by_frame(scene, tmp_path):
     error = np.abs(alone.mean - calibrate(counts, SC660).mean(axis=0, dtype=float))
     assert error.max() > 0.02
     assert (error <= alone.bound_K + 2e-6).all()
+
+
+@pytest.mark.parametrize("reach", [3, 900, 30_000])
+def test_sums_are_exact_however_far_the_counts_move(rng, reach):
+    """Steps of a few counts, of nearly as many as 32 bits hold, and of more in one tile only; any number of frames."""
+    counts = rng.integers(31_000, 31_000 + 3, (11, 3, 4000)).astype(np.uint16)
+    counts[:, 1] = rng.integers(31_000 - reach, 31_000 + reach, (11, 4000))
+    for frames in (1, 2, 3, 4, 9, 11):
+        sums = Accumulator((3, 4000))
+        sums.add(counts[: frames // 2 + 1])
+        if frames > frames // 2 + 1:
+            sums.add(counts[frames // 2 + 1 : frames])
+        found, wide = sums.statistics(), counts[: sums.frames].astype(np.uint64)
+        assert found.frames == sums.frames == max(frames, 1)
+        assert (found.total == wide.sum(axis=0)).all()
+        assert (found.squares == (wide**2).sum(axis=0)).all()
+        assert (found.lowest == wide.min(axis=0)).all()
+        assert (found.highest == wide.max(axis=0)).all()
+
+
+def test_sums_hold_the_frames_they_say():
+    """The largest steps that count as near, 1000 times: the squares all but fill 32 bits."""
+    counts = np.full((1000, 2, 2), 2047, np.uint16)
+    counts[0] = 0
+    found = accumulate(counts)
+    assert (found.squares == 999 * 2047**2).all()
+    with pytest.raises(
+        ValueError, match="counts: 1001 frames, but the sums hold 1000; merge the statistics of several"
+    ):
+        accumulate(np.zeros((1001, 2, 2), np.uint16))
 
 
 def test_merging_sums_is_exact_in_any_order(rng):
