@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 @njit(cache=True)
-def _accumulate(
+def _filter(
     seconds: Array,
     loadings: Array,
     order: int,
@@ -28,52 +28,42 @@ def _accumulate(
     observed: NDArray[np.bool_],
     weights: Array,
     columns: Array,
-) -> tuple[Array, Array, Array]:
-    """Average (components, p), its covariance (components, components) and that with the drift (n, components, components)."""
+) -> tuple[Array, Array, Array, Array]:
+    """Filter with the average as part of the state: last state (size, p) and covariance (size, size), predicted covariances, gains."""
     n, components = loadings.shape
-    p = columns.shape[1]
     m = components * order
     size = m + components
-    state = np.zeros((size, p))
+    state = np.zeros((size, columns.shape[1]))
     covariance = np.zeros((size, size))
-    seen = np.zeros(size)
-    kept = np.zeros((n, size, size))
+    seen, error = np.zeros(size), np.empty(columns.shape[1])
+    predicted = np.zeros((n, size, size))
     gains = np.zeros((n, size))
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        if order == 2:
-            for c in range(components):
-                for j in range(p):
-                    state[2 * c, j] += step * state[2 * c + 1, j]
+        kalman.advance(state[:m], order, step)
         kalman.predict(covariance, order, ratios, step)
-        kept[k] = covariance
+        predicted[k] = covariance
         if observed[k]:
-            spread = variance[k]
-            for i in range(size):
-                seen[i] = 0.0
-                for c in range(components):
-                    seen[i] += covariance[i, c * order] * loadings[k, c]
-            for c in range(components):
-                spread += loadings[k, c] * seen[c * order]
-            for j in range(p):
-                error = columns[k, j]
-                for c in range(components):
-                    error -= loadings[k, c] * state[c * order, j]
-                for i in range(size):
-                    state[i, j] += seen[i] * error / spread
+            spread = kalman.look(covariance, order, loadings, k, variance[k], seen)
+            kalman.learn(covariance, seen, spread)
+            kalman.correct(state, order, loadings, k, columns[k], seen, spread, error)
             for i in range(size):
                 gains[k, i] = seen[i] / spread
-                for j in range(size):
-                    covariance[i, j] -= seen[i] * seen[j] / spread
         if weights[k] != 0.0:
             for c in range(components):
-                for j in range(p):
-                    state[m + c, j] += weights[k] * state[c * order, j]
-                for j in range(size):
-                    covariance[m + c, j] += weights[k] * covariance[c * order, j]
-                for j in range(size):
-                    covariance[j, m + c] += weights[k] * covariance[j, c * order]
-    with_drift = np.empty((n, components, components))
+                state[m + c] += weights[k] * state[c * order]
+                covariance[m + c] += weights[k] * covariance[c * order]
+                covariance[:, m + c] += weights[k] * covariance[:, c * order]
+    return state, covariance, predicted, gains
+
+
+@njit(cache=True)
+def _carry_back(seconds: Array, loadings: Array, order: int, weights: Array, predicted: Array, gains: Array) -> Array:
+    """Covariance (n, components, components) of the drift at every reading with the average, in units of sigma^2."""
+    n, components = loadings.shape
+    m = components * order
+    size = m + components
+    with_drift = np.zeros((n, components, components))
     onward = np.zeros((components, size))
     for c in range(components):
         onward[c, m + c] = 1.0
@@ -83,21 +73,19 @@ def _accumulate(
             for c in range(components):
                 for i in range(components):
                     onward[i, 2 * c + 1] += step * onward[i, 2 * c]
-        for c in range(components):
-            for i in range(components):
-                onward[i, c * order] += weights[k] * onward[i, m + c]
         for i in range(components):
             pulled = 0.0
+            for c in range(components):
+                onward[i, c * order] += weights[k] * onward[i, m + c]
             for j in range(size):
                 pulled += onward[i, j] * gains[k, j]
             for c in range(components):
                 onward[i, c * order] -= pulled * loadings[k, c]
         for c in range(components):
             for i in range(components):
-                with_drift[k, c, i] = 0.0
                 for j in range(size):
-                    with_drift[k, c, i] += kept[k, c * order, j] * onward[i, j]
-    return state[m:], covariance[m:, m:], with_drift
+                    with_drift[k, c, i] += predicted[k, c * order, j] * onward[i, j]
+    return with_drift
 
 
 def average_drift(system: DriftSystem, weights: Array, columns: Array) -> tuple[Array, Array, Array]:
@@ -120,13 +108,17 @@ def average_drift(system: DriftSystem, weights: Array, columns: Array) -> tuple[
     with_drift : (n, components, components) ndarray
         Covariance of the error of each reading's drift (second axis) with that of the average (third), likewise.
     """
-    return _accumulate(
+    weights = np.ascontiguousarray(weights, float)
+    state, covariance, predicted, gains = _filter(
         system.seconds,
         system.loadings,
         system.order,
         system.ratios,
         system.variance,
         system.observed,
-        np.ascontiguousarray(weights, float),
+        weights,
         np.ascontiguousarray(columns, float),
     )
+    m = system.loadings.shape[1] * system.order
+    with_drift = _carry_back(system.seconds, system.loadings, system.order, weights, predicted, gains)
+    return state[m:], covariance[m:, m:], with_drift

@@ -83,7 +83,7 @@ def fit_joint(
             raise DriftDataError(f"components {unknown} are not known; choose from {', '.join(COMPONENTS)}")
         return _fit(readings, cells, cell, tuple(components), robust, order, None)
     joint = _fit(readings, cells, cell, BASE_COMPONENTS, robust, order, None)
-    wanted = tuple(name for name in ("reversal", "bend") if _asks_for(joint, name))
+    wanted = _asked_for(joint)
     if not wanted:
         return joint
     start = np.concatenate([joint.fit.system.ratios, np.full(len(wanted), joint.fit.system.ratios.min() * 1e-2)])
@@ -120,10 +120,17 @@ def _without_medians(readings: xr.Dataset) -> Array:
     passes = readings["cycle"].values * 2 + (readings["sign"].values > 0)
     cells = readings["target"].values * 2 + (readings["sign"].values > 0)
     for groups in (cells, passes):
-        _, own = np.unique(groups, return_inverse=True)
-        medians = np.array([np.median(left[own == one]) for one in range(own.max() + 1)])
-        left = left - medians[own]
+        left = left - _group_medians(groups, left)
     return left
+
+
+def _group_medians(groups: NDArray[np.int64], values: Array) -> Array:
+    """Return for each value the median of its group, (n,)."""
+    _, own, count = np.unique(groups, return_inverse=True, return_counts=True)
+    ordered = values[np.lexsort((values, own))]
+    first = np.cumsum(count) - count
+    medians = 0.5 * (ordered[first + (count - 1) // 2] + ordered[first + count // 2])
+    return np.asarray(medians[own])
 
 
 def _cells(deviations: xr.Dataset, readings: xr.Dataset) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -176,24 +183,28 @@ def _fit(
     return JointFit(readings, cells, cell, components, fit)
 
 
-def _asks_for(joint: JointFit, component: str) -> bool:
-    """Tell whether the noise holds a component that changes slowly, by the von Neumann ratio of its contrast per cycle."""
+def _asked_for(joint: JointFit) -> tuple[str, ...]:
+    """Return the further components that the noise holds: their contrast per cycle changes slowly by the von Neumann ratio."""
     readings = joint.readings
-    sign = readings["sign"].values.astype(float)
-    names = (component, *(name for name in COMPONENTS if name != component and name != "bend"))
-    if component == "reversal" and np.unique(sign).size < 2:
-        return False
-    basis = loadings_of(sign, readings["position"].values, names, span_mm(readings))
+    sign, position = readings["sign"].values.astype(float), readings["position"].values
     noise = joint.fit.noise()[0] / joint.fit.system.variance
-    contrasts = []
-    for cycle in np.unique(readings["cycle"].values):
-        own = readings["cycle"].values == cycle
-        wanted, others = basis[own, 0], basis[own, 1:]
-        wanted = wanted - others @ np.linalg.lstsq(others, wanted, rcond=None)[0]
-        size = float(wanted @ wanted)
-        if size > 1e-6 * own.sum():
-            contrasts.append(float(wanted @ noise[own]) / np.sqrt(size))
-    return _serial_p_value(np.array(contrasts)) < COMPONENT_LEVEL
+    by_cycle = np.argsort(readings["cycle"].values, kind="stable")
+    starts = np.flatnonzero(np.diff(readings["cycle"].values[by_cycle])) + 1
+    found = []
+    for component, beside in (("reversal", BASE_COMPONENTS), ("bend", (*BASE_COMPONENTS, "reversal"))):
+        if component == "reversal" and np.unique(sign).size < 2:
+            continue
+        basis = loadings_of(sign, position, (component, *beside), span_mm(readings))
+        contrasts = []
+        for own in np.split(by_cycle, starts):
+            wanted, others = basis[own, 0], basis[own, 1:]
+            wanted = wanted - others @ np.linalg.lstsq(others, wanted, rcond=None)[0]
+            size = float(wanted @ wanted)
+            if size > 1e-6 * own.size:
+                contrasts.append(float(wanted @ noise[own]) / np.sqrt(size))
+        if _serial_p_value(np.array(contrasts)) < COMPONENT_LEVEL:
+            found.append(component)
+    return tuple(found)
 
 
 def _serial_p_value(series: Array) -> float:

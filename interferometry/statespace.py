@@ -76,6 +76,18 @@ class DriftSystem:
         )
         return errors, spread
 
+    def normal_equations(self, columns: Array) -> tuple[Array, float]:
+        """Gram matrix (p, p) of the whitened columns (n, p) of the observed readings, and the log-determinant of their covariance."""
+        return kalman.normal_equations(
+            self.seconds,
+            self.loadings,
+            self.order,
+            self.ratios,
+            self.variance,
+            self.observed,
+            np.ascontiguousarray(columns),
+        )
+
     def whiten(self, columns: Array) -> tuple[Array, float]:
         """Standardised prediction errors of the observed readings (n_observed, p), and the log-determinant of their covariance."""
         errors, spread = self.innovations(columns)
@@ -203,13 +215,35 @@ def fit_fixed_effects(system: DriftSystem, response: Array, design: Array) -> Dr
     DriftModelError
         if a value is not finite, or if the columns are linearly dependent after whitening.
     """
-    if not (np.isfinite(response).all() and np.isfinite(design).all()):
-        raise DriftModelError("response and design must be finite; leave readings without a value out before the fit")
-    errors, spread = system.innovations(np.column_stack([response, design]))
-    gram = kalman.gram(errors, spread, system.observed)
-    log_determinant = float(np.log(spread[system.observed]).sum())
+    return _solve(system, _Problem.of(response, design))
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """What every fit of a search has in common.
+
+    columns (n, 1 + p) holds response and design side by side; least (p,) is the whitened size under which a column vanishes.
+    """
+
+    response: Array
+    design: Array
+    columns: Array
+    least: Array
+
+    @classmethod
+    def of(cls, response: Array, design: Array) -> _Problem:
+        columns = np.column_stack([response, design])
+        if not np.isfinite(columns).all():
+            raise DriftModelError(
+                "response and design must be finite; leave readings without a value out before the fit"
+            )
+        return cls(response, design, columns, 1e-12 * np.maximum(1.0, np.abs(design).max(axis=0, initial=0.0)))
+
+
+def _solve(system: DriftSystem, problem: _Problem) -> DriftFit:
+    gram, log_determinant = system.normal_equations(problem.columns)
     scale = np.sqrt(np.diag(gram)[1:])
-    vanishing = np.flatnonzero(scale < 1e-12 * np.maximum(1.0, np.abs(design).max(axis=0, initial=0.0)))
+    vanishing = np.flatnonzero(scale < problem.least)
     if vanishing.size:
         raise DriftModelError(f"columns {vanishing.tolist()} of the design vanish; leave them out")
     scale_all = np.concatenate([[1.0], scale])
@@ -227,8 +261,8 @@ def fit_fixed_effects(system: DriftSystem, response: Array, design: Array) -> Dr
     log_likelihood = -0.5 * (freedom * np.log(max(sigma2, 1e-300)) + log_determinant + log_normal)
     return DriftFit(
         system=system,
-        response=response,
-        design=design,
+        response=problem.response,
+        design=problem.design,
         coefficients=swept[1:, 0] / scale,
         covariance=sigma2 * swept[1:, 1:] / np.outer(scale, scale),
         sigma=float(np.sqrt(sigma2)),
@@ -241,6 +275,7 @@ def _maximise(system: DriftSystem, response: Array, design: Array, start: Array 
     """Restricted maximum likelihood of the variance ratios by a bounded simplex in their logarithm."""
     low, high = _LOG_RATIO_LIMITS
     components = system.loadings.shape[1]
+    problem = _Problem.of(response, design)
     # Ratios are searched per component in units that make the drift over one hour comparable to one reading's noise.
     unit = np.log10(1.0 / 3600.0 ** (1.0 if system.order == 1 else 3.0)) - 2 * np.log10(
         np.maximum(np.abs(system.loadings).max(axis=0), 1e-12)
@@ -248,7 +283,7 @@ def _maximise(system: DriftSystem, response: Array, design: Array, start: Array 
 
     def fitted(log_ratio: Array) -> DriftFit:
         ratios = 10.0 ** (unit + np.clip(log_ratio, low, high))
-        return fit_fixed_effects(replace(system, ratios=ratios), response, design)
+        return _solve(replace(system, ratios=ratios), problem)
 
     guess = np.zeros(components) if start is None else np.clip(np.log10(np.maximum(start, 1e-300)) - unit, low, high)
     simplex = np.vstack([guess, guess + 1.5 * np.eye(components)])
