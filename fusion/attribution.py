@@ -1,12 +1,15 @@
 """L4 - The test behind the maps: many temperatures as sources of several drift series, with one family-wise error.
 
-Sources: Westfall and Young (1993), *Resampling-based multiple testing* (smallest p over channels against its own null); Benjamini and
+Temperatures come in sets (cells, thermal modes, regions). All sets share the redrawn nulls and one error probability: for every set
+and series the maximum statistic is measured in units of its own null, and the largest of these is compared with its null.
+
+Sources: Westfall and Young (1993), *Resampling-based multiple testing* (maxima over tests of different kind); Benjamini and
 Hochberg (1995), J. R. Stat. Soc. B 57, 289.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,7 +61,7 @@ class Film:
 
 @dataclass(frozen=True)
 class Tested:
-    """What the test of one film found; columns are cells, regions or modes.
+    """What the test of one set of temperatures found; columns are cells, modes or regions.
 
     Attributes
     ----------
@@ -67,8 +70,7 @@ class Tested:
     p_value, q_value : (channels, columns) family-wise over everything tested, and false-discovery rate within the channel
     coefficient, coefficient_u, detectable : (channels, columns) um per K
     threshold : (channels,) of the statistic at the family-wise level
-    null_maxima : (draws, channels) maximum statistic of every redrawn null
-    false_alarm_rate : share of fresh nulls in which anything passed the threshold
+    false_alarm_rate : share of fresh nulls in which anything of this set passed its threshold
     """
 
     names: tuple[str, ...]
@@ -80,15 +82,31 @@ class Tested:
     coefficient_u: Array
     detectable: Array
     threshold: Array
-    null_maxima: Array
     false_alarm_rate: float
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What the test of all sets found.
+
+    Attributes
+    ----------
+    sets : findings per set, in the order given
+    banks : fitted null of every series
+    draws : redrawn nulls behind the p values
+    false_alarm_rate : share of fresh nulls in which anything of any set passed
+    """
+
+    sets: Mapping[str, Tested]
     banks: tuple[NullBank, ...]
+    draws: int
+    false_alarm_rate: float
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
-def evaluate_film(
+def evaluate_films(
     series: Sequence[DriftSeries],
-    film: Film,
+    films: Mapping[str, Film],
     excitation: Excitation,
     *,
     lags_s: Sequence[float] = LAGS_S,
@@ -96,13 +114,19 @@ def evaluate_film(
     checks: int = 199,
     rng: np.random.Generator,
     progress: Callable[[float], None] | None = None,
-) -> Tested:
-    """Test all columns of a film as sources of all series, with one family-wise error over columns, lags and series.
+) -> Findings:
+    """Test all columns of all films as sources of all series, with one family-wise error over films, columns, lags and series.
 
     The first two series, where they are "common" and "proportional", are also tested together at the same lag. The first `draws`
-    nulls (the series' own whitened residuals in other orders) set the threshold, `checks` fresh ones (Gaussian) measure what passes it.
+    nulls (the series' own whitened residuals in other orders) set the thresholds, `checks` fresh ones (Gaussian) measure what passes.
+
+    Parameters
+    ----------
+    series : drift series, all on the films' clock
+    films : sets of temperatures by name, all at the same instants
     """
-    operators = lag_operators(film.seconds, lags_s)
+    seconds = next(iter(films.values())).seconds
+    operators = lag_operators(seconds, lags_s)
     banks = tuple(
         null_bank(one.values, one.seconds, one.variance, nuisance_columns(one.seconds, excitation)) for one in series
     )
@@ -113,30 +137,32 @@ def evaluate_film(
     names = [one.name for one in series]
     if names[:2] == ["common", "proportional"]:
         names.append("joint")
-    cells32 = film.values.astype(np.float32)
-    columns, lags = film.values.shape[1], len(lags_s)
-    tally = _Tally(len(names), columns, draws + checks)
-    for tile in tiles(columns * lags, lags):
-        cells = slice(tile.start // lags, tile.stop // lags)
-        _test_tile(sources, cells32[:, cells], cells, lags, tally)
-        if progress is not None:
-            progress(tile.stop / (columns * lags))
-    calibration, check = tally.maxima[:, :draws], tally.maxima[:, draws:]
-    p_value, threshold = _family_wise(tally.statistic, calibration)
-    return Tested(
-        names=tuple(names),
-        statistic=tally.statistic,
-        lag_index=tally.lag_index,
-        p_value=p_value,
-        q_value=np.stack([_false_discovery(*pair) for pair in zip(tally.statistic, tally.pooled, strict=True)]),
-        coefficient=tally.effects[0],
-        coefficient_u=tally.effects[1],
-        detectable=(np.sqrt(threshold)[:, None] + _POWER_80) * tally.effects[2],
-        threshold=threshold,
-        null_maxima=calibration.T,
-        false_alarm_rate=float((check >= threshold[:, None]).any(axis=0).mean()) if checks else float("nan"),
+    whole = sum(film.values.shape[1] for film in films.values())
+    tallies, done = [], 0
+    for film in films.values():
+        tallies.append(_Tally(len(names), film.values.shape[1], draws + checks))
+        for cells in _test_film(sources, film, len(lags_s), tallies[-1]):
+            if progress is not None:
+                progress((done + cells.stop) / whole)
+        done += film.values.shape[1]
+    maxima = np.concatenate([tally.maxima for tally in tallies])
+    p_values, thresholds = _family_wise([row for tally in tallies for row in tally.statistic], maxima[:, :draws])
+    alarms = (maxima[:, draws:] > thresholds[:, None]).reshape(len(films), len(names), checks)
+    rows = [slice(k * len(names), (k + 1) * len(names)) for k in range(len(films))]
+    return Findings(
+        sets={
+            name: tally.finish(names, np.stack(p_values[row]), thresholds[row], _rate(alarms[k]))
+            for k, (name, tally, row) in enumerate(zip(films, tallies, rows, strict=True))
+        },
         banks=banks,
+        draws=draws,
+        false_alarm_rate=_rate(alarms.reshape(len(films) * len(names), checks)),
     )
+
+
+def _rate(alarms: NDArray[np.bool_]) -> float:
+    """Share of the nulls (rows, nulls) in which any row raised an alarm; NaN without nulls."""
+    return float(alarms.any(axis=0).mean()) if alarms.size else float("nan")
 
 
 @dataclass(frozen=True)
@@ -159,6 +185,21 @@ class _Tally:
         # Coefficient, its uncertainty, and its uncertainty under the fitted null.
         self.effects = np.zeros((3, channels, columns))
 
+    def finish(self, names: Sequence[str], p_value: Array, threshold: Array, false_alarm_rate: float) -> Tested:
+        """Findings of the set, once its p values (channels, columns) and thresholds (channels,) are known."""
+        return Tested(
+            names=tuple(names),
+            statistic=self.statistic,
+            lag_index=self.lag_index,
+            p_value=p_value,
+            q_value=np.stack([_false_discovery(*pair) for pair in zip(self.statistic, self.pooled, strict=True)]),
+            coefficient=self.effects[0],
+            coefficient_u=self.effects[1],
+            detectable=(np.sqrt(threshold)[:, None] + _POWER_80) * self.effects[2],
+            threshold=threshold,
+            false_alarm_rate=false_alarm_rate,
+        )
+
     def add(self, channel: int, cells: slice, ratio: Array32, effects: Array) -> None:
         """Enter ratios (1 + nulls, cells, lags) and effects (3, cells, lags) of one channel."""
         best = ratio.max(axis=2)
@@ -175,6 +216,15 @@ class _Tally:
 def _seen_through(series: DriftSeries, operators: Sequence[Array]) -> Array32:
     """How a series sees the film under every lag, (lags, n, frames)."""
     return np.stack([series.sampling @ operator for operator in operators]).astype(np.float32)
+
+
+def _test_film(sources: Sequence[_Source], film: Film, lags: int, tally: _Tally) -> Iterator[slice]:
+    """Test a film tile by tile; yields each slice of columns that is done."""
+    values = film.values.astype(np.float32)
+    for tile in tiles(values.shape[1] * lags, lags):
+        cells = slice(tile.start // lags, tile.stop // lags)
+        _test_tile(sources, values[:, cells], cells, lags, tally)
+        yield cells
 
 
 def _test_tile(sources: Sequence[_Source], film32: Array32, cells: slice, lags: int, tally: _Tally) -> None:
@@ -238,21 +288,25 @@ def _respond_tile(response: Array32, cells: Array32) -> Array32:
     return np.ascontiguousarray(seen.transpose(1, 2, 0)).reshape(seen.shape[1], -1)
 
 
-def _family_wise(statistic: Array, maxima: Array) -> tuple[Array, Array]:
-    """Family-wise p (channels, columns) and thresholds (channels,): smallest p over channels against its own null."""
-    channels, draws = maxima.shape
-    ordered = np.sort(maxima, axis=1)
+def _family_wise(statistics: Sequence[Array], maxima: Array) -> tuple[list[Array], Array]:
+    """Family-wise p of every row of statistics, and thresholds (rows,), from the rows' maxima (rows, draws) in the same nulls.
 
-    def exceed(channel: int, values: Array) -> Array:
-        return (draws - np.searchsorted(ordered[channel], values, side="left") + 1.0) / (draws + 1.0)
-
-    smallest = np.sort(np.min([exceed(c, maxima[c]) for c in range(channels)], axis=0))
-    single = np.stack([exceed(c, statistic[c]) for c in range(channels)])
-    p_value = (np.searchsorted(smallest, single, side="right") + 1.0) / (draws + 1.0)
-    # The largest single-channel p that is still significant after the step over channels sets each channel's threshold.
-    admitted = smallest[max(int(np.floor(LEVEL * (draws + 1))) - 1, 0)]
-    rank = np.clip(np.ceil((1.0 - admitted) * (draws + 1)).astype(int), 1, draws) - 1
-    return np.minimum(p_value, 1.0), ordered[:, rank]
+    A row is one series in one set. Rows of very different length have one error probability together because each is measured in its own
+    unit, the distance from the median of its maxima to their 95 % point; the largest such value over the rows is ranked. Measured and
+    redrawn maxima set the units together, so that the rank is exact for any number of draws.
+    """
+    draws = maxima.shape[1]
+    measured = np.array([values.max() for values in statistics])
+    middle, upper = np.quantile(np.column_stack([measured, maxima]), [0.5, 0.95], axis=1)
+    unit = np.maximum(upper - middle, 1e-9)
+    largest = np.sort(((maxima - middle[:, None]) / unit[:, None]).max(axis=0))
+    p_values = []
+    for values, centre, step in zip(statistics, middle, unit, strict=True):
+        reached = draws - np.searchsorted(largest, (values - centre) / step, side="left")
+        p_values.append((reached + 1.0) / (draws + 1.0))
+    # What passes exceeds all but the share LEVEL of the nulls.
+    limit = largest[draws - max(int(np.floor(LEVEL * (draws + 1))), 1)]
+    return p_values, middle + limit * unit
 
 
 def _false_discovery(statistic: Array, counts: Array) -> Array:

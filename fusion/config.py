@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 import re
 import tomllib
 from collections.abc import Iterable
@@ -129,6 +128,7 @@ class PlanTable(_Table):
     size_mm: tuple[PositiveMillimetres, PositiveMillimetres] = Field(alias="size")
     cell_size_mm: PositiveMillimetres = Field(alias="cell_size")
     fiducials: str
+    regions: str | None = None
     axis: AxisTable
 
     @model_validator(mode="after")
@@ -162,9 +162,22 @@ class InterferometryTable(_Table):
 
 
 class DriversTable(_Table):
-    """``[drivers]``: anything else that was logged."""
+    """``[drivers]``: anything else that was logged, and which of it was switched on and off at random by a stated law."""
 
     file: str
+    randomised: tuple[str, ...] = ()
+    mean_dwell_s: PositiveSeconds | None = Field(default=None, alias="mean_dwell")
+    least_dwell_s: Seconds = Field(default=0.0, alias="least_dwell")
+
+    @model_validator(mode="after")
+    def _law_is_whole(self) -> DriversTable:
+        if bool(self.randomised) != (self.mean_dwell_s is not None):
+            text = "randomised and mean_dwell belong together: which columns were switched at random, and the mean time between"
+            raise PydanticCustomError("law", text)
+        if self.mean_dwell_s is not None and not 0.0 <= self.least_dwell_s < self.mean_dwell_s:
+            text = f"least_dwell {self.least_dwell_s:g} s must be shorter than mean_dwell {self.mean_dwell_s:g} s, and not negative"
+            raise PydanticCustomError("law", "{text}", {"text": text})
+        return self
 
 
 class RecordTable(_Table):
@@ -227,7 +240,7 @@ class Campaign(_Table):
         """Return the files that one table of the campaign names, keyed by their path relative to the campaign file."""
         names: list[str | None] = []
         if table == "plan" and self.plan is not None:
-            names = [self.plan.fiducials]
+            names = [self.plan.fiducials, self.plan.regions]
         elif table == "interferometry" and self.interferometry is not None:
             names = [self.interferometry.deviations, self.interferometry.environment]
         elif table == "drivers" and self.drivers is not None:
@@ -345,6 +358,7 @@ def _check_files(campaign: Campaign, place: Place) -> list[str]:
     named: list[tuple[tuple[str, ...], str | None]] = []
     if campaign.plan is not None:
         named.append((("plan", "fiducials"), campaign.plan.fiducials))
+        named.append((("plan", "regions"), campaign.plan.regions))
     if campaign.interferometry is not None:
         named.append((("interferometry", "deviations"), campaign.interferometry.deviations))
         named.append((("interferometry", "environment"), campaign.interferometry.environment))
@@ -381,22 +395,3 @@ def _check_effects(campaign: Campaign, known: tuple[str, ...], place: Place) -> 
     for name in sorted({name for name in campaign.model.declared if campaign.model.declared.count(name) > 1}):
         faults.append(f'{where}: model.declared names "{name}" more than once; name each effect once')
     return faults
-
-
-def match_columns(patterns: Iterable[str], headings: Iterable[str]) -> tuple[str, ...]:
-    """Return the headings that column names or patterns (``*`` for any text) select, in the order of the file.
-
-    Raises
-    ------
-    CampaignError
-        If a pattern selects nothing; the message lists the headings that there are.
-    """
-    headings = list(headings)
-    selected: set[str] = set()
-    for pattern in patterns:
-        escaped = pattern.replace("[", "[[]")
-        found = {heading for heading in headings if heading == pattern or fnmatch.fnmatchcase(heading, escaped)}
-        if not found:
-            raise CampaignError(f'no column is named "{pattern}"; the file has: {", ".join(headings)}')
-        selected |= found
-    return tuple(heading for heading in headings if heading in selected)

@@ -20,6 +20,8 @@ Mask = NDArray[np.bool_]
 
 #: Places of the two sessions count as the same within this distance: half the width of a heat source's halo.
 SAME_PLACE_MM = 50.0
+#: Quantities of a candidate, and what stands where there is none.
+_BLANK = {"statistic": -1.0, "p_value": 1.0, "sensitivity": 0.0, "sensitivity_u": np.inf, "lag": 0.0}
 #: Sensitivities disagree where they differ by more than this many standard uncertainties.
 _DISAGREEMENT = 3.0
 
@@ -35,7 +37,7 @@ class Common:
     Attributes
     ----------
     verdict : "attributable", "not attributable" or "not separable"
-    x_mm, y_mm : where the weaker of the two statistics is strongest
+    x_mm, y_mm : where the weaker of the two statistics is strongest, midway between both sessions' places
     p_value : the larger of both sessions' family-wise p there (a conjunction needs both)
     sensitivity_um_per_K : of both sessions
     reason : why, in words
@@ -83,14 +85,12 @@ def agree(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, list[Commo
     separable = any(one.attrs["excitation"] != "warm-up only" for one in (first, second))
     maps, verdicts, found = [], [], []
     for channel in channels:
-        sessions = [one.sel(channel=channel) for one in (first, second)]
-        places = [_strongest_nearby(one, reach) for one in sessions]
+        places = [_strongest_nearby(_candidates(one, channel), reach) for one in (first, second)]
         joint_p = np.maximum(places[0]["p_value"], places[1]["p_value"])
         verdict = np.where((joint_p <= LEVEL) & _consistent(*places), ATTRIBUTABLE, NOT_ATTRIBUTABLE)
         maps.append(joint_p)
         verdicts.append(verdict if separable else np.full_like(verdict, NOT_SEPARABLE))
-        limits = (float(sessions[0]["threshold"]), float(sessions[1]["threshold"]))
-        found.append(_conclude(channel, first, places, limits, separable))
+        found.append(_conclude(channel, places, separable))
     dims = ("channel", "y", "x")
     joined = xr.Dataset(
         {
@@ -106,43 +106,59 @@ def agree(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, list[Commo
     return joined, found
 
 
-def _strongest_nearby(session: xr.Dataset, reach: int) -> dict[str, Array]:
-    """Quantities of the strongest place within reach (cells) of every cell: p value, statistic, sensitivity, u, lag, each (y, x)."""
-    names = ("statistic", "p_value", "sensitivity", "sensitivity_u", "lag")
-    blank = (-1.0, 1.0, 0.0, np.inf, 0.0)
-    values = {name: np.nan_to_num(session[name].values, nan=none) for name, none in zip(names, blank, strict=True)}
+def _candidates(session: xr.Dataset, channel: str) -> dict[str, Array]:
+    """Strongest candidate at every place, (y, x) each: the cell itself, or the thermal mode that has its height there.
+
+    The statistic is divided by its threshold, so that cells and modes compare.
+    """
+    chosen = session.sel(channel=channel)
+    strongest = {name: np.nan_to_num(chosen[name].values, nan=none) for name, none in _BLANK.items()}
+    strongest["statistic"] = strongest["statistic"] / float(chosen["threshold"])
+    for mode in session["mode"].values if "modes_p_value" in session else ():
+        one = chosen.sel(mode=mode)
+        at = (int(np.argmin(np.abs(chosen["y"].values - float(one["modes_at_y"])))),
+              int(np.argmin(np.abs(chosen["x"].values - float(one["modes_at_x"])))))  # fmt: skip
+        ratio = float(one["modes_statistic"]) / float(one["modes_threshold"])
+        if ratio > strongest["statistic"][at]:
+            for name in _BLANK:
+                strongest[name][at] = ratio if name == "statistic" else float(one[f"modes_{name}"])
+    y, x = np.meshgrid(chosen["y"].values, chosen["x"].values, indexing="ij")
+    return strongest | {"x": x, "y": y}
+
+
+def _strongest_nearby(values: dict[str, Array], reach: int) -> dict[str, Array]:
+    """Quantities of the strongest place within reach (cells) of every cell, its own place included, (y, x) each."""
     rows, columns = values["statistic"].shape
-    padded = {name: np.pad(values[name], reach, constant_values=none) for name, none in zip(names, blank, strict=True)}
-    best = {name: field.copy() for name, field in values.items()}
+    padded = {name: np.pad(array, reach, constant_values=_BLANK.get(name, 0.0)) for name, array in values.items()}
+    best = {name: array.copy() for name, array in values.items()}
     for down in range(-reach, reach + 1):
         for right in range(-reach, reach + 1):
             if np.hypot(down, right) > reach:
                 continue
             part = (slice(reach + down, reach + down + rows), slice(reach + right, reach + right + columns))
             stronger = padded["statistic"][part] > best["statistic"]
-            for name in names:
-                best[name] = np.where(stronger, padded[name][part], best[name])
+            for name, array in padded.items():
+                best[name] = np.where(stronger, array[part], best[name])
     return best
 
 
 def _consistent(first: dict[str, Array], second: dict[str, Array]) -> Mask:
-    """Where both sessions' strongest places nearby have sensitivities of one sign that agree within their uncertainty, (y, x)."""
+    """Where both sessions' strongest places nearby are one place, with sensitivities of one sign that agree within u, (y, x)."""
     a, b = first["sensitivity"], second["sensitivity"]
     u = np.hypot(first["sensitivity_u"], second["sensitivity_u"])
-    return np.asarray((a * b > 0) & (np.abs(a - b) <= _DISAGREEMENT * u), bool)
+    apart = np.hypot(first["x"] - second["x"], first["y"] - second["y"])
+    return np.asarray((a * b > 0) & (np.abs(a - b) <= _DISAGREEMENT * u) & (apart <= SAME_PLACE_MM), bool)
 
 
 def _conclude(
     channel: str,
-    attribution: xr.Dataset,
     places: list[dict[str, Array]],
-    thresholds: tuple[float, float],
     separable: bool,
 ) -> Common:
     """Verdict on one channel from the strongest places (per session) near every cell."""
     joint_p = np.maximum(places[0]["p_value"], places[1]["p_value"])
     consistent = _consistent(*places)
-    weaker = np.minimum(*[one["statistic"] / limit for one, limit in zip(places, thresholds, strict=True)])
+    weaker = np.minimum(*[one["statistic"] for one in places])
     candidates = (joint_p <= LEVEL) & consistent
     row, column = np.unravel_index(int(np.where(candidates, weaker + 1e6, weaker).argmax()), weaker.shape)
     p_value = float(joint_p[row, column])
@@ -153,14 +169,15 @@ def _conclude(
         verdict, reason = "attributable", "both sessions find this place, with one sign and one size"
     elif p_value <= LEVEL:
         verdict = "not attributable"
-        reason = f"both sessions find this place, but with {sensitivity[0]:+.2f} and {sensitivity[1]:+.2f} um/K"
+        sizes = f"{sensitivity[0]:+.2f} and {sensitivity[1]:+.2f} um/K"
+        reason = f"both sessions find something near here, but not at one place with one size: {sizes}"
     else:
         verdict, reason = "not attributable", "no place is found by both sessions"
     return Common(
         channel=channel,
         verdict=verdict,
-        x_mm=float(attribution["x"][column]),
-        y_mm=float(attribution["y"][row]),
+        x_mm=float(np.mean([one["x"][row, column] for one in places])),
+        y_mm=float(np.mean([one["y"][row, column] for one in places])),
         p_value=p_value,
         sensitivity_um_per_K=sensitivity,
         lag_s=(float(places[0]["lag"][row, column]), float(places[1]["lag"][row, column])),

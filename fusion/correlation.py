@@ -1,9 +1,10 @@
 """L4 - Which part of the temperature field drives the drift, tested so that two warming series do not pass for cause and effect.
 
-Every plan cell is tested against the drift's channels (common, proportional to position, reversal; on request every target and
-direction): the cell's temperature goes through a bank of first-order lags, the drift that the field does not explain is a random or
-integrated random walk whose size is estimated anew under every hypothesis, and the statistic is the profile likelihood ratio. The
-family-wise p value compares it with the maximum over all cells, lags and channels in series redrawn from the fitted null.
+Plan cells, localised thermal modes and regions are tested against the drift's channels (common, proportional to position, reversal; on
+request every target and direction): each temperature goes through a bank of first-order lags, the drift that the field does not explain
+is a random or integrated random walk whose size is estimated anew under every hypothesis, and the statistic is the profile likelihood
+ratio. The family-wise p value compares it with the maxima over all cells, modes, regions, lags and channels in series redrawn from the
+fitted null: one error probability for everything that can become a finding.
 
 Two limits are built into the answer. A session that is one warm-up moves every series along one curve; it is tested beside free
 exponentials and its best verdict is "not separable"; where a warm-up only dominates, the rest must carry the evidence. And a map
@@ -21,14 +22,18 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from fusion.attribution import LAGS_S, LEVEL, Film, Tested, evaluate_film
-from fusion.channels import Array, ClockedReadings, DriftSeries, read_clock, reduce_channels, target_table
+from fusion.attribution import LAGS_S, LEVEL, Film, Findings, Tested, evaluate_films
+from fusion.channels import Array, DriftSeries, read_clock, reduce_channels, target_table
 from fusion.excitation import Excitation, describe_excitation
+from fusion.groups import joined
+from fusion.regions import Modes, Region, localise_modes, region_courses
 from fusion.screening import screen
 
 #: Verdict codes of the maps, in the order of the CF flag meanings.
 NOT_ATTRIBUTABLE, ATTRIBUTABLE, NOT_SEPARABLE = 0, 1, 2
 _FLAG_MEANINGS = "not_attributable attributable not_separable"
+#: Values (channels or series, columns) and attributes with units, by name.
+Quantities = dict[str, tuple[Array | NDArray[Any], dict[str, Any]]]
 #: Cells with gaps in up to this share of the frames are filled by interpolation in time; others are left out.
 _GAP_SHARE = 0.2
 
@@ -41,6 +46,7 @@ def correlate(
     fused_readings: xr.Dataset,
     field: xr.DataArray,
     *,
+    regions: Sequence[Region] = (),
     lags_s: Sequence[float] = LAGS_S,
     draws: int = 499,
     checks: int = 199,
@@ -48,7 +54,7 @@ def correlate(
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> xr.Dataset:
-    """Test every plan cell as a source of the drift.
+    """Test plan cells, thermal modes and regions as sources of the drift.
 
     Parameters
     ----------
@@ -56,6 +62,8 @@ def correlate(
         ``deviation`` (um) and ``time`` (UTC) with dims cycle, direction, target, and ``position`` (mm) per target.
     field : DataArray
         Temperature in degC or rise in K, dims time, y, x (mm), at least 12 frames; NaN where masked.
+    regions : sequence of Region
+        Parts of the plan whose mean temperature is tested as well, each with a name of its own.
     lags_s : sequence of float
         Time constants of the first-order response, s.
     draws : int
@@ -63,7 +71,7 @@ def correlate(
     checks : int
         Fresh nulls on which the rate of false alarms of this threshold is measured.
     per_target : bool
-        Also screen every target and direction by itself (``target_*`` maps along ``series``), whitening fixed under the null.
+        Also screen every target and direction by itself, with its own family-wise error and the whitening fixed under the null.
     seed : int
         Seed of the redrawn series.
     progress : callable, optional
@@ -74,13 +82,16 @@ def correlate(
     Dataset
         Maps over channel, y, x: ``statistic``, ``p_value`` (family-wise), ``q_value`` (false discovery), ``sensitivity`` and
         ``sensitivity_u`` (um/K), ``lag`` (s), ``detectable_sensitivity`` (um/K found with 80 % power), ``verdict``, and
-        ``naive_correlation`` for contrast only; per channel ``threshold``, ``noise`` (um), ``unexplained_drift`` (um over one hour),
-        ``drift_order``, ``verdict_channel``; scalars ``false_alarm_rate``, ``warm_up_share``; attribute ``verdict``.
+        ``naive_correlation`` for contrast only. The same over channel and mode as ``modes_*``, with ``modes_pattern`` (1 at the
+        strongest cell, at ``modes_at_x``, ``modes_at_y``); over channel and region as ``regions_*``. Per channel ``threshold``, ``noise``
+        (um), ``unexplained_drift`` (um over one hour), ``drift_order``; scalars ``false_alarm_rate`` (of everything tested),
+        ``cells_false_alarm_rate``, ``modes_false_alarm_rate``, ``regions_false_alarm_rate``, ``warm_up_share``; attribute
+        ``verdict``. With `per_target`, maps over series, y, x as ``targets_*`` and, over series and region, ``target_regions_*``.
 
     Raises
     ------
-    CorrelationError, ChannelError
-        if no cell is seen, or too few frames or cycles remain.
+    CorrelationError, ChannelError, RegionError
+        if no cell is seen, too few frames or cycles remain, or a region holds no seen cell.
     """
     if field.dims != ("time", "y", "x"):
         raise CorrelationError(f"field has dims {field.dims}; expected ('time', 'y', 'x')")
@@ -88,9 +99,12 @@ def correlate(
     film, seen = read_film(field, readings.frame_seconds)
     series = reduce_channels(readings)
     excitation = describe_excitation(film.seconds, film.values)
-    tested = evaluate_film(
+    modes = localise_modes(film.values)
+    courses = {"modes": modes.courses, "regions": region_courses(film.values, seen, field, regions)}
+    films = {"cells": film} | {name: Film(film.seconds, few) for name, few in courses.items() if few.shape[1]}
+    found = evaluate_films(
         series,
-        film,
+        films,
         excitation,
         lags_s=lags_s,
         draws=draws,
@@ -98,13 +112,28 @@ def correlate(
         rng=np.random.default_rng(seed),
         progress=progress,
     )
-    dataset = _lay_out(tested, series, film, seen, field, lags_s, excitation)
-    dataset.attrs["readings_outside_film"] = readings.outside_film
+    dataset = describe_session(found, excitation).assign_coords(y=field["y"], x=field["x"])
+    dataset = dataset.assign(
+        _over_cells("channel", describe(found.sets["cells"], series, film, lags_s, excitation), seen, field)
+    )
+    if "modes" in films:
+        quantities = describe(found.sets["modes"], series, films["modes"], lags_s, excitation)
+        dataset = joined(dataset, modes=_over_modes(quantities, modes, seen, field))
+    if "regions" in films:
+        quantities = describe(found.sets["regions"], series, films["regions"], lags_s, excitation)
+        dataset = joined(dataset, regions=_over_regions("channel", quantities, regions))
     if per_target:
-        dataset = xr.merge(
-            [dataset, _correlate_targets(readings, film, seen, field, excitation, lags_s, draws, seed)],
-            combine_attrs="override",
-        )
+        table = target_table(readings)
+        single = {
+            name: _screen_targets(table, one, excitation, lags_s, draws, seed + 1)
+            for name, one in films.items()
+            if name != "modes"
+        }
+        dataset = dataset.assign_coords(series=table[0])
+        dataset = joined(dataset, targets=xr.Dataset(_over_cells("series", single["cells"], seen, field)))
+        if "regions" in single:
+            dataset = joined(dataset, target_regions=_over_regions("series", single["regions"], regions))
+    dataset.attrs["readings_outside_film"] = readings.outside_film
     return dataset
 
 
@@ -124,10 +153,11 @@ def read_film(field: xr.DataArray, frame_seconds: Array) -> tuple[Film, NDArray[
     return Film(frame_seconds, values - values.mean(axis=0)), seen
 
 
-def _session_verdict(p_value: Array, excitation: Excitation) -> int:
+def _session_verdict(found: Findings, excitation: Excitation) -> int:
     if excitation.warm_up_only:
         return NOT_SEPARABLE
-    return ATTRIBUTABLE if (p_value <= LEVEL).any() else NOT_ATTRIBUTABLE
+    passed = any((tested.p_value <= LEVEL).any() for tested in found.sets.values())
+    return ATTRIBUTABLE if passed else NOT_ATTRIBUTABLE
 
 
 def _naive(series: DriftSeries, film: Film) -> Array:
@@ -141,7 +171,7 @@ def _naive(series: DriftSeries, film: Film) -> Array:
 
 def describe(
     tested: Tested, series: Sequence[DriftSeries], film: Film, lags_s: Sequence[float], excitation: Excitation
-) -> dict[str, tuple[Array, dict[str, Any]]]:
+) -> Quantities:
     """What the test found per channel and column, by name: values (channels, columns) and attributes with units."""
     verdict = np.where(tested.p_value <= LEVEL, ATTRIBUTABLE, NOT_ATTRIBUTABLE)
     if excitation.warm_up_only:
@@ -174,11 +204,12 @@ def describe(
     }
 
 
-def describe_session(tested: Tested, excitation: Excitation) -> xr.Dataset:
+def describe_session(found: Findings, excitation: Excitation) -> xr.Dataset:
     """What holds for the whole session: thresholds, noise and unexplained drift per channel, false alarms, verdict."""
-    nulls = list(tested.banks) + [tested.banks[0]] * (len(tested.names) - len(tested.banks))
+    cells = found.sets["cells"]
+    nulls = list(found.banks) + [found.banks[0]] * (len(cells.names) - len(found.banks))
     per_channel: dict[str, tuple[list[float], dict[str, Any]]] = {
-        "threshold": (tested.threshold.tolist(), {"units": "1", "long_name": "statistic at a family-wise p of 0.05"}),
+        "threshold": (cells.threshold.tolist(), {"units": "1", "long_name": "statistic at a family-wise p of 0.05"}),
         "noise": ([bank.sigma for bank in nulls], {"units": "um", "long_name": "noise of one value of the channel"}),
         "unexplained_drift": (
             [bank.drift_per_hour for bank in nulls],
@@ -189,85 +220,104 @@ def describe_session(tested: Tested, excitation: Excitation) -> xr.Dataset:
             {"units": "1", "long_name": "0 none, 1 random walk, 2 integrated random walk"},
         ),
     }
-    session = _session_verdict(tested.p_value, excitation)
+    rates = {"false_alarm_rate": found.false_alarm_rate} | {
+        f"{name}_false_alarm_rate": tested.false_alarm_rate for name, tested in found.sets.items()
+    }
+    session = _session_verdict(found, excitation)
+    others = {
+        f"{name}_threshold": (tested.threshold.tolist(), per_channel["threshold"][1])
+        for name, tested in found.sets.items()
+        if name != "cells"
+    }
     return xr.Dataset(
-        {name: (("channel",), values, attrs) for name, (values, attrs) in per_channel.items()}
+        {name: (("channel",), values, attrs) for name, (values, attrs) in (per_channel | others).items()}
         | {
-            "false_alarm_rate": (
-                (),
-                tested.false_alarm_rate,
-                {"units": "1", "long_name": "share of fresh nulls flagged"},
-            ),
+            name: ((), rate, {"units": "1", "long_name": "share of fresh nulls flagged"})
+            for name, rate in rates.items()
+        }
+        | {
             "warm_up_share": (
                 (),
                 excitation.warm_up_share,
                 {"units": "1", "long_name": "share of the field's course that one warm-up explains"},
             ),
         },
-        coords={"channel": list(tested.names)},
+        coords={"channel": list(cells.names)},
         attrs={
             "verdict": _FLAG_MEANINGS.split()[session].replace("_", " "),
             "excitation": excitation.name,
-            "draws": tested.null_maxima.shape[0],
+            "draws": found.draws,
         },
     )
 
 
-def _lay_out(
-    tested: Tested,
-    series: Sequence[DriftSeries],
+def _over_cells(
+    leading: str, quantities: Quantities, seen: NDArray[np.bool_], field: xr.DataArray
+) -> dict[str, xr.DataArray]:
+    """Quantities (leading, seen cells) as maps; cells that were not tested are NaN, flags there 0."""
+    maps = {}
+    for name, (values, attrs) in quantities.items():
+        flags = values.dtype.kind == "i"
+        whole = np.full((values.shape[0], seen.size), 0 if flags else np.nan, values.dtype)
+        whole[:, seen] = values if flags else np.where(np.isfinite(values), values, np.nan)
+        maps[name] = xr.DataArray(whole.reshape(-1, *field.shape[1:]), dims=(leading, "y", "x"), attrs=attrs)
+    return maps
+
+
+def _over_regions(leading: str, quantities: Quantities, regions: Sequence[Region]) -> xr.Dataset:
+    """Quantities (leading, regions), with the places of the regions."""
+    centre = np.array([region.centre_mm for region in regions]).reshape(-1, 2)
+    return (
+        _over_columns(leading, "region", quantities)
+        .assign(at_x=(("region",), centre[:, 0], {"units": "mm"}), at_y=(("region",), centre[:, 1], {"units": "mm"}))
+        .assign_coords(region=[region.name for region in regions])
+    )
+
+
+def _over_modes(quantities: Quantities, modes: Modes, seen: NDArray[np.bool_], field: xr.DataArray) -> xr.Dataset:
+    """Quantities (channel, modes), with the modes' patterns and their strongest cells."""
+    row, column = np.divmod(np.flatnonzero(seen)[modes.peaks], field.sizes["x"])
+    pattern = _over_cells("mode", {"pattern": (modes.patterns, {"units": "1"})}, seen, field)["pattern"]
+    return (
+        _over_columns("channel", "mode", quantities)
+        .assign(
+            pattern=pattern,
+            at_x=(("mode",), field["x"].values[column], {"units": "mm"}),
+            at_y=(("mode",), field["y"].values[row], {"units": "mm"}),
+        )
+        .assign_coords(mode=np.arange(1, modes.peaks.size + 1))
+    )
+
+
+def _over_columns(leading: str, trailing: str, quantities: Quantities) -> xr.Dataset:
+    return xr.Dataset(
+        {
+            name: (
+                (leading, trailing),
+                values if values.dtype.kind == "i" else np.where(np.isfinite(values), values, np.nan),
+                attrs,
+            )
+            for name, (values, attrs) in quantities.items()
+        }
+    )
+
+
+def _screen_targets(
+    table: tuple[list[str], Array, Array, Array],
     film: Film,
-    seen: NDArray[np.bool_],
-    field: xr.DataArray,
-    lags_s: Sequence[float],
-    excitation: Excitation,
-) -> xr.Dataset:
-    """The findings as maps; cells that were not tested are NaN, their verdict "not attributable"."""
-    dataset = describe_session(tested, excitation).assign_coords(y=field["y"], x=field["x"])
-    for name, (values, attrs) in describe(tested, series, film, lags_s, excitation).items():
-        blank = np.zeros if values.dtype.kind == "i" else _nans
-        whole = blank((values.shape[0], seen.size), dtype=values.dtype)
-        whole[:, seen] = values if values.dtype.kind == "i" else np.where(np.isfinite(values), values, np.nan)
-        dataset[name] = (("channel", "y", "x"), whole.reshape(-1, field.sizes["y"], field.sizes["x"]), attrs)
-    return dataset
-
-
-def _nans(shape: tuple[int, int], dtype: np.dtype[Any]) -> Array:
-    return np.full(shape, np.nan, dtype=dtype)
-
-
-def _correlate_targets(
-    readings: ClockedReadings,
-    film: Film,
-    seen: NDArray[np.bool_],
-    field: xr.DataArray,
     excitation: Excitation,
     lags_s: Sequence[float],
     draws: int,
     seed: int,
-) -> xr.Dataset:
-    """Maps of every target and direction by itself, family-wise over all of them, named ``target_*`` along ``series``."""
-    names, values, seconds, sampling = target_table(readings)
-    found = screen(
-        values,
-        seconds,
-        sampling,
-        film,
-        excitation,
-        lags_s=lags_s,
-        permutations=draws,
-        rng=np.random.default_rng(seed + 1),
-    )
-    maps = {
+) -> Quantities:
+    """Findings of every target and direction by itself, by name."""
+    _, values, seconds, sampling = table
+    rng = np.random.default_rng(seed)
+    found = screen(values, seconds, sampling, film, excitation, lags_s=lags_s, permutations=draws, rng=rng)
+    return {
         "statistic": (found.statistic, {"units": "1", "long_name": "likelihood ratio, whitening fixed under the null"}),
         "p_value": (found.p_value, {"units": "1", "long_name": "family-wise p value over all series"}),
         "sensitivity": (found.sensitivity, {"units": "um/K"}),
         "sensitivity_u": (found.sensitivity_u, {"units": "um/K"}),
         "lag": (np.asarray(lags_s, float)[found.lag_index], {"units": "s"}),
     }
-    dataset = xr.Dataset(coords={"series": names, "y": field["y"], "x": field["x"]})
-    for name, (columns, attrs) in maps.items():
-        whole = np.full((len(names), seen.size), np.nan)
-        whole[:, seen] = columns
-        dataset[f"target_{name}"] = (("series", "y", "x"), whole.reshape(-1, *field.shape[1:]), attrs)
-    return dataset

@@ -22,3 +22,13 @@ def group(dataset: xr.Dataset, name: str) -> xr.Dataset:
 def has(dataset: xr.Dataset, name: str) -> bool:
     """Tell whether a part is there."""
     return any(str(variable).startswith(f"{name}_") for variable in dataset.data_vars)
+
+
+def correlation_of(fusion: xr.Dataset) -> xr.Dataset:
+    """Return the correlation in fusion.nc as `fusion.correlation.correlate` gave it, attributes included."""
+    attrs = {
+        str(name).removeprefix("correlation_"): value
+        for name, value in fusion.attrs.items()
+        if str(name).startswith("correlation_")
+    }
+    return group(fusion, "correlation").assign_attrs(attrs)

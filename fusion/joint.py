@@ -8,11 +8,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import xarray as xr
-
 from fusion.conjunction import Common, agree
-from fusion.groups import group
-from fusion.plots_fusion import CHANNELS
+from fusion.groups import correlation_of
+from fusion.plots_correlation import CHANNELS
 from fusion.products import read_dataset, write_dataset, write_json, write_text
 from fusion.report import render_report
 from fusion.report_findings import readable
@@ -49,24 +47,14 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
         {"campaigns": [_title(folder) for folder in folders], "sources": [asdict(one) for one in found]},
     )
     rows = [(CHANNELS.get(one.channel, one.channel), in_words(one)) for one in found]
+    causes = [CHANNELS.get(one.channel, one.channel) for one in found if one.verdict == "attributable"]
     for at, folder in enumerate(folders):
-        joint = {"other": _title(folders[1 - at]), "rows": rows}
+        joint = {"other": _title(folders[1 - at]), "rows": rows, "causes": causes}
         write_text(
             folder / "report.html",
             render_report(_json(folder, "results"), _json(folder, "provenance"), datasets[at], joint=joint),
         )
     return rows
-
-
-def correlation_of(fusion: xr.Dataset) -> xr.Dataset:
-    """Return the correlation maps of fusion.nc as `fusion.correlation.correlate` gave them."""
-    maps = group(fusion, "correlation")
-    attrs = {
-        str(name).removeprefix("correlation_"): value
-        for name, value in fusion.attrs.items()
-        if str(name).startswith("correlation_")
-    }
-    return maps.assign_attrs(attrs)
 
 
 def in_words(found: Common) -> str:

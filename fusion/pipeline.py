@@ -12,7 +12,7 @@ from typing import Any
 
 import xarray as xr
 
-from fusion import stages, stages_thermal
+from fusion import stages, stages_correlation, stages_thermal
 from fusion.cf import annotate
 from fusion.config import Campaign, load_campaign
 from fusion.outcome import Outcome
@@ -157,7 +157,10 @@ def run_campaign(
     run.notices.extend(outside)
     joint = ("plan", "interferometry", "drivers")
     maps = run.stage(
-        "correlation", joint, ("fields", "deviations"), lambda: stages.correlate_field(fields, fused, report=report)
+        "correlation",
+        joint,
+        ("fields", "deviations"),
+        lambda: stages_correlation.correlate_field(source, fields, fused, report=report),
     )
     model = run.stage(
         "model",

@@ -1,4 +1,4 @@
-"""L5 - Charts of the joint estimate, the correlation and the closed loop."""
+"""L5 - Charts of the joint estimate and the closed loop."""
 
 from __future__ import annotations
 
@@ -13,14 +13,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BEFORE = "#9aa7ad"
-LEVEL = 0.05
-#: Parts of the drift as the correlation names them, in plain words.
-CHANNELS = {
-    "common": "drift common to all positions",
-    "proportional": "drift that grows with position",
-    "reversal": "drift of the reversal",
-    "joint": "common and growing drift together",
-}
 
 
 def plot_profile(drift: xr.Dataset, position: xr.DataArray, *, ax: Axes | None = None) -> Axes:
@@ -81,34 +73,6 @@ def plot_position_scatter(drift: xr.Dataset, flagged: set[int], *, ax: Axes | No
         )  # fmt: skip
     ax.set(xlabel="position", ylabel="scatter s / µm", ylim=(0, None))
     ax.legend()
-    return ax
-
-
-def plot_cells(maps: xr.Dataset, name: str, channel: str, *, label: str, ax: Axes | None = None) -> Axes:
-    """Draw a map over the plan cells of one channel; cells with a family-wise p up to 0.05 are outlined.
-
-    A sensitivity is shown in full colour, with its scale, in those cells; elsewhere it is mostly noise and pale.
-    """
-    ax = new_axes(ax, height=2.55)
-    chosen = maps.sel(channel=channel)
-    values, p = chosen[name].values, chosen["p_value"].fillna(1.0).values
-    x, y = chosen["x"].values, chosen["y"].values
-    half = float(np.median(np.diff(x))) / 2
-    extent = (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half)
-    found = p <= LEVEL
-    if name == "p_value":
-        colours: dict[str, Any] = {"cmap": "viridis_r", "vmin": 0.0, "vmax": 1.0}
-    else:
-        limit = float(np.nanmax(np.abs(values[found]))) if found.any() else float(np.nanpercentile(np.abs(values), 90))
-        colours = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
-    if found.any() and name != "p_value":
-        colours["alpha"] = np.where(found, 1.0, 0.25)
-    picture = ax.imshow(values, origin="lower", extent=extent, interpolation="nearest", **colours)
-    ax.figure.colorbar(picture, ax=ax, label=label, orientation="horizontal", aspect=40).outline.set_visible(False)
-    if found.any():
-        ax.contour(x, y, found.astype(float), levels=[0.5], colors=[INK], linewidths=1.2)
-    ax.set(xlabel="x / mm", ylabel="y / mm", title=CHANNELS.get(channel, channel))
-    ax.grid(visible=False)
     return ax
 
 

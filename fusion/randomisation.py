@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy import stats
 from threadpoolctl import threadpool_limits
 
 from fusion.attribution_kernel import NullBank, estimate_effects, likelihood_ratios, null_bank, whiten_series
@@ -24,6 +25,10 @@ RESPONSES_S = tuple((first, second) for second in (0.0, 1800.0) for first in (60
 #: Step of the schedule's time grid, s.
 GRID_S = 60.0
 LEVEL = 0.05
+#: A logged load within this share of the range from its lowest or highest value is at that level.
+_LEVEL_TOLERANCE = 0.05
+#: A number of switchings that the stated law makes more rarely than this was made by another one.
+_IMPOSSIBLE = 1e-4
 
 
 class RandomisationError(ValueError):
@@ -63,6 +68,72 @@ class DutyLaw:
         """One schedule, 0 or 1 at the given times (n,)."""
         first, switching = self.draw(float(seconds[-1] - seconds[0]) + GRID_S, rng)
         return (np.searchsorted(switching, seconds - seconds[0], side="right") + first) % 2.0
+
+
+def read_duty(drivers: xr.Dataset, names: Sequence[str], law: DutyLaw, *, source: str = "drivers") -> xr.DataArray:
+    """Return the switching states 0 and 1 (time, source) of logged columns, and refuse those that the law cannot have made.
+
+    Parameters
+    ----------
+    drivers : Dataset
+        Logged columns over time.
+    names : sequence of str
+        Columns that were switched at random.
+    law : DutyLaw
+        The law that they were drawn from, as it is stated.
+    source : str
+        Name of the file, for messages.
+
+    Raises
+    ------
+    RandomisationError
+        if a column is not there, takes other than two levels, was switched before the least dwell was over, or so often or so
+        seldom as the law makes it in less than one session in ten thousand.
+    """
+    unknown = [name for name in names if name not in drivers]
+    if unknown:
+        raise RandomisationError(
+            f"{source}: no column {', '.join(unknown)} for drivers.randomised; it has: {', '.join(map(str, drivers.data_vars))}"
+        )
+    log = drivers[list(names)].dropna("time")
+    seconds = (log["time"].values - log["time"].values[0]) / np.timedelta64(1, "s")
+    states = []
+    for name in names:
+        values = log[name].values.astype(float)
+        low, high = float(values.min()), float(values.max())
+        share = (values - low) / max(high - low, 1e-300)
+        if high > low and np.minimum(share, 1.0 - share).max() > _LEVEL_TOLERANCE:
+            raise RandomisationError(
+                f"{source}: {name} takes levels between {low:g} and {high:g}; the randomisation test is for loads that are switched "
+                "between two levels: take it out of drivers.randomised"
+            )
+        states.append(np.round(share))
+        _refuse_other_law(f"{source}: {name}", seconds, states[-1], law)
+    return xr.DataArray(
+        np.column_stack(states), dims=("time", "source"), coords={"time": log["time"], "source": list(names)}
+    )
+
+
+def _refuse_other_law(place: str, seconds: Array, states: Array, law: DutyLaw) -> None:
+    """Refuse a course (n,) of 0 and 1 that the law cannot have made, as far as its dwells and their number show."""
+    changes = seconds[np.flatnonzero(np.diff(states)) + 1]
+    # A change is known to one step of the log, and between two changes both may be late or early.
+    step = float(np.diff(seconds).max())
+    shortest = float(np.diff(changes).min(initial=np.inf))
+    if shortest < law.least_dwell_s - 2.0 * step:
+        raise RandomisationError(
+            f"{place} was switched again after {shortest:g} s, before the least dwell of {law.least_dwell_s:g} s; state the law that the "
+            "schedule was drawn from, or leave drivers.randomised out"
+        )
+    expected = seconds[-1] / law.mean_dwell_s
+    if (
+        changes.size
+        and min(stats.poisson.cdf(changes.size, expected), stats.poisson.sf(changes.size - 1, expected)) < _IMPOSSIBLE
+    ):
+        raise RandomisationError(
+            f"{place} was switched {changes.size} times in {seconds[-1] / 3600:.1f} h, where a mean dwell of {law.mean_dwell_s:g} s makes "
+            f"about {expected:.0f}; state the law that the schedule was drawn from, or leave drivers.randomised out"
+        )
 
 
 def duty_responses(seconds: Array, courses: Array) -> Array:

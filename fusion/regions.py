@@ -1,115 +1,147 @@
-"""L4 - Hotspots, regions and thermal modes as sources of the drift: fewer, quieter candidates than cells.
+"""L4 - Regions and thermal modes of the film: fewer, quieter candidates for a source of the drift than single cells.
 
 A region's temperature is the mean of its cells. Thermal modes are the film's leading spatial patterns, rotated until each lives in one
-place (varimax), so that a mode usually is one heat source with its halo; that finds weak sources where single cells do not.
+place (varimax), so that a mode usually is one heat source with its halo; that finds weak and lagged sources where single cells do not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import csv
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from skimage.measure import points_in_poly
 
-from fusion.attribution import LAGS_S, Film, evaluate_film
-from fusion.channels import Array, ClockedReadings, read_clock, reduce_channels
-from fusion.correlation import CorrelationError, describe, describe_session, read_film
-from fusion.excitation import describe_excitation, thermal_modes
+from fusion.channels import Array
+from fusion.excitation import thermal_modes
 
 #: Rotation stops when the varimax criterion grows by less than this share.
 _ROTATION_TOLERANCE = 1e-6
 _ROTATION_ROUNDS = 200
+#: Corners of a disc that is written as a polygon; its area is then within 0.3 % of the circle's.
+_DISC_CORNERS = 48
+_COLUMNS = ("name", "x_mm", "y_mm")
+
+
+class RegionError(ValueError):
+    """A region that cannot be used; the message names file or place and what to do."""
 
 
 @dataclass(frozen=True)
-class Disc:
-    """A round region on the plan, mm."""
+class Region:
+    """A part of the plan, by the corners (corners, 2) of its outline in mm."""
 
-    x_mm: float
-    y_mm: float
-    radius_mm: float
+    name: str
+    corners_mm: NDArray[np.float64]
+
+    def cells(self, plane: xr.DataArray) -> NDArray[np.bool_]:
+        """Which cells of a plane (..., y, x), flattened, have their centre inside."""
+        y, x = np.meshgrid(plane["y"].values, plane["x"].values, indexing="ij")
+        return np.asarray(points_in_poly(np.column_stack([x.ravel(), y.ravel()]), self.corners_mm), bool)
+
+    @property
+    def centre_mm(self) -> tuple[float, float]:
+        """Mean of the corners, x and y in mm."""
+        x, y = self.corners_mm.mean(axis=0)
+        return float(x), float(y)
 
 
-def correlate_regions(
-    fused_readings: xr.Dataset,
-    field: xr.DataArray,
-    regions: Mapping[str, Disc],
-    *,
-    lags_s: Sequence[float] = LAGS_S,
-    draws: int = 499,
-    seed: int = 0,
-) -> xr.Dataset:
-    """Test the mean temperature of named regions as sources of the drift.
+def disc(name: str, x_mm: float, y_mm: float, radius_mm: float) -> Region:
+    """Return a round region."""
+    angle = np.linspace(0.0, 2.0 * np.pi, _DISC_CORNERS, endpoint=False)
+    corners = np.column_stack([x_mm + radius_mm * np.cos(angle), y_mm + radius_mm * np.sin(angle)])
+    return Region(name, corners)
 
-    Parameters
-    ----------
-    fused_readings, field : as for :func:`fusion.correlation.correlate`
-    regions : mapping
-        Name to disc; for a hotspot its centroid and the radius of a disc of its area.
 
-    Returns
-    -------
-    Dataset
-        The quantities of :func:`fusion.correlation.correlate` over channel and region.
+def read_regions(path: str | Path) -> list[Region]:
+    """Read named regions: one line ``name,x_mm,y_mm`` per corner, the corners of a region in order along its outline.
 
     Raises
     ------
-    CorrelationError
+    RegionError
+        A column is missing, a coordinate is no number, or a region has fewer than three corners; with file, line and remedy.
+    """
+    path = Path(path)
+    corners: dict[str, list[tuple[float, float]]] = {}
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        reader = csv.DictReader(file)
+        header = [column.strip() for column in reader.fieldnames or []]
+        missing = [column for column in _COLUMNS if column not in header]
+        if missing:
+            raise RegionError(
+                f"{path}:1: no column {', '.join(missing)}; the first line must read {','.join(_COLUMNS)}"
+            )
+        reader.fieldnames = header
+        for row in reader:
+            try:
+                point = float(row["x_mm"]), float(row["y_mm"])
+            except (TypeError, ValueError):
+                point = np.nan, np.nan
+            if not np.isfinite(point).all() or not (row["name"] or "").strip():
+                raise RegionError(
+                    f"{path}:{reader.line_num}: {row['name']!r}, {row['x_mm']!r}, {row['y_mm']!r} is no corner; "
+                    "write a name and two numbers in mm"
+                )
+            corners.setdefault(row["name"].strip(), []).append(point)
+    for name, points in corners.items():
+        if len(points) < 3:
+            raise RegionError(f"{path}: region {name!r} has {len(points)} corners; an outline needs at least 3")
+    if not corners:
+        raise RegionError(f"{path}: lists no region; write one line per corner, or leave plan.regions out")
+    return [Region(name, np.array(points)) for name, points in corners.items()]
+
+
+def region_courses(values: Array, seen: NDArray[np.bool_], plane: xr.DataArray, regions: Sequence[Region]) -> Array:
+    """Mean temperatures (frames, regions) of regions from seen cells (frames, cells) of a plane.
+
+    Raises
+    ------
+    RegionError
         if a region holds no seen cell.
     """
-    readings = read_clock(fused_readings, field["time"].values.astype("datetime64[ns]"))
-    film, seen = read_film(field, readings.frame_seconds)
-    y, x = np.meshgrid(field["y"].values, field["x"].values, indexing="ij")
     columns = []
-    for name, disc in regions.items():
-        inside = (np.hypot(x - disc.x_mm, y - disc.y_mm) <= disc.radius_mm).ravel()[seen]
+    for region in regions:
+        inside = region.cells(plane)[seen]
         if not inside.any():
-            raise CorrelationError(
-                f"region {name!r} at x = {disc.x_mm:g} mm, y = {disc.y_mm:g} mm holds no seen cell; move it or make it larger"
+            x_mm, y_mm = region.centre_mm
+            raise RegionError(
+                f"region {region.name!r} around x = {x_mm:.0f} mm, y = {y_mm:.0f} mm holds no seen cell; move it or make it larger"
             )
-        columns.append(film.values[:, inside].mean(axis=1))
-    return _test(readings, film, np.column_stack(columns), list(regions), lags_s, draws, seed)
+        columns.append(values[:, inside].mean(axis=1))
+    return np.column_stack(columns) if columns else np.empty((values.shape[0], 0))
 
 
-def correlate_modes(
-    fused_readings: xr.Dataset,
-    field: xr.DataArray,
-    *,
-    lags_s: Sequence[float] = LAGS_S,
-    draws: int = 499,
-    limit: int = 6,
-    seed: int = 0,
-) -> xr.Dataset:
-    """Test the film's localised thermal modes as sources of the drift.
+@dataclass(frozen=True)
+class Modes:
+    """Localised thermal modes.
 
-    Returns
-    -------
-    Dataset
-        As :func:`correlate_regions` (regions "mode 1"..), with ``pattern`` (region, y, x; 1 at its strongest cell) and its place
-        ``peak_x``, ``peak_y`` (mm). Sensitivities count per K at the strongest cell.
+    Attributes
+    ----------
+    courses : (frames, modes) K at each mode's strongest cell
+    patterns : (modes, cells) share of that, 1 at the strongest cell
+    peaks : (modes,) index of the strongest cell
     """
-    readings = read_clock(fused_readings, field["time"].values.astype("datetime64[ns]"))
-    film, seen = read_film(field, readings.frame_seconds)
-    courses, patterns = thermal_modes(film.values, limit=limit)
+
+    courses: Array
+    patterns: Array
+    peaks: NDArray[np.int64]
+
+
+def localise_modes(values: Array, *, limit: int = 6) -> Modes:
+    """Find the localised modes of a film (frames, cells), centred over time; none where it stands still."""
+    courses, patterns = thermal_modes(values, limit=limit)
     if courses.shape[1] == 0:
-        raise CorrelationError("no thermal mode stands above the film's noise; the field did not change enough")
+        return Modes(courses, patterns, np.zeros(0, np.int64))
     rotation = varimax(patterns.T)
     courses, patterns = courses @ rotation, rotation.T @ patterns
-    place = np.abs(patterns).argmax(axis=1)
-    peak = np.take_along_axis(patterns, place[:, None], axis=1)
-    courses, patterns = courses * peak.T, patterns / peak
-    names = [f"mode {k + 1}" for k in range(courses.shape[1])]
-    dataset = _test(readings, film, courses, names, lags_s, draws, seed)
-    maps = np.full((len(names), seen.size), np.nan)
-    maps[:, seen] = patterns
-    cell = np.flatnonzero(seen)[place]
-    row, column = np.divmod(cell, field.sizes["x"])
-    dataset["pattern"] = (("region", "y", "x"), maps.reshape(len(names), *field.shape[1:]), {"units": "1"})
-    dataset["peak_x"] = (("region",), field["x"].values[column], {"units": "mm"})
-    dataset["peak_y"] = (("region",), field["y"].values[row], {"units": "mm"})
-    return dataset.assign_coords(y=field["y"], x=field["x"])
+    peaks = np.abs(patterns).argmax(axis=1)
+    height = np.take_along_axis(patterns, peaks[:, None], axis=1)
+    courses = courses * height.T
+    return Modes(courses - courses.mean(axis=0), patterns / height, peaks)
 
 
 def varimax(loadings: Array) -> NDArray[np.float64]:
@@ -126,23 +158,3 @@ def varimax(loadings: Array) -> NDArray[np.float64]:
             break
         criterion = float(size.sum())
     return rotation
-
-
-def _test(
-    readings: ClockedReadings,
-    film: Film,
-    columns: Array,
-    names: list[str],
-    lags_s: Sequence[float],
-    draws: int,
-    seed: int,
-) -> xr.Dataset:
-    series = reduce_channels(readings)
-    excitation = describe_excitation(film.seconds, film.values)
-    few = Film(film.seconds, columns - columns.mean(axis=0))
-    tested = evaluate_film(series, few, excitation, lags_s=lags_s, draws=draws, rng=np.random.default_rng(seed))
-    dataset = describe_session(tested, excitation).assign_coords(region=names)
-    for name, (values, attrs) in describe(tested, series, few, lags_s, excitation).items():
-        finite = values if values.dtype.kind == "i" else np.where(np.isfinite(values), values, np.nan)
-        dataset[name] = (("channel", "region"), finite, attrs)
-    return dataset

@@ -14,8 +14,10 @@ import jinja2
 import numpy as np
 import xarray as xr
 
-from fusion import plots, plots_fusion, plots_plan, report_text, wording
-from fusion.groups import group, has
+from fusion import plots, plots_correlation, plots_fusion, plots_plan, report_text, wording
+from fusion.groups import correlation_of, group, has
+from fusion.report_correlation import leading_region
+from fusion.verdict import find_source
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,13 +81,7 @@ def draw_figures(results: Mapping[str, Any], datasets: Mapping[str, xr.Dataset])
         charts |= _drift_charts(results, datasets["deviations"])
     fused = datasets.get("fusion")
     if fused is not None and has(fused, "correlation"):
-        maps = group(fused, "correlation")
-        smallest = maps["p_value"].min(["y", "x"]).fillna(1.0)
-        channel = str(maps["channel"].values[int(np.argmin(smallest.values))])
-        charts["sensitivity"] = lambda: plots_fusion.plot_cells(
-            maps, "sensitivity", channel, label="sensitivity / (µm/K)"
-        )
-        charts["significance"] = lambda: plots_fusion.plot_cells(maps, "p_value", channel, label="family-wise p")
+        charts |= _correlation_charts(fused)
     if fused is not None and has(fused, "loop") and "deviations" in datasets:
         loop, deviations = group(fused, "loop"), datasets["deviations"]
         charts["residual_time"] = lambda: plots_fusion.plot_residual_time(loop, deviations)
@@ -114,6 +110,23 @@ def _drift_charts(results: Mapping[str, Any], deviations: xr.Dataset) -> dict[st
         "reversal": lambda: plots_fusion.plot_reversal(drift, position),
         "anomalies": lambda: plots_fusion.plot_position_scatter(drift, flagged),
     }
+
+
+def _correlation_charts(fused: xr.Dataset) -> dict[str, Callable[[], Axes]]:
+    """The maps of the channel that leads, the modes, the clusters, and the leading region by target."""
+    maps = correlation_of(fused)
+    channel = find_source(maps).channel
+    charts: dict[str, Callable[[], Axes]] = {
+        "sensitivity": lambda: plots_correlation.plot_cells(maps, "sensitivity", channel, label="sensitivity / (µm/K)"),
+        "significance": lambda: plots_correlation.plot_cells(maps, "p_value", channel, label="family-wise p"),
+        "clusters": lambda: plots_correlation.plot_clusters(maps),
+    }
+    if has(maps, "modes"):
+        charts["modes"] = lambda: plots_correlation.plot_modes(maps, channel)
+    if has(maps, "target_regions"):
+        region = leading_region(maps)
+        charts["region_targets"] = lambda: plots_correlation.plot_region_targets(maps, region, fused["position"])
+    return charts
 
 
 def svg_text(draw: Callable[[], Axes], name: str) -> str:

@@ -1,4 +1,4 @@
-"""L5 - What the report says of correlation and model: verdicts in words, the table of all candidates, values as text."""
+"""L5 - What the report says of model and anomalies: the table of all candidates, evidence, values as text."""
 
 from __future__ import annotations
 
@@ -6,64 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from fusion import wording
-from fusion.groups import group, has
-from fusion.plots_fusion import CHANNELS
-from fusion.wording import duration, join, measured, number
-
-_CORRELATION = {
-    "attributable": "Parts of the field go with the drift more closely than chance and common warm-up allow.",
-    "not attributable": "No part of the field goes with the drift more closely than chance allows.",
-    "not separable": "These data cannot tell: the whole session is one warm-up, in which every temperature rises like every drift.",
-}
-
-
-def describe_correlation(fused: xr.Dataset) -> dict[str, Any] | None:
-    """Return what the correlation of drift and field found, in words; None where it was not tested."""
-    if not has(fused, "correlation"):
-        return None
-    maps = group(fused, "correlation")
-    rows = [
-        (CHANNELS.get(channel, channel).capitalize(), _channel(maps.sel(channel=channel)))
-        for channel in map(str, maps["channel"].values)
-    ]
-    rate = float(maps["false_alarm_rate"])
-    rows.append(("Chance of a false find", f"{rate:.2f}, measured on data simulated without any link"))
-    rows.append(("Excitation", str(fused.attrs.get("correlation_excitation", ""))))
-    clusters = group(maps, "clusters")
-    rows.append(
-        (
-            "Courses of temperature",
-            f"{int(clusters['cluster'].max())} groups of cells that warm alike; inside a group these data cannot tell places apart "
-            f"(condition of the thermal modes {number(float(clusters['condition']), 2)})",
-        )
-    )
-    verdict = str(fused.attrs.get("correlation_verdict", ""))
-    return {"headline": _CORRELATION.get(verdict, verdict), "rows": rows, "sensors": _sensors(group(maps, "sensors"))}
-
-
-def _sensors(sensors: xr.Dataset) -> list[list[str]]:
-    """Return one row per number of contact sensors: the place that is added, the drift left, the loss beside the camera."""
-    rows = []
-    for at in range(sensors.sizes["sensor"]):
-        one = sensors.isel(sensor=at)
-        place = f"x {float(one['x']):.0f} mm, y {float(one['y']):.0f} mm"
-        rows.append([str(at + 1), place, number(float(one["rms"]), 2), number(float(one["loss"]), 2)])
-    return rows
-
-
-def _channel(maps: xr.Dataset) -> str:
-    """Return the strongest cell of one channel, what would have been found, and the drift that nothing explains."""
-    flat = maps.stack(cell=("y", "x"))
-    best = flat.isel(cell=int(np.argmin(flat["p_value"].fillna(np.inf).values)))
-    return (
-        f"smallest p {wording.p_value(float(best['p_value']))} at x {float(best['x']):.0f} mm, y {float(best['y']):.0f} mm: "
-        f"{measured(float(best['sensitivity']), float(best['sensitivity_u']), 'µm/K')}, lag {duration(float(best['lag']))}; "
-        f"found with 80 % power from {number(float(best['detectable_sensitivity']), 2)} µm/K on; "
-        f"drift that nothing explains {number(float(maps['unexplained_drift']), 2)} µm in one hour"
-    )
+from fusion.wording import join, measured, number
 
 
 def describe_model(loop: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -80,7 +25,7 @@ def describe_model(loop: Mapping[str, Any]) -> list[tuple[str, str]]:
         left = loop["nuisance"]
         text = (
             f"{left['kind']}; rms {_small(left['common_rms_um'])} µm common to all positions, "
-            f"{_small(left['stretch_rms_um'])} µm of stretch at the far end"
+            f"{_small(left['stretch_rms_um'])} µm of stretch along the axis"
         )
         rows.append(("drift that nobody explains", text))
     if "rmse_persistence_um" in loop:

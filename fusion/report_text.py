@@ -11,9 +11,9 @@ import xarray as xr
 from fusion import wording
 from fusion.groups import group, has
 from fusion.plots import time_span
+from fusion.report_correlation import describe_correlation
 from fusion.report_findings import (
     describe_candidates,
-    describe_correlation,
     describe_model,
     evidence,
     parameters,
@@ -67,7 +67,7 @@ def describe(
     deviations, fields, fused = (datasets.get(name) for name in ("deviations", "fields", "fusion"))
     loop = results.get("loop")
     anomalies = results.get("anomalies", [])
-    correlation = describe_correlation(fused) if fused is not None else None
+    correlation = describe_correlation(fused, results, joint) if fused is not None else None
     present = {*results, *(["correlation"] if correlation else [])}
     return {
         "subtitle": _subtitle(provenance, deviations),
@@ -90,7 +90,6 @@ def describe(
         "anomaly_advice": [wording.CAUSES[item["cause"]][1] for item in anomalies],
         "evidence": [evidence(item["evidence"]) for item in anomalies],
         "correlation": correlation,
-        "camera_rms": float(fused["correlation_sensors_camera_rms"]) if correlation and fused is not None else None,
         "joint": joint,
         "model": describe_model(loop) if loop else [],
         "loop_numbers": wording.verdict_numbers(loop) if loop else "",

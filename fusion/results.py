@@ -8,6 +8,7 @@ from typing import Any
 
 SCHEMA_VERSION = 1
 CAUSES = ("structural", "local_temperature", "stick_slip", "step", "undetermined")
+ATTRIBUTIONS = ("attributable", "not attributable", "not separable")
 VERDICTS = ("complete", "explained", "partial", "unexplained")
 
 
@@ -34,7 +35,7 @@ class Notice:
 
 
 #: Parts of results.json that a run may add, besides schema, campaign and warnings.
-PARTS = ("registration", "alignment", "iso230", "neighbours", "drift", "anomalies", "hotspots", "loop")
+PARTS = ("registration", "alignment", "iso230", "neighbours", "drift", "anomalies", "hotspots", "correlation", "loop")
 
 
 def assemble(title: str, parts: Mapping[str, Any], warnings: Sequence[Notice]) -> dict[str, Any]:
@@ -112,6 +113,21 @@ def results_schema() -> dict[str, Any]:
                 p_value=number,
                 lag_s=number,
             )
+        ),
+        "correlation": _at_least(
+            verdict={"enum": list(ATTRIBUTIONS)},
+            excitation=text,
+            false_alarm_rate=number,
+            source=_map({}),
+            would_tell=text,
+            unexplained_drift_um_per_h=_map(number),
+            modes=_list(_at_least(name=text, x_mm=number, y_mm=number, parts=_map({}))),
+            regions=_list(_at_least(name=text, x_mm=number, y_mm=number, parts=_map({}))),
+            sensors=_map({}),
+            randomised_duty={
+                "type": ["array", "null"],
+                "items": _at_least(name=text, cause={"type": "boolean"}, p_value=number),
+            },
         ),
         "loop": _at_least(
             declared=_list(text),

@@ -1,8 +1,17 @@
 """L4 - Which few contact sensors, placed where, would do as well as the camera, and what each missing one costs in um.
 
-Sensors are chosen one by one among the plan cells: each new one lowers most what is left of the drift channels under the session's
-drift model (orthogonal least squares). What a set is worth is judged on later cycles than it was chosen and fitted on, against the
-camera's thermal modes fitted the same way; never by random folds, which reward series that merely wander alike.
+Camera (its thermal modes) and sensors (single cells with a contact sensor's noise) predict the drift channels by the same model: one
+lag, one prior for all sensitivities, and a drift of its own kind and size, all chosen by marginal likelihood. Everything, the places
+included, is chosen on three quarters of the cycles and predicts the quarter left out, a run of successive cycles; never random ones,
+which reward series that merely wander alike.
+
+What the sensors lose beside the camera is not taken from two held-out errors: both contain the drift that neither explains, whose
+chance fluctuation is larger than what is asked. It is taken from where the two predictions differ: with their difference delta and
+what the camera leaves of the readings, e, both from their mean within each run, the sensors' mean square error exceeds the camera's by::
+
+    mean(delta^2) + 2 mean(delta e)
+
+exactly, and its uncertainty is what the drift and noise in e do to the second term.
 """
 
 from __future__ import annotations
@@ -16,33 +25,73 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from fusion.attribution import LAGS_S
-from fusion.attribution_kernel import NullBank, null_bank
+from fusion.attribution_kernel import Grid, null_bank, whitening_grid
 from fusion.channels import Array, DriftSeries, lag_operators, read_clock, reduce_channels
 from fusion.correlation import read_film
 from fusion.excitation import thermal_modes
 
 #: The camera is represented by at most this many thermal modes.
 CAMERA_MODES = 6
-#: Share of the cycles that chooses and fits; the rest judges.
-TRAIN_SHARE = 0.7
+#: Runs of successive cycles that are left out in turn.
+FOLDS = 4
+#: Prior spread of what one member explains, in units of the noise of one value.
+_PRIORS = 3.0 ** np.arange(-1.0, 6.0)
+#: Log-likelihoods that differ by less than this cannot be told apart (chi-square, 1 degree of freedom, 0.95, halved).
+_ALIKE_NATS = 1.92
+#: An excess this many uncertainties above zero is decided.
+_DECIDED = 2.0
+
+
+@dataclass(frozen=True)
+class Excess:
+    """Mean square error of a prediction beyond the camera's, um^2, rms over all targets.
+
+    Attributes
+    ----------
+    value, u : with its standard uncertainty; negative values occur where the difference is within u
+    """
+
+    value: float
+    u: float
+
+    @property
+    def um(self) -> float:
+        """The loss in um: root of the excess, 0 where it is not positive."""
+        return float(np.sqrt(max(self.value, 0.0)))
+
+    @property
+    def at_most_um(self) -> float:
+        """Upper end of the loss in um (two uncertainties)."""
+        return float(np.sqrt(max(self.value, 0.0) + _DECIDED * self.u))
+
+    @property
+    def decided(self) -> bool:
+        """Whether the data show a loss at all."""
+        return self.value > _DECIDED * self.u
 
 
 @dataclass(frozen=True)
 class SensorSet:
-    """The best sensors of one size.
+    """The best sensors of one size, in the order of their worth, and what they miss beside the camera."""
+
+    places_mm: tuple[tuple[float, float], ...]
+    loss: Excess
+
+
+@dataclass(frozen=True)
+class SensorChoice:
+    """Contact sensors beside the camera.
 
     Attributes
     ----------
-    places_mm : x, y of every sensor, in the order of their worth
-    rms_um : held-out drift left at the worst target (common plus stretch)
-    camera_rms_um : the same with the camera
-    loss_um : what the sensors miss beside the camera, as a root of the difference of squares (0 where they do as well)
+    sets : for 1, 2, ... sensors; empty where the field stands still
+    without : what is missed without any temperature: the worth of the camera itself
+    run_s : length of a run of cycles within which the losses hold, s
     """
 
-    places_mm: tuple[tuple[float, float], ...]
-    rms_um: float
-    camera_rms_um: float
-    loss_um: float
+    sets: tuple[SensorSet, ...]
+    without: Excess
+    run_s: float
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
@@ -54,7 +103,7 @@ def choose_sensors(
     contact_noise_K: float = 0.02,
     lags_s: Sequence[float] = LAGS_S,
     seed: int = 0,
-) -> list[SensorSet]:
+) -> SensorChoice:
     """Choose 1..most contact sensors on the plan.
 
     Parameters
@@ -63,127 +112,173 @@ def choose_sensors(
     most : int
         Largest number of sensors.
     contact_noise_K : float
-        Noise of a contact sensor's value per cycle, added to the cells so that no set lives on differences that it could not see.
+        Noise of a contact sensor's value per frame, added to the cells so that no set lives on differences that it could not see.
     lags_s : sequence of float
-        Lags that each sensor and mode may take.
+        Lags between temperature and drift, one for all members of a prediction.
     seed : int
         Seed of that noise.
-
-    Returns
-    -------
-    list of SensorSet
-        For 1, 2, ... sensors.
     """
     readings = read_clock(fused_readings, field["time"].values.astype("datetime64[ns]"))
     film, seen = read_film(field, readings.frame_seconds)
     series = [one for one in reduce_channels(readings) if one.name != "reversal"]
-    operators = lag_operators(film.seconds, lags_s)
-    courses, _ = thermal_modes(film.values, limit=CAMERA_MODES)
+    modes, _ = thermal_modes(film.values, limit=CAMERA_MODES)
+    if modes.shape[1] == 0:
+        return SensorChoice((), Excess(0.0, 0.0), 0.0)
     # The camera sees its modes free of the single cells' noise; a contact sensor sees its cell with its own.
-    smooth = courses @ np.linalg.lstsq(courses, film.values, rcond=None)[0]
+    smooth = modes @ np.linalg.lstsq(modes, film.values, rcond=None)[0]
     contact = smooth + contact_noise_K * np.random.default_rng(seed).standard_normal(smooth.shape)
+    operators = lag_operators(film.seconds, lags_s)
+    # Mean square over the targets of a shift, and of a stretch that is 1 at the ends of travel.
+    weight = {"common": 1.0, "proportional": float((readings.design[:, 1] ** 2).mean())}
     tasks = [_Task.build(one, operators) for one in series]
-    camera = _held_out(tasks, courses, list(range(courses.shape[1])))
-    places = np.flatnonzero(seen)
-    chosen: list[int] = []
-    sets = []
-    for _ in range(min(most, contact.shape[1])):
-        chosen.append(_next_sensor(tasks, contact, chosen))
-        rms = _held_out(tasks, contact, chosen)
-        rows, columns = np.divmod(places[chosen], field.sizes["x"])
-        sets.append(
-            SensorSet(
-                tuple((float(field["x"][c]), float(field["y"][r])) for r, c in zip(rows, columns, strict=True)),
-                rms,
-                camera,
-                float(np.sqrt(max(rms**2 - camera**2, 0.0))),
-            )
+    most = min(most, contact.shape[1])
+    everything = [_Part(task, np.ones(task.series.values.size, bool)) for task in tasks]
+    chosen = _place(everything, [_fit(part, modes) for part in everything], contact, most)
+    rows, columns = np.divmod(np.flatnonzero(seen)[chosen], field.sizes["x"])
+    places = tuple((float(field["x"][c]), float(field["y"][r])) for r, c in zip(rows, columns, strict=True))
+    predictions = _predict_left_out(tasks, modes, contact, most)
+    excess = [
+        _total(
+            [
+                (_exceed(task, one[0], one[1 + k]), weight[task.series.name])
+                for task, one in zip(tasks, predictions, strict=True)
+            ]
         )
-    return sets
+        for k in range(most + 1)
+    ]
+    run_s = float(np.ptp(series[0].seconds)) / FOLDS
+    return SensorChoice(tuple(SensorSet(places[:k], excess[k]) for k in range(1, most + 1)), excess[0], run_s)
 
 
 @dataclass(frozen=True)
 class _Task:
-    """One channel: training rows, the whitening fitted on them, and how the channel sees the film under every lag."""
+    """One channel, and how it sees the film under every lag, (lags, n, frames)."""
 
     series: DriftSeries
-    train: NDArray[np.bool_]
-    bank: NullBank
     responses: Array
 
     @staticmethod
     def build(series: DriftSeries, operators: Sequence[Array]) -> _Task:
-        train = np.arange(series.values.size) < round(TRAIN_SHARE * series.values.size)
-        ones = np.ones((int(train.sum()), 1))
-        bank = null_bank(series.values[train], series.seconds[train], series.variance[train], ones)
-        return _Task(series, train, bank, np.stack([series.sampling @ operator for operator in operators]))
-
-    def white(self, columns: Array) -> tuple[Array, Array]:
-        """Whitened training response (n,) and columns (n, p)."""
-        project = self.bank.fitted.project
-        return project @ self.series.values[self.train], project @ columns[self.train]
-
-    def lagged(self, film: Array) -> Array:
-        """Film columns as the channel sees them, (n, columns, lags)."""
-        return np.asarray(np.tensordot(self.responses, film, axes=(2, 0)).transpose(1, 2, 0), float)
+        return _Task(series, np.stack([series.sampling @ operator for operator in operators]))
 
 
-def _columns(task: _Task, film: Array, members: Sequence[int]) -> Array:
-    """Each member at the lag that explains the training part best beside those before it, (n, members)."""
-    kept: list[Array] = []
-    for member in members:
-        candidates = task.lagged(film[:, [member]])[:, 0, :]
-        gains = []
-        for lag in range(candidates.shape[1]):
-            response, white = task.white(np.column_stack([*kept, candidates[:, lag]]))
-            rest = response - white @ np.linalg.lstsq(white, response, rcond=None)[0]
-            gains.append(float(rest @ rest))
-        kept.append(candidates[:, int(np.argmin(gains))])
-    return np.column_stack(kept)
+class _Part:
+    """The values of one channel that a prediction may be fitted to, whitened under every drift of the grid."""
+
+    def __init__(self, task: _Task, kept: NDArray[np.bool_]) -> None:
+        series = task.series
+        self.task, self.kept = task, kept
+        self.values = series.values[kept]
+        ones = np.ones((self.values.size, 1))
+        self.grid: Grid = whitening_grid(series.seconds[kept], series.variance[kept], ones)
+        self.projects = np.stack([point.project for point in self.grid.whitenings])
+        self.penalty = np.array([point.log_penalty for point in self.grid.whitenings])
+        self.white = self.projects @ self.values
+
+    def columns(self, film: Array) -> Array:
+        """Members (frames, members) as the kept values see them under every lag, (lags, n, members)."""
+        return np.asarray(self.task.responses[:, self.kept] @ film, float)
 
 
-def _next_sensor(tasks: Sequence[_Task], film: Array, chosen: Sequence[int]) -> int:
-    """The cell that lowers the sum of the channels' whitened residuals most beside the chosen ones."""
-    total = np.zeros(film.shape[1])
-    for task in tasks:
-        response, _ = task.white(task.series.values[:, None])
-        basis = np.zeros((response.size, 0))
-        if chosen:
-            basis, _ = np.linalg.qr(task.white(_columns(task, film, chosen))[1])
-        rest = response - basis @ (basis.T @ response)
-        project = task.bank.fitted.project
-        gain = np.zeros(film.shape[1])
-        for operator in task.responses:
-            white = project @ (operator[task.train] @ film)
-            free = white - basis @ (basis.T @ white)
-            size = np.sqrt((free**2).sum(axis=0))
-            useful = size > 1e-6 * np.sqrt((white**2).sum(axis=0)) + 1e-12
-            gain = np.maximum(gain, np.where(useful, (rest @ free / np.where(useful, size, 1.0)) ** 2, 0.0))
-        total += gain / max(float(rest @ rest), 1e-30)
-    total[list(chosen)] = -1.0
-    return int(total.argmax())
+@dataclass(frozen=True)
+class _Fit:
+    """The model of highest marginal likelihood: place in the drift grid, lag, and prior variance of a sensitivity over noise variance."""
+
+    drift: int
+    lag: int
+    prior: float
+    coefficients: Array
 
 
-def _held_out(tasks: Sequence[_Task], film: Array, members: Sequence[int]) -> float:
-    """Root mean square of common plus stretch that is left in the later cycles, each from its level at their start (um)."""
+def _fit(part: _Part, members: Array) -> _Fit:
+    """Fit sensitivities of members (frames, p) that share one lag and one prior."""
+    columns = part.columns(members)
+    size = float(np.sqrt((columns[0] ** 2).mean())) + 1e-30
+    freedom = part.grid.freedom
+    best, found = np.inf, _Fit(0, 0, 0.0, np.zeros(members.shape[1]))
+    for drift, (project, white) in enumerate(zip(part.projects, part.white, strict=True)):
+        moved = project @ columns
+        power, vectors = np.linalg.eigh(moved.transpose(0, 2, 1) @ moved)
+        power = np.maximum(power, 0.0)
+        along = np.einsum("lpk,lp->lk", vectors, np.einsum("lnp,n->lp", moved, white))
+        whole = float(white @ white)
+        for spread in _PRIORS:
+            prior = (spread / size) ** 2
+            shrunk = prior / (1.0 + prior * power)
+            rss = np.maximum(whole - (along**2 * shrunk).sum(axis=1), 1e-30)
+            score = np.log(rss) + (np.log1p(prior * power).sum(axis=1)) / freedom + part.penalty[drift]
+            lag = int(np.argmin(score))
+            if score[lag] < best:
+                best = float(score[lag])
+                found = _Fit(drift, lag, prior, vectors[lag] @ (shrunk[lag] * along[lag]))
+    return found
+
+
+def _place(parts: Sequence[_Part], fits: Sequence[_Fit], contact: Array, most: int) -> list[int]:
+    """Choose cells one by one: each raises the marginal likelihood of all channels most, under the drift and lag of the camera's fit."""
+    chosen: list[int] = []
+    swing = contact.std(axis=0)
     left = []
-    for task in tasks:
-        columns = _columns(task, film, members)
-        response, white = task.white(columns)
-        rest = task.series.values - columns @ _shrunk(task, response, white, columns)
-        # The level is known when the prediction starts; after that nothing is measured any more.
-        start = rest[task.train][-3:].mean()
-        left.append(rest[~task.train] - start)
-    return float(np.sqrt((sum(left) ** 2).mean()))
+    for part, fit in zip(parts, fits, strict=True):
+        project = part.projects[fit.drift]
+        left.append((project.T @ project, part.columns(contact)[fit.lag]))
+    for _ in range(most):
+        gain = np.zeros(contact.shape[1])
+        for part, fit, (inverse, columns) in zip(parts, fits, left, strict=True):
+            moved = inverse @ columns
+            informed = 1.0 + fit.prior * np.einsum("ij,ij->j", columns, moved)
+            whole = float(part.values @ inverse @ part.values)
+            share = fit.prior * (part.values @ moved) ** 2 / informed / whole
+            gain -= part.grid.freedom * np.log1p(-np.minimum(share, 1.0 - 1e-9)) + np.log(informed)
+        gain[chosen] = -np.inf
+        # Among cells that these data cannot tell apart the one that warms most shows the most beside its noise.
+        chosen.append(int(np.where(gain >= gain.max() - _ALIKE_NATS, swing, -1.0).argmax()))
+        for k, (fit, (inverse, columns)) in enumerate(zip(fits, left, strict=True)):
+            moved = inverse @ columns[:, chosen[-1]]
+            informed = 1.0 + fit.prior * float(columns[:, chosen[-1]] @ moved)
+            left[k] = (inverse - fit.prior * np.outer(moved, moved) / informed, columns)
+    return chosen
 
 
-def _shrunk(task: _Task, response: Array, white: Array, columns: Array) -> Array:
-    """Coefficients with a prior under which each member alone may explain the whole drift, but no more (ridge).
+def _predict_left_out(tasks: Sequence[_Task], modes: Array, contact: Array, most: int) -> list[Array]:
+    """Predictions per channel, (2 + most, n): the camera, nothing, and 1..most sensors; each run by what the others teach."""
+    predictions = [np.zeros((2 + most, task.series.values.size)) for task in tasks]
+    # Channels share their cycles, so that runs are the same stretch of the session in all of them.
+    for run in _runs(tasks[0].series.values.size):
+        parts = [_Part(task, ~np.isin(np.arange(task.series.values.size), run)) for task in tasks]
+        camera = [_fit(part, modes) for part in parts]
+        chosen = _place(parts, camera, contact, most)
+        for task, part, seen, out in zip(tasks, parts, camera, predictions, strict=True):
+            out[0, run] = (task.responses[seen.lag][run] @ modes) @ seen.coefficients
+            for k in range(1, most + 1):
+                few = contact[:, chosen[:k]]
+                fit = _fit(part, few)
+                out[1 + k, run] = (task.responses[fit.lag][run] @ few) @ fit.coefficients
+    return predictions
 
-    Without it, members that warm alike get large coefficients of opposite sign, which multiply the sensors' noise later on.
-    """
-    prior = task.series.values.std() / np.maximum(columns[task.train].std(axis=0), 1e-12)
-    noise = float(np.sqrt((response @ response) / task.bank.freedom))
-    augmented = np.vstack([white, np.diag(noise / prior)])
-    target = np.concatenate([response, np.zeros(prior.size)])
-    return np.asarray(np.linalg.lstsq(augmented, target, rcond=None)[0], float)
+
+def _exceed(task: _Task, camera: Array, other: Array) -> Excess:
+    """Mean square error of a prediction (n,) beyond the camera's within the runs, from where the two differ."""
+    series = task.series
+    left = series.values - camera
+    delta = _within_runs(camera - other)
+    rest = null_bank(left, series.seconds, series.variance, np.ones((left.size, 1)))
+    white = rest.fitted.project @ left
+    noise = float(np.sqrt(white @ white / rest.freedom))
+    value = float((delta**2).mean() + 2.0 * (delta * _within_runs(left)).mean())
+    return Excess(value, 2.0 * noise * float(np.sqrt(((delta @ rest.fitted.colour) ** 2).sum())) / delta.size)
+
+
+def _runs(values: int) -> list[NDArray[np.int64]]:
+    return np.array_split(np.arange(values), FOLDS)
+
+
+def _within_runs(series: Array) -> Array:
+    """A series (n,) from its mean within each run."""
+    return np.concatenate([series[run] - series[run].mean() for run in _runs(series.size)])
+
+
+def _total(parts: Sequence[tuple[Excess, float]]) -> Excess:
+    """Sum over channels with their weights."""
+    value = sum(weight * one.value for one, weight in parts)
+    return Excess(float(value), float(np.sqrt(sum((weight * one.u) ** 2 for one, weight in parts))))

@@ -15,8 +15,10 @@ from fusion.alignment import AxisGeometry, cycle_bounds
 from fusion.config import Campaign, InterferometryTable, PlanTable, ThermographyTable, relative_name
 from fusion.contracts import check
 from fusion.preflight import check_clocks
+from fusion.randomisation import DutyLaw, read_duty
+from fusion.regions import Region, read_regions
 from fusion.results import Notice
-from fusion.tables import read_drivers
+from fusion.tables import read_drivers, split_heading
 from interferometry.compensation import air_index, dead_path_error_um
 from interferometry.contract import DEVIATIONS
 from interferometry.readers import read_deviations, read_environment
@@ -43,6 +45,8 @@ class Source:
     fiducials: list[Fiducial]
     frames: list[FrameReference]
     frames_rejected: list[dict[str, Any]]
+    regions: list[Region] = field(default_factory=list)
+    duty: tuple[xr.DataArray, DutyLaw] | None = None
     notices: list[Notice] = field(default_factory=list)
 
     @property
@@ -98,9 +102,20 @@ def read_source(campaign: Campaign) -> Source:
     source = Source(
         campaign, thermography, plan, interferometry, deviations, environment, drivers,
         read_fiducials(campaign.resolve(plan.fiducials)), timed, listed,
+        [] if plan.regions is None else read_regions(campaign.resolve(plan.regions)), _randomised(campaign, drivers),
     )  # fmt: skip
     source.notices.extend([*_notices(source), *corrected])
     return source
+
+
+def _randomised(campaign: Campaign, drivers: xr.Dataset | None) -> tuple[xr.DataArray, DutyLaw] | None:
+    """The columns that were switched at random, and the law that they were drawn from; None where none was."""
+    table = campaign.drivers
+    if table is None or drivers is None or table.mean_dwell_s is None:
+        return None
+    law = DutyLaw(table.mean_dwell_s, table.least_dwell_s)
+    names = [split_heading(campaign.resolve(table.file), heading)[0] for heading in table.randomised]
+    return read_duty(drivers, names, law, source=table.file), law
 
 
 def correct_dead_path(

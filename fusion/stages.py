@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,9 +11,6 @@ import xarray as xr
 
 from fusion import cf
 from fusion.alignment import align
-from fusion.attribution import LEVEL
-from fusion.collinearity import cluster_cells, evidence_at
-from fusion.correlation import CorrelationError, correlate
 from fusion.diagnosis import Diagnosis, diagnose
 from fusion.effects import library
 from fusion.groups import joined
@@ -22,15 +19,12 @@ from fusion.model import ModelFit, fit_model
 from fusion.outcome import Outcome
 from fusion.progress import Report
 from fusion.readings import Readings, read_fused
-from fusion.regions import correlate_modes
 from fusion.results import Notice
-from fusion.sensors import SensorSet, choose_sensors
 from fusion.sources import Source, counted, listed
 from interferometry import iso230, neighbours
 from interferometry.anomalies import Anomaly, detect_anomalies
 from interferometry.drift import estimate_drift, flag_outliers
 from interferometry.flags import OUTLIER
-from thermography.hotspots import Hotspot, detect_hotspots
 
 #: What each stage is called in progress and provenance.
 LABELS = {
@@ -39,7 +33,6 @@ LABELS = {
     "correlation": "correlation",
     "model": "anomalies and closed loop",
 }
-_CORRELATION_CELL_MM = 10.0
 #: Largest family-wise p of an anomaly for which a cause is named.
 _CAUSE_LEVEL = 0.02
 
@@ -130,53 +123,6 @@ def align_recordings(source: Source, fields: xr.Dataset, deviations: xr.Dataset)
     """Give every reading the field, the environment and the drivers at its own time; note readings outside the frames' time."""
     fused = align(deviations, fields, source.axis, environment=source.environment, drivers=source.drivers)
     return fused, outside_notices(fused)
-
-
-def correlate_field(fields: xr.Dataset, fused: xr.Dataset, *, report: Report) -> Outcome:
-    """Test every part of the field as a source of the drift.
-
-    The cells are averaged to about a centimetre first: within one cycle heat spreads further than that in steel, so nothing is lost
-    but noise and time.
-    """
-    cell = float(np.median(np.diff(fields["x"])))
-    block = max(1, int(_CORRELATION_CELL_MM / cell))
-    film = fields["frame_temperature"].coarsen(x=block, y=block, boundary="trim").mean()
-    report("correlation", 0, 100)
-    maps = correlate(fused, film, progress=lambda part: report("correlation", round(100 * part), 100))
-    report("correlation", 100, 100)
-    report("sensor places", 0, 1)
-    places = sensor_variables(choose_sensors(fused, film))
-    maps = joined(maps, clusters=cluster_cells(film), sensors=places, modes=mode_findings(fused, film))
-    report("sensor places", 1, 1)
-    return Outcome(maps, {"hotspots": hotspot_part(fields, maps, fused)})
-
-
-def mode_findings(fused: xr.Dataset, film: xr.DataArray) -> xr.Dataset:
-    """Return the test of the localised thermal modes, which find lagged sources better than cells; empty for a still field."""
-    try:
-        return correlate_modes(fused, film)
-    except CorrelationError:
-        return xr.Dataset()
-
-
-def sensor_variables(sets: Sequence[SensorSet]) -> xr.Dataset:
-    """Return the best places of contact sensors and what each number of them costs beside the camera."""
-    places = np.array(sets[-1].places_mm).reshape(-1, 2)
-    um, mm = {"units": "um"}, {"units": "mm"}
-    return xr.Dataset(
-        {
-            "x": ("sensor", places[:, 0], mm),
-            "y": ("sensor", places[:, 1], mm),
-            "rms": (
-                "sensor",
-                [one.rms_um for one in sets],
-                {**um, "long_name": "held-out drift left with 1..n sensors"},
-            ),
-            "loss": ("sensor", [one.loss_um for one in sets], {**um, "long_name": "missed beside the camera"}),
-            "camera_rms": ((), sets[-1].camera_rms_um, um),
-        },
-        coords={"sensor": np.arange(1, len(sets) + 1)},
-    )
 
 
 def model_drift(source: Source, fused: xr.Dataset, deviations: xr.Dataset, *, report: Report) -> Outcome:
@@ -314,30 +260,3 @@ def centred(fit: ModelFit) -> np.ndarray:
     """Return the readings minus profile and effects, the unexplained drift left in, with mean zero, (n,)."""
     residual = fit.fit.residual()
     return residual - residual.mean()
-
-
-def hotspot_part(fields: xr.Dataset, maps: xr.Dataset, fused: xr.Dataset) -> list[dict[str, Any]]:
-    """Return the hotspots of the last cycle with what the correlation says of their place."""
-    return [_hotspot(spot, maps, fused) for spot in detect_hotspots(fields["temperature_rise"].isel(cycle=-1))]
-
-
-def driven_targets(maps: xr.Dataset, fused: xr.Dataset, evidence: Mapping[str, float | str]) -> list[int]:
-    """Return the targets that a place drives: none unless the session tells, all for a shift, those away from zero for a stretch."""
-    if maps.attrs["verdict"] != "attributable" or float(evidence["p_value"]) > LEVEL:
-        return []
-    away = (
-        fused["position"].values != 0 if evidence["channel"] == "proportional" else np.ones(fused.sizes["target"], bool)
-    )
-    return fused["target"].values[away].astype(int).tolist()
-
-
-def _hotspot(spot: Hotspot, maps: xr.Dataset, fused: xr.Dataset) -> dict[str, Any]:
-    evidence = evidence_at(maps, spot.x_mm, spot.y_mm)
-    return {
-        "x_mm": spot.x_mm,
-        "y_mm": spot.y_mm,
-        "peak_rise_K": spot.peak_rise_K,
-        "targets": driven_targets(maps, fused, evidence),
-        "p_value": evidence["p_value"],
-        "lag_s": evidence["lag_s"],
-    }

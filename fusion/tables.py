@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import json
 import re
 from collections.abc import Callable, Iterable
@@ -12,7 +13,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from fusion.config import Campaign, CampaignError, RecordTable, match_columns
+from fusion.config import Campaign, CampaignError, RecordTable
 from fusion.quantities import QuantityError, conversion, unit_name
 from interferometry.delimited import BadReading, Rejected, join_zones, parse_time, read_table, refuse_hopeless
 
@@ -37,6 +38,25 @@ def split_heading(path: Path, heading: str) -> tuple[str, str]:
             f'{path}: the column "{heading}" has no unit; write it in the heading, for example "{heading} [1]" for a pure number'
         )
     return match.group(1), unit_name(match.group(2))
+
+
+def match_columns(patterns: Iterable[str], headings: Iterable[str]) -> tuple[str, ...]:
+    """Return the headings that column names or patterns (``*`` for any text) select, in the order of the file.
+
+    Raises
+    ------
+    CampaignError
+        If a pattern selects nothing; the message lists the headings that there are.
+    """
+    headings = list(headings)
+    selected: set[str] = set()
+    for pattern in patterns:
+        escaped = pattern.replace("[", "[[]")
+        found = {heading for heading in headings if heading == pattern or fnmatch.fnmatchcase(heading, escaped)}
+        if not found:
+            raise CampaignError(f'no column is named "{pattern}"; the file has: {", ".join(headings)}')
+        selected |= found
+    return tuple(heading for heading in headings if heading in selected)
 
 
 def read_drivers(path: Path) -> xr.Dataset:

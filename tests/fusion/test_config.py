@@ -1,13 +1,13 @@
 """The campaign file: every promise kept for good input, one exact message per kind of bad input."""
 
-
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
 
-from fusion.config import Campaign, CampaignError, load_campaign, match_columns
+from fusion.config import Campaign, CampaignError, load_campaign
+from fusion.tables import match_columns
 
 TEXT = """\
 [campaign]

@@ -1,14 +1,15 @@
-"""Regions, modes, evidence and clusters of films of known truth."""
+"""Regions, modes, the session's answer and clusters of films of known truth."""
 
 import numpy as np
 import pytest
 
-from fusion.collinearity import carry_evidence, cluster_cells, evidence_at
-from fusion.correlation import CorrelationError, correlate
-from fusion.regions import Disc, correlate_modes, correlate_regions, varimax
+from fusion.collinearity import cluster_cells
+from fusion.correlation import correlate
+from fusion.regions import RegionError, disc, localise_modes, read_regions, varimax
+from fusion.verdict import find_source, would_tell
 from tests.fusion import film_simulator as simulator
 
-SOURCES = {f"source {k}": Disc(10 * c + 5, 10 * r + 5, 30) for k, (r, c) in enumerate(simulator.SOURCES)}
+SOURCES = [disc(f"source {k}", 10 * c + 5, 10 * r + 5, 30) for k, (r, c) in enumerate(simulator.SOURCES)]
 
 
 @pytest.fixture(scope="module")
@@ -16,35 +17,76 @@ def driven():
     return simulator.driven_session(np.random.default_rng(4), source=1)
 
 
-def test_the_region_that_drives_the_axis_is_named_with_its_sensitivity(driven):
-    found = correlate_regions(driven.fused, driven.field, SOURCES, draws=99)
-    common = found.sel(channel="common")
-    assert float(common["p_value"].sel(region="source 1")) == pytest.approx(0.01)
-    assert int(np.argmax(common["statistic"].values)) == 1
+@pytest.fixture(scope="module")
+def maps(driven):
+    return correlate(driven.fused, driven.field[:, ::2, ::2], regions=SOURCES, draws=99, checks=20, per_target=True)
+
+
+def test_the_region_that_drives_the_axis_is_named_with_its_sensitivity(maps):
+    common = maps.sel(channel="common", region="source 1")
+    assert float(common["regions_p_value"]) <= 0.05
+    ratio = maps["regions_statistic"].sel(channel="common").values
+    assert int(np.argmax(ratio)) == 1
     # 3 um per 3 K at the centre; the disc of 3 cells radius in a halo of 5 cells sees 0.84 of that rise.
-    sensitivity = float(common["sensitivity"].sel(region="source 1"))
-    assert sensitivity == pytest.approx(1 / 0.84, abs=4 * float(common["sensitivity_u"].sel(region="source 1")))
+    u = float(common["regions_sensitivity_u"])
+    assert float(common["regions_sensitivity"]) == pytest.approx(1 / 0.84, abs=4 * u)
+    assert float(common["regions_at_x"]) == pytest.approx(125.0)
 
 
-def test_modes_separate_sources_and_name_the_right_one(driven):
-    found = correlate_modes(driven.fused, driven.field, draws=99)
-    joint = found.sel(channel="joint")
-    strongest = joint.isel(region=int(np.argmax(joint["statistic"].values)))
-    place = float(strongest["peak_y"]) / 10 - 0.5, float(strongest["peak_x"]) / 10 - 0.5
-    assert simulator.distance_cells(*place, 1) <= 5
-    assert float(strongest["p_value"]) <= 0.05
-    assert float(np.nanmax(strongest["pattern"])) == pytest.approx(1.0)
+def test_every_target_is_tested_against_every_region(maps):
+    p = maps["target_regions_p_value"].sel(region="source 1")
+    assert p.sizes == {"series": 32}
+    # Common and stretch add up at the far end and cancel at target 1, which then does not move with the source.
+    assert float(p.sel(series="positive 16")) <= 0.05
+    assert float(p.sel(series="positive 1")) > 0.05
+
+
+def test_the_answer_comes_from_the_mode_of_the_right_source(maps):
+    found = find_source(maps)
+    assert (found.verdict, found.kind) == ("attributable", "mode")
+    assert simulator.distance_cells(found.y_mm / 10 - 0.5, found.x_mm / 10 - 0.5, 1) <= 5
+    assert found.others_mm == ()
+    assert 20.0 < found.width_mm < 120.0
+    assert float(np.nanmax(maps["modes_pattern"])) == pytest.approx(1.0)
+    assert "A second session that finds the same place" in would_tell(maps, found)
+
+
+def test_without_a_finding_the_answer_says_what_would_tell(rng):
+    made = simulator.null_session("rw", rng)
+    maps = correlate(made.fused, made.field[:, ::4, ::4], draws=99, checks=1)
+    found = find_source(maps)
+    assert found.verdict == "not attributable" and found.p_value > 0.05
+    text = would_tell(maps, found)
+    assert f"From {found.detectable_um_per_K:.2g} um/K on" in text
+    assert f'--noise "{float(maps["noise"].sel(channel="common")):.2g} um"' in text
+
+
+def test_places_that_warm_alike_are_named_as_equal(rng):
+    """Two halos of one switched source: nothing can tell which of them drives the axis."""
+    course = simulator.source_responses("duty", rng)[1][:, 1]
+    row, column = np.mgrid[: simulator.ROWS, : simulator.COLUMNS]
+    halos = sum(np.exp(-((row - r) ** 2 + (column - c) ** 2) / 50.0) for r, c in simulator.SOURCES[1:])
+    film = 3.0 * np.multiply.outer(course, halos) + 0.03 * rng.standard_normal((simulator.CYCLES, *row.shape))
+    made = simulator.session(film, 3 * course, 3 * course, rng)
+    found = find_source(correlate(made.fused, made.field[:, ::2, ::2], draws=99, checks=1))
+    assert found.verdict == "attributable"
+    places = [(found.x_mm, found.y_mm), *found.others_mm]
+    for r, c in simulator.SOURCES[1:]:
+        assert min(np.hypot(x - (10 * c + 5), y - (10 * r + 5)) for x, y in places) <= 50.0
 
 
 def test_a_region_outside_the_plan_is_refused(driven):
-    with pytest.raises(CorrelationError, match=r"region 'far' at x = 5000 mm, y = 0 mm holds no seen cell"):
-        correlate_regions(driven.fused, driven.field, {"far": Disc(5000, 0, 20)})
+    with pytest.raises(RegionError, match=r"region 'far' around x = 5000 mm, y = -?0 mm holds no seen cell"):
+        correlate(driven.fused, driven.field, regions=[disc("far", 5000, 0, 20)])
 
 
 def test_a_still_field_has_no_modes(driven, rng):
-    still = driven.field.copy(data=20.0 + 0.03 * rng.standard_normal(driven.field.shape))
-    with pytest.raises(CorrelationError, match="no thermal mode stands above the film's noise"):
-        correlate_modes(driven.fused, still)
+    still = 0.03 * rng.standard_normal((100, 60))
+    assert localise_modes(still - still.mean(axis=0)).courses.shape == (100, 0)
+    field = driven.field[:, ::4, ::4].copy(data=20.0 + 0.03 * rng.standard_normal((100, 6, 8)))
+    maps = correlate(driven.fused, field, draws=39, checks=1)
+    assert "modes_p_value" not in maps
+    assert find_source(maps).kind == "cell"
 
 
 def test_varimax_undoes_a_rotation_of_localised_patterns(rng):
@@ -57,14 +99,31 @@ def test_varimax_undoes_a_rotation_of_localised_patterns(rng):
     assert np.sort(back, axis=1)[:, :2].max() < 1e-2
 
 
-def test_evidence_names_place_size_and_what_cannot_be_told_apart(driven):
-    maps = correlate(driven.fused, driven.field[:, ::2, ::2], draws=99, checks=1)
-    found = carry_evidence(maps)
-    assert found.p_value <= 0.05
-    assert found.area_mm2 >= 400.0
-    assert "um/K at x = " in found.sentence()
-    near = evidence_at(maps, found.x_mm + 3, found.y_mm - 3)
-    assert near["p_value"] == pytest.approx(0.01)
+def test_regions_are_read_by_their_corners(tmp_path, driven):
+    path = tmp_path / "regions.csv"
+    path.write_text("name,x_mm,y_mm\nmotor,0,0\nmotor,100,0\nmotor,100,50\nmotor,0,50\n")
+    (motor,) = read_regions(path)
+    # 10 x 5 cells of 10 mm have their centre inside.
+    assert motor.name == "motor" and motor.cells(driven.field).sum() == 50
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name,x_mm\na,1\n", r"regions.csv:1: no column y_mm; the first line must read name,x_mm,y_mm"),
+        (
+            "name,x_mm,y_mm\na,1,left\n",
+            r"regions.csv:2: 'a', '1', 'left' is no corner; write a name and two numbers in mm",
+        ),
+        ("name,x_mm,y_mm\na,1,1\na,2,2\n", r"region 'a' has 2 corners; an outline needs at least 3"),
+        ("name,x_mm,y_mm\n", r"lists no region; write one line per corner, or leave plan.regions out"),
+    ],
+)
+def test_bad_regions_are_refused(tmp_path, text, message):
+    path = tmp_path / "regions.csv"
+    path.write_text(text)
+    with pytest.raises(RegionError, match=message):
+        read_regions(path)
 
 
 def test_two_places_on_one_heat_source_form_one_cluster(rng):
