@@ -1,0 +1,238 @@
+"""L3 - A record of sensors and channels, reduced to blocks of time on which its displacements are modelled.
+
+A record holds thousands of samples in which a machine hardly moves. They are averaged over blocks that are short beside any thermal
+time constant; drivers are averaged after they are raised to a power, because heat follows a power of the speed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from fusion.readings import Readings, Series
+from interferometry.statespace import Array
+
+#: Blocks that a record is averaged to at most: more cost time and hold no more of what is slow.
+MOST_BLOCKS = 600
+#: Blocks below which nothing can be held out.
+LEAST_BLOCKS = 40
+#: Powers of a driver in the heat it makes: friction of a torque that is constant and of one that grows with the speed.
+EXPONENTS = (1, 2)
+#: A load cycle starts where a driver leaves its rest; rest is this share of its range above its minimum.
+_REST_SHARE = 0.02
+#: A driver is switched where it changes by this share of its range from one block to the next.
+_SWITCHED = 0.05
+#: Shortest and most chained blocks that a record is cut into.
+_MOST_CHAINED = 8
+_LEAST_CHAINED = 4
+
+
+class RecordError(ValueError):
+    """A record that cannot be modelled; the message says what is missing and what to do."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """A record on its blocks.
+
+    Attributes
+    ----------
+    start : time of the first sample, UTC
+    seconds : (blocks,) middle of each block, s since the first sample
+    block_s : length of a block, s
+    displacement : (blocks, channels) mean, um; NaN where a block holds no sample
+    temperature : (blocks, sensors) mean, degC, gaps interpolated
+    temperature_noise : (sensors,) standard uncertainty of a block mean from the scatter of the samples, K
+    drivers : driver to its powers, exponent to (blocks,) values as a share of the driver's largest size
+    channels, sensors, driver_units : names, and units by driver
+    duplicates : sensors left out because they are a linear combination of the others
+    chained : (blocks,) number of the chronological block of each row for forward chaining, from 0
+    gaps : values that were interpolated, by column
+    """
+
+    start: np.datetime64
+    seconds: Array
+    block_s: float
+    displacement: Array
+    temperature: Array
+    temperature_noise: Array
+    drivers: Mapping[str, Mapping[int, Array]]
+    channels: tuple[str, ...]
+    sensors: tuple[str, ...]
+    driver_units: Mapping[str, str]
+    duplicates: tuple[str, ...]
+    chained: NDArray[np.int64]
+    gaps: Mapping[str, int]
+
+    @property
+    def rise(self) -> Array:
+        """Temperatures minus their first block, K (blocks, sensors)."""
+        return self.temperature - self.temperature[0]
+
+    def switched(self) -> NDArray[np.bool_]:
+        """Blocks within three blocks of a switching of any driver (blocks,): what happens there may be its consequence."""
+        near = np.zeros(self.seconds.size, bool)
+        for powers in self.drivers.values():
+            change = np.abs(np.diff(powers[1], prepend=powers[1][0])) > _SWITCHED * np.ptp(powers[1])
+            near |= np.convolve(change, np.ones(7), "same") > 0
+        return near
+
+    def view(self) -> Readings:
+        """The record as readings of one place, so that effects that only need time, series and drivers work on it."""
+        one = np.ones(self.seconds.size)
+        series = {"mean_rise": Series(self.seconds, self.rise.mean(axis=1), "K")}
+        series |= {
+            f"temperature {name}": Series(self.seconds, self.rise[:, k], "K") for k, name in enumerate(self.sensors)
+        }
+        series |= {name: Series(self.seconds, powers[1], "1") for name, powers in self.drivers.items()}
+        return Readings(
+            seconds=self.seconds,
+            response=np.nanmean(self.displacement, axis=1),
+            cycle=np.arange(1, self.seconds.size + 1),
+            target=one.astype(np.int64),
+            position_mm=one,
+            sign=one,
+            targets=np.array([1]),
+            positions_mm=np.array([1.0]),
+            series=series,
+            drivers=tuple(self.drivers),
+            left_out={},
+        )
+
+
+def reduce_record(table: xr.Dataset) -> Record:
+    """Average a record over blocks.
+
+    Parameters
+    ----------
+    table : Dataset
+        As :func:`fusion.tables.read_record` returns it.
+
+    Raises
+    ------
+    RecordError
+        if it is too short, or a channel or a sensor holds too few values.
+    """
+    time = table["time"].values.astype("datetime64[ns]")
+    elapsed = (time - time[0]) / np.timedelta64(1, "s")
+    if np.unique(elapsed).size < LEAST_BLOCKS:
+        raise RecordError(
+            f"{table.attrs.get('source', 'record')}: {np.unique(elapsed).size} samples are too few to hold a part out; "
+            f"a record needs at least {LEAST_BLOCKS}"
+        )
+    step = float(np.median(np.diff(np.unique(elapsed))))
+    block = step * max(1, int(np.ceil((elapsed[-1] + step) / step / MOST_BLOCKS)))
+    place = (elapsed // block).astype(int)
+    count = int(place[-1]) + 1
+
+    def mean(values: Array) -> Array:
+        known = np.isfinite(values)
+        total = np.bincount(place[known], values[known], minlength=count)
+        number = np.bincount(place[known], minlength=count)
+        return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+    seconds = (np.arange(count) + 0.5) * block
+    gaps: dict[str, int] = {}
+
+    def filled(name: str, values: Array) -> Array:
+        column = mean(values)
+        known = np.isfinite(column)
+        if known.sum() < 0.5 * count:
+            raise RecordError(
+                f'{table.attrs.get("source", "record")}: column "{name}" has values in {known.sum()} of {count} blocks of '
+                f"{block:g} s; leave it out of [record]"
+            )
+        if not known.all():
+            gaps[name] = int((~known).sum())
+        return np.asarray(np.interp(seconds, seconds[known], column[known]))
+
+    channels = tuple(str(name) for name in table["channel"].values)
+    displacement = np.column_stack([mean(table["displacement"].values[:, k]) for k in range(len(channels))])
+    for k, name in enumerate(channels):
+        if np.isfinite(displacement[:, k]).sum() < LEAST_BLOCKS:
+            raise RecordError(
+                f'{table.attrs.get("source", "record")}: channel "{name}" holds too few values; leave it out of [record]'
+            )
+    sensors = [str(name) for name in table["sensor"].values]
+    temperature = np.column_stack([filled(name, table["temperature"].values[:, k]) for k, name in enumerate(sensors)])
+    kept = independent(temperature)
+    drivers, units = _drivers(table, filled)
+    return Record(
+        start=time[0],
+        seconds=seconds,
+        block_s=block,
+        displacement=displacement,
+        temperature=temperature[:, kept],
+        temperature_noise=np.array([_noise(table["temperature"].values[:, k]) for k in kept])
+        / np.sqrt(max(1.0, block / step)),
+        drivers=drivers,
+        channels=channels,
+        sensors=tuple(sensors[k] for k in kept),
+        driver_units=units,
+        duplicates=tuple(name for k, name in enumerate(sensors) if k not in kept),
+        chained=chained_blocks(seconds, [powers[1] for powers in drivers.values()]),
+        gaps=gaps,
+    )
+
+
+def _noise(samples: Array) -> float:
+    """Noise of single samples from their second differences, in which whatever is slow cancels."""
+    second = np.diff(samples[np.isfinite(samples)], 2)
+    return float(1.4826 * np.median(np.abs(second - np.median(second))) / np.sqrt(6.0))
+
+
+def _drivers(
+    table: xr.Dataset, filled: Callable[[str, Array], Array]
+) -> tuple[dict[str, dict[int, Array]], dict[str, str]]:
+    """Powers of every driver as shares of its largest size; one that never changes is left out."""
+    drivers: dict[str, dict[int, Array]] = {}
+    units: dict[str, str] = {}
+    for k, name in enumerate(str(one) for one in table["driver_name"].values):
+        values = table["driver"].values[:, k]
+        largest = float(np.nanmax(np.abs(values), initial=0.0))
+        if largest == 0.0 or np.nanmin(values) == np.nanmax(values):
+            continue
+        drivers[name] = {exponent: filled(name, (values / largest) ** exponent) for exponent in EXPONENTS}
+        units[name] = str(table["driver_units"].values[k])
+    return drivers, units
+
+
+def independent(columns: Array, *, tolerance: float = 1e-8) -> list[int]:
+    """Columns, in their order, of which more than a share of the variance is not a linear combination of those before."""
+    kept: list[int] = []
+    centred = columns - columns.mean(axis=0)
+    basis = np.empty((columns.shape[0], 0))
+    for k in range(columns.shape[1]):
+        own = float(centred[:, k] @ centred[:, k])
+        left = centred[:, k] - basis @ (basis.T @ centred[:, k])
+        left -= basis @ (basis.T @ left)
+        rest = float(left @ left)
+        if own > 0.0 and rest > tolerance * own:
+            kept.append(k)
+            basis = np.column_stack([basis, left / np.sqrt(rest)])
+    return kept
+
+
+def chained_blocks(seconds: Array, drivers: list[Array]) -> NDArray[np.int64]:
+    """Number of the chronological block of each row: load cycles where a driver starts from rest often enough, else equal parts.
+
+    A block begins where a driver leaves its rest, so that a model is always asked to predict a whole load cycle.
+    """
+    least = (seconds[-1] - seconds[0]) / _MOST_CHAINED
+    starts: list[float] = []
+    for values in drivers:
+        rest = values <= values.min() + _REST_SHARE * np.ptp(values)
+        starts += list(seconds[1:][rest[:-1] & ~rest[1:]])
+    bounds: list[float] = []
+    for start in sorted(starts):
+        # The first block may hold what was logged before the first load.
+        early = start - seconds[0] < least
+        if not early and (not bounds or start - bounds[-1] >= least) and seconds[-1] - start >= 0.5 * least:
+            bounds.append(start)
+    if len(bounds) + 1 < _LEAST_CHAINED:
+        bounds = list(np.linspace(seconds[0], seconds[-1], _MOST_CHAINED + 1)[1:-1])
+    return np.searchsorted(np.array(bounds), seconds, side="right").astype(np.int64)

@@ -1,0 +1,219 @@
+"""L4 - The library of effects for a record: the same physics as along an axis, every channel with coefficients of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fusion.effects import LIBRARY, Effect, library
+from fusion.episodes import jumps
+from fusion.members import LAGS_MIN, Member, periods_min
+from fusion.readings import Series
+from fusion.record import EXPONENTS, Record
+
+#: What a record is modelled with where nothing else is declared: every displacement a linear function of the temperatures.
+QUASI_STATIC = "quasi_static"
+#: A load acts at once (bearings widen with the speed), warms the part beside it, then what that part is joined to: states a factor of
+#: four apart in their time constants.
+_CHAIN = (0.0, 0.25, 1.0, 4.0)
+#: Time constants of the middle part, min.
+_SOURCE_MIN = (5.0, 10.0, 20.0, 40.0, 80.0)
+#: Response times of a sensor, min.
+_RESPONSES_MIN = (2.5, 5.0, 10.0)
+#: An event needs this share of the record on either side to be told from a drift.
+_EVENT_MARGIN = 0.05
+#: Instants at which an event is tried.
+_EVENT_INSTANTS = 200
+#: A sensor's jump belongs to the sensor alone where it exceeds that of the others' mean so many times.
+_OWN_JUMP = 5.0
+#: Fewer periods than this are no rhythm: any slow drift looks like them.
+_LEAST_PERIODS = 6.0
+
+_ALONG_AN_AXIS = "a record has no positions"
+
+
+@dataclass(frozen=True)
+class RecordEffect:
+    """A named effect in a record.
+
+    Attributes
+    ----------
+    name, physics, source : as in the library of :mod:`fusion.effects`
+    members : from the record (and a member near which to look closer) to columns (blocks, q) that every channel follows with its
+        own coefficients
+    needs : why it cannot be tried with this record, or None
+    """
+
+    name: str
+    physics: str
+    source: str
+    members: Callable[[Record, Member | None], Iterator[Member]]
+    needs: Callable[[Record], str | None]
+
+
+def quasi_static_columns(record: Record) -> Member:
+    """Rise of every sensor, K: the declared model of a record."""
+    return Member(record.rise, {}, ("um/K",) * len(record.sensors))
+
+
+def thermal_lag_members(record: Record, near: Member | None) -> Iterator[Member]:
+    """Lagged copies of one sensor, or of the mean of all."""
+    block_min = record.block_s / 60.0
+    named = {name: record.rise[:, k] for k, name in enumerate(record.sensors)}
+    named["mean of all"] = record.rise.mean(axis=1)
+    for name, rise in named.items():
+        if near is not None and near.parameters["sensor"] != name:
+            continue
+        for minutes in _around(near, LAGS_MIN):
+            if minutes >= 2.0 * block_min:
+                lagged = Series(record.seconds, rise, "K").lagged(60.0 * minutes).values
+                yield Member(lagged[:, None], {"sensor": name, "time_constant_min": minutes}, ("um/K",))
+
+
+def sensor_lag_members(record: Record, near: Member | None) -> Iterator[Member]:
+    """What sensors of a common response time have not shown yet: the temperatures minus their own delayed copies."""
+    for minutes in _around(near, _RESPONSES_MIN):
+        late = Series(record.seconds, record.rise, "K").lagged(60.0 * minutes).values
+        yield Member(record.rise - late, {"time_constant_min": minutes}, ("um/K",) * len(record.sensors))
+
+
+def unseen_heat_source_members(record: Record, near: Member | None) -> Iterator[Member]:
+    """States of a chain of parts that a driver heats, in proportion to the driver and to its square."""
+    for name, powers in record.drivers.items():
+        if near is not None and near.parameters["follows"] != name:
+            continue
+        for minutes in _around(near, _SOURCE_MIN):
+            states = [
+                Series(record.seconds, powers[exponent], "1").lagged(60.0 * minutes * share).values
+                for share in _CHAIN
+                for exponent in EXPONENTS
+            ]
+            parameters: dict[str, float | str] = {
+                "follows": name,
+                "time_constant_min": minutes,
+                "chain": "at once, " + ", ".join(f"{minutes * share:.3g} min" for share in _CHAIN[1:]),
+            }
+            yield Member(np.column_stack(states), parameters, ("um",) * len(states))
+
+
+def step_event_members(record: Record, near: Member | None) -> Iterator[Member]:
+    """A level shift at one instant, in every channel by its own amount."""
+    first, last = record.seconds[0], record.seconds[-1]
+    margin = _EVENT_MARGIN * (last - first)
+    if near is None or near.event_s is None:
+        every = max(1, record.seconds.size // _EVENT_INSTANTS)
+        instants = record.seconds[::every]
+    else:
+        instants = record.seconds[np.abs(record.seconds - near.event_s) <= 0.01 * (last - first)]
+    for instant in instants:
+        if first + margin <= instant <= last - margin:
+            late = (record.seconds >= instant).astype(float)
+            yield Member(late[:, None], {"time_s": float(instant)}, ("um",), float(instant))
+
+
+def periodic_disturbance_members(record: Record, near: Member | None) -> Iterator[Member]:
+    """Waves in time."""
+    shortest = 4.0 * record.block_s / 60.0
+    if near is None:
+        periods = periods_min(record.view())
+    else:
+        span = float(record.seconds[-1] - record.seconds[0]) / 60.0
+        periods = 1.0 / (1.0 / float(near.parameters["period_min"]) + np.linspace(-0.5, 0.5, 21) / span)
+    longest = float(record.seconds[-1] - record.seconds[0]) / 60.0 / _LEAST_PERIODS
+    for period in periods[(periods >= shortest) & (periods <= longest)]:
+        phase = 2 * np.pi * record.seconds / (60.0 * period)
+        yield Member(np.column_stack([np.cos(phase), np.sin(phase)]), {"period_min": float(period)}, ("um", "um"))
+
+
+def sensor_faults(record: Record) -> list[tuple[int, float, float]]:
+    """Sensors that jump alone: place, time in s and size in K.
+
+    A jump that the other sensors share is no fault, nor is one at which a driver was switched.
+    """
+    found = []
+    switched = record.switched()
+    for k in range(len(record.sensors)):
+        others = np.delete(record.rise, k, axis=1)
+        common = others.mean(axis=1) if others.shape[1] else np.zeros(record.seconds.size)
+        for before, after, size in jumps(Series(record.seconds, record.rise[:, k], "K")):
+            at = np.searchsorted(record.seconds, (before, after))
+            alone = abs(size) > _OWN_JUMP * abs(common[at[1]] - common[at[0]])
+            if alone and not switched[at[0] : at[1] + 1].any():
+                found.append((k, after, size))
+    return found
+
+
+def sensor_fault_members(record: Record, near: Member | None) -> Iterator[Member]:
+    """What the jump of a sensor does to the prediction: a step, since the displacement does not follow it."""
+    for k, instant, size in sensor_faults(record):
+        if near is None or near.event_s == instant:
+            late = (record.seconds >= instant).astype(float)
+            parameters: dict[str, float | str] = {"sensor": record.sensors[k], "time_s": instant, "jump_K": size}
+            yield Member(late[:, None], parameters, ("um",), instant)
+
+
+def _around(near: Member | None, grid: tuple[float, ...]) -> tuple[float, ...]:
+    if near is None:
+        return grid
+    found = float(near.parameters["time_constant_min"])
+    return tuple(float(found * factor) for factor in np.geomspace(0.6, 1.6, 7))
+
+
+_MEMBERS = {
+    "sensor_lag": sensor_lag_members,
+    "thermal_lag": thermal_lag_members,
+    "unseen_heat_source": unseen_heat_source_members,
+    "step_event": step_event_members,
+    "periodic_disturbance": periodic_disturbance_members,
+    "sensor_fault": sensor_fault_members,
+}
+
+
+def _needs(name: str) -> Callable[[Record], str | None]:
+    """Why an effect of the library cannot be tried with a record."""
+
+    def needs(record: Record) -> str | None:
+        if name == "unseen_heat_source" and not record.drivers:
+            return "nothing that drives a heat source was logged; name speed, load or duty as record.drivers"
+        if name == "sensor_fault" and not sensor_faults(record):
+            return "no sensor jumps alone"
+        return None
+
+    return needs
+
+
+SENSOR_LAG = RecordEffect(
+    "sensor_lag",
+    "Sensors on a surface or in a pocket show the temperature of what moves only after their own response time: the displacement leads them.",
+    "first-order response of a contact sensor",
+    sensor_lag_members,
+    lambda record: None,
+)
+
+
+def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[str, RecordEffect], dict[str, str]]:
+    """Effects that can act in a record by name, and why the others of the library are not tried.
+
+    A user's own effect takes part as it is, with the record laid out as readings of one place.
+    """
+    built_in = {effect.name for effect in LIBRARY}
+    found, not_tried = {}, {}
+    found["sensor_lag"] = SENSOR_LAG
+    for name, effect in (library() if effects is None else effects).items():
+        if name in _MEMBERS:
+            found[name] = RecordEffect(name, effect.physics, effect.source, _MEMBERS[name], _needs(name))
+        elif name in built_in:
+            not_tried[name] = _ALONG_AN_AXIS
+        else:
+            found[name] = RecordEffect(name, effect.physics, effect.source, _as_it_is(effect), _own_needs(effect))
+    return found, not_tried
+
+
+def _as_it_is(effect: Effect) -> Callable[[Record, Member | None], Iterator[Member]]:
+    return lambda record, near: effect.members(record.view(), {}, near)
+
+
+def _own_needs(effect: Effect) -> Callable[[Record], str | None]:
+    return lambda record: effect.needs(record.view())

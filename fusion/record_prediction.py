@@ -1,0 +1,89 @@
+"""L4 - Predicting hours ahead: coefficients shrunk together, how strongly decided by forward chaining inside the training part.
+
+Nothing is learnt from the predicted part: no level, no drift, no re-zeroing. Ridge regression on standardised columns (Hoerl and
+Kennard 1970); its penalty is the one that predicts best when each chronological block of the training part is predicted from those
+before it. One penalty serves all channels, which keeps few blocks from deciding too much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.record import Record
+from interferometry.statespace import Array
+
+#: Shares of a column's variance that are added to it: from ordinary least squares to hardly any coefficient at all.
+PENALTIES = 10.0 ** np.arange(-5.0, 1.6, 0.5)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A prediction of all blocks of a record from some of them.
+
+    Attributes
+    ----------
+    predicted : (blocks, channels) um
+    coefficients : (p, channels) of the columns, um per unit of each
+    centre : (p,) values of the columns at which the prediction is the channel's mean
+    penalty : the shrinkage that forward chaining chose
+    chained_rmse : error of the forward-chained training blocks under it, mean over channels, um; NaN with fewer than two blocks
+    """
+
+    predicted: Array
+    coefficients: Array
+    centre: Array
+    penalty: float
+    chained_rmse: float
+
+
+def predict(record: Record, columns: Array, train: NDArray[np.bool_]) -> Prediction:
+    """Predict every block of a record from the training blocks alone.
+
+    Parameters
+    ----------
+    record : the record
+    columns : (blocks, p) of the model, known for all blocks
+    train : (blocks,) those whose displacements may be used
+    """
+    numbers = np.unique(record.chained[train])
+    errors = np.full((numbers.size, PENALTIES.size), np.nan)
+    for place, number in enumerate(numbers[1:], start=1):
+        before, next_one = train & (record.chained < number), train & (record.chained == number)
+        for k, (predicted, _, _) in enumerate(_paths(record, columns, before)):
+            errors[place, k] = rmse(record, predicted, next_one)
+    mean = errors[1:].mean(axis=0) if numbers.size > 1 else np.full(PENALTIES.size, np.nan)
+    best = int(np.argmin(mean)) if numbers.size > 1 else PENALTIES.size // 2
+    return Prediction(*_paths(record, columns, train)[best], float(PENALTIES[best]), float(mean[best]))
+
+
+def rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> float:
+    """Root mean square error over some blocks, mean over the channels, um."""
+    return float(np.mean(channel_rmse(record, predicted, where)))
+
+
+def channel_rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> Array:
+    """Root mean square error of every channel over some blocks, um (channels,)."""
+    missed = (record.displacement - predicted)[where]
+    return np.asarray(np.sqrt(np.nanmean(missed**2, axis=0)))
+
+
+def _paths(record: Record, columns: Array, train: NDArray[np.bool_]) -> list[tuple[Array, Array, Array]]:
+    """Predictions (blocks, channels), coefficients (p, channels) and centre (p,) under every penalty."""
+    centre, scale = columns[train].mean(axis=0), columns[train].std(axis=0)
+    scale = np.where(scale > 0.0, scale, np.inf)
+    standard = (columns - centre) / scale
+    coefficients = np.zeros((PENALTIES.size, columns.shape[1], len(record.channels)))
+    levels = np.zeros((PENALTIES.size, len(record.channels)))
+    for channel in range(len(record.channels)):
+        here = train & np.isfinite(record.displacement[:, channel])
+        x, y = standard[here], record.displacement[here, channel]
+        # A channel that misses blocks has its mean where the columns of the others have theirs.
+        offset, middle = x.mean(axis=0), float(y.mean())
+        values, vectors = np.linalg.eigh((x - offset).T @ (x - offset) / here.sum())
+        projected = vectors.T @ ((x - offset).T @ (y - middle) / here.sum())
+        coefficients[:, :, channel] = (projected / (np.maximum(values, 0.0) + PENALTIES[:, None])) @ vectors.T
+        levels[:, channel] = middle - coefficients[:, :, channel] @ offset
+    return [(standard @ one + levels[k], one / scale[:, None], centre) for k, one in enumerate(coefficients)]

@@ -1,0 +1,106 @@
+"""L4 - What a model of a record leaves: tests of its structure, and a description of it in words.
+
+Two things can be left. A shape in the innovations of the fit: where only drift and noise act they are exchangeable in time, so that
+permuting them gives every statistic its null. And a drift that the fit lets wander freely and that no test of the innovations can see:
+it counts where the model, asked for the sealed part, leaves more than a tenth of the displacements' variance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fusion.adequacy import LEVEL
+from fusion.record_model import RecordFit
+from interferometry.statespace import Array
+
+_PERMUTATIONS = 400
+#: Largest share of the displacements' variance that may be left without being called unexplained.
+_VARIANCE_SHARE = 0.1
+_LAGS = 12
+_CLIP = 4.0
+
+
+@dataclass(frozen=True)
+class RecordRemainder:
+    """What a model of a record leaves.
+
+    Attributes
+    ----------
+    p_value : chance of so much structure where only drift and noise act, over all statistics
+    p_values : the same for each statistic alone
+    shape : in words, empty where nothing is left
+    rms_um : error on the sealed part that the shape stands for, mean over channels; 0 where nothing is left
+    variance_share : share of the displacements' variance that the model leaves in the sealed part
+    """
+
+    p_value: float
+    p_values: dict[str, float]
+    shape: str
+    rms_um: float
+    variance_share: float
+
+
+def examine(model: RecordFit, sealed_rmse: Array, rng: np.random.Generator) -> RecordRemainder:
+    """Test what is left.
+
+    Parameters
+    ----------
+    model : fitted to all blocks
+    sealed_rmse : (channels,) error of the final model on the sealed part, um
+    rng : for the permutations
+    """
+    record = model.record
+    innovations = np.zeros(record.displacement.shape)
+    for k, (fit, rows) in enumerate(zip(model.channels, model.rows, strict=True)):
+        whitened, _ = fit.system.whiten(fit.residual()[:, None])
+        scale = 1.4826 * np.median(np.abs(whitened)) or 1.0
+        innovations[rows, k] = np.clip(whitened[:, 0] / scale, -_CLIP, _CLIP)
+    innovations -= innovations.mean(axis=0)
+    switched = record.switched()
+    observed, line = _statistics(innovations, switched)
+    null = np.array([_statistics(rng.permutation(innovations), switched)[0] for _ in range(_PERMUTATIONS)])
+    names = ("course in time", "rhythm", "switching")
+    centre, spread = null.mean(axis=0), np.maximum(null.std(axis=0), 1e-12)
+    largest = ((null - centre) / spread).max(axis=1)
+    values = (observed - centre) / spread
+    p_values = {
+        name: float((1 + (null[:, k] >= observed[k]).sum()) / (1 + _PERMUTATIONS)) for k, name in enumerate(names)
+    }
+    p_value = float((1 + (largest >= values.max()).sum()) / (1 + _PERMUTATIONS))
+    share = float(np.mean(sealed_rmse**2) / np.mean(np.nanvar(record.displacement, axis=0)))
+    words = []
+    if p_value < LEVEL:
+        period_min = record.seconds.size * record.block_s / 60.0 / line
+        words.append(
+            {
+                "course in time": "changes that come and go within a few blocks, too quick for the drift",
+                "rhythm": f"a rhythm of about {period_min:.0f} min",
+                "switching": "quick responses where a driver is switched",
+            }[names[int(np.argmax(values))]]
+        )
+    if share > _VARIANCE_SHARE:
+        words.append("a slow drift that neither temperatures nor drivers follow")
+    shape = f"{' and '.join(words)}; largest in {_largest(record.channels, sealed_rmse)}" if words else ""
+    return RecordRemainder(p_value, p_values, shape, float(np.mean(sealed_rmse)) if words else 0.0, share)
+
+
+def _statistics(innovations: Array, switched: Array) -> tuple[Array, int]:
+    """Three statistics that grow with structure, of the channels' leading common course; and the strongest line's number."""
+    u, s, _ = np.linalg.svd(innovations, full_matrices=False)
+    course = u[:, 0] * s[0]
+    n = course.size
+    power = float(course @ course) / n
+    autocorrelation = np.array([float(course[k:] @ course[:-k]) / n / power for k in range(1, _LAGS + 1)])
+    spectrum = np.abs(np.fft.rfft(course))[1 : n // 2] ** 2
+    line = int(np.argmax(spectrum)) + 1
+    near = course[switched] ** 2
+    excess = float(near.mean() / power) if near.size else 0.0
+    return np.array([float((autocorrelation**2).sum()), float(spectrum.max() / spectrum.mean()), excess]), line
+
+
+def _largest(channels: tuple[str, ...], rmse: Array) -> str:
+    """Channels with the larger errors, in words."""
+    strong = [name for name, error in zip(channels, rmse, strict=True) if error >= 0.7 * rmse.max()]
+    return "all channels alike" if len(strong) == len(channels) and len(strong) > 1 else ", ".join(strong)

@@ -1,0 +1,231 @@
+"""L4 - What the closed loop on a record has to tell: errors on the sealed part, steps, verdict, as results.json says it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.effects import Effect
+from fusion.model import Term
+from fusion.record import Record
+from fusion.record_loop import (
+    MOST_EFFECTS,
+    WORSE,
+    Chained,
+    Progress,
+    Round,
+    RecordScore,
+    Search,
+    chain_forward,
+    declare,
+    seal,
+    search,
+)
+from fusion.record_model import RecordFit, columns_of, fit_record
+from fusion.record_prediction import Prediction, channel_rmse, predict
+from fusion.record_remainder import RecordRemainder, examine
+from fusion.search import TIE_GAIN
+from interferometry.statespace import Array
+
+#: An effect that is not even significant alone is no rival.
+_RIVAL_LEVEL = 0.05
+
+
+@dataclass(frozen=True)
+class RecordResult:
+    """Everything the loop found on a record.
+
+    Attributes
+    ----------
+    found : the search on the time before the seal, effects that the seal withdrew left out
+    sealed : (blocks,) True for the sealed part
+    held_out : which part is sealed, in words
+    predictions : of the declared model and after every added effect, from before the seal
+    errors : (1 + effects, channels) their errors on the sealed part, um
+    persistence_um : (channels,) error of repeating the last value before the seal
+    whole : the final model fitted to all blocks, for what it leaves
+    remainder : what is left
+    chained : every part from the third on, predicted by the whole procedure on the time before it
+    """
+
+    found: Search
+    sealed: NDArray[np.bool_]
+    held_out: str
+    predictions: list[Prediction]
+    errors: Array
+    persistence_um: Array
+    whole: RecordFit
+    remainder: RecordRemainder
+    chained: list[Chained]
+
+    @property
+    def verdict(self) -> str:
+        """complete, explained, partial or unexplained."""
+        if self.found.entries:
+            return "partial" if self.remainder.shape else "explained"
+        return "unexplained" if self.remainder.shape else "complete"
+
+    def as_json(self) -> dict[str, Any]:
+        """The ``loop`` part of results.json; errors are means over the channels."""
+        record = self.found.record
+        mean = self.errors.mean(axis=1)
+        last = self.found.rounds[-1].scores
+        return {
+            "declared": [term.effect for term in self.found.terms[: self.found.declared]],
+            "held_out": self.held_out,
+            "noise_floor_um": float(np.mean(self.whole.sigma)),
+            "rmse_persistence_um": float(self.persistence_um.mean()),
+            "rmse_declared_um": float(mean[0]),
+            "rmse_final_um": float(mean[-1]),
+            "steps": [self._step(k) for k in range(len(self.found.entries))],
+            "verdict": self.verdict,
+            "unexplained": {
+                "shape": self.remainder.shape,
+                "rms_um": self.remainder.rms_um,
+                "p_value": self.remainder.p_value,
+                "p_values": self.remainder.p_values,
+                "variance_share": self.remainder.variance_share,
+                "nearest": last[0].name if self.remainder.shape and last else "",
+            },
+            "channels": {
+                name: {
+                    "rmse_persistence_um": float(self.persistence_um[k]),
+                    "rmse_declared_um": float(self.errors[0, k]),
+                    "rmse_final_um": float(self.errors[-1, k]),
+                    "noise_um": float(self.whole.sigma[k]),
+                }
+                for k, name in enumerate(record.channels)
+            },
+            "chained": [
+                {
+                    "first_h": one.first_h,
+                    "last_h": one.last_h,
+                    "effects": list(one.effects),
+                    "rmse_persistence_um": float(one.rmse_persistence_um.mean()),
+                    "rmse_declared_um": float(one.rmse_declared_um.mean()),
+                    "rmse_final_um": float(one.rmse_final_um.mean()),
+                }
+                for one in self.chained
+            ],
+            "search": [_round_json(one) for one in self.found.rounds],
+            "not_tried": dict(self.found.not_tried),
+            "blocked": dict(self.found.blocked),
+        }
+
+    def _step(self, k: int) -> dict[str, Any]:
+        score, turn = self.found.entries[k]
+        term = self.found.terms[self.found.declared + k]
+        others = [one for one in turn.scores if one.name != score.name and one.member is not None]
+        tied = [one.name for one in others if one.p_value < _RIVAL_LEVEL and score.excess - one.excess < TIE_GAIN]
+        runner_up: dict[str, Any] = {}
+        if others:
+            behind = score.excess - others[0].excess
+            runner_up = {"effect": others[0].name, "behind_by": behind, "p_value": others[0].family_wise_p}
+        before, after = self.errors[k].mean(), self.errors[k + 1].mean()
+        return {
+            "effect": term.effect,
+            "parameters": dict(term.member.parameters),
+            "p_value": score.family_wise_p,
+            "rmse_before_um": float(before),
+            "rmse_after_um": float(after),
+            "rms_um": float(np.sqrt(np.mean(self.contribution(term) ** 2))),
+            "rms_by_channel_um": {
+                name: float(np.sqrt(np.mean(self.contribution(term)[:, channel] ** 2)))
+                for channel, name in enumerate(self.found.record.channels)
+            },
+            "chained_rmse_before_um": turn.chained_rmse,
+            "chained_rmse_after_um": score.chained_rmse,
+            "tied": tied,
+            "runner_up": runner_up,
+            "rejected": dict(turn.rejected),
+            "confirmed": "parts of the record before the seal, each predicted from those before it, are predicted better with it",
+            "event_s": term.member.event_s,
+        }
+
+    def contribution(self, term: Term) -> Array:
+        """What a term contributes to the prediction by the final model, about its mean, um (blocks, channels)."""
+        start = 0
+        for other in self.found.terms:
+            if other is term:
+                break
+            start += other.width
+        final = self.predictions[-1]
+        place = slice(start, start + term.width)
+        series = term.member.columns @ final.coefficients[place]
+        return np.asarray(series - series.mean(axis=0))
+
+
+def _round_json(turn: Round) -> list[dict[str, Any]]:
+    return [
+        {
+            "effect": one.name,
+            "parameters": dict(one.member.parameters) if one.member else {},
+            "gain": one.gain,
+            "excess_gain": one.excess,
+            "p_value": one.p_value,
+            "family_wise_p": one.family_wise_p,
+            "chained_rmse_before_um": turn.chained_rmse,
+            "chained_rmse_after_um": one.chained_rmse,
+            "chosen": one.name == turn.chosen,
+            "rejected": turn.rejected.get(one.name, ""),
+        }
+        for one in turn.scores
+    ]
+
+
+def close_record(
+    record: Record,
+    declared: Sequence[str],
+    *,
+    seed: int = 1,
+    effects: Mapping[str, Effect] | None = None,
+    progress: Progress = lambda done, total, what: None,
+) -> RecordResult:
+    """Close the loop on a record.
+
+    Parameters
+    ----------
+    record : the record on its blocks
+    declared : names of the declared effects; ``quasi_static`` is the only one that a record can be declared with
+    seed : of the simulated records behind the p-values, so that a run can be repeated
+    effects : the library; the built-in one with the user's own by default
+
+    Raises
+    ------
+    RecordError
+        if a name has no meaning for a record, or a channel is too short for the model.
+    """
+    terms = declare(declared, record)
+    before, held_out = seal(record)
+    found = search(record, before, terms, seed=seed, effects=effects, progress=progress)
+    found, predictions, errors = _open_seal(found)
+    progress(MOST_EFFECTS, MOST_EFFECTS, "examining what is left")
+    whole = fit_record(record, found.terms, np.ones_like(before))
+    remainder = examine(whole, errors[-1], np.random.default_rng(seed))
+    last = np.array([column[before & np.isfinite(column)][-1] for column in record.displacement.T])
+    persistence = channel_rmse(record, np.broadcast_to(last, record.displacement.shape), ~before)
+    chained = chain_forward(record, terms, seed=seed, effects=effects, progress=progress)
+    return RecordResult(found, ~before, held_out, predictions, errors, persistence, whole, remainder, chained)
+
+
+def _open_seal(found: Search) -> tuple[Search, list[Prediction], Array]:
+    """Errors on the sealed part of every model in turn; an effect that makes them larger is withdrawn."""
+    predictions = found.predictions()
+    errors = np.array([channel_rmse(found.record, one.predicted, ~found.train) for one in predictions])
+    mean = errors.mean(axis=1)
+    for k, (score, _) in enumerate(found.entries):
+        if mean[k + 1] > WORSE * mean[k]:
+            reason = (
+                f"withdrawn: it was found before the seal (p = {score.family_wise_p:.2g}), but the error on the sealed part rose from "
+                f"{mean[k]:.3g} to {mean[k + 1]:.3g} um with it"
+            )
+            kept = [j for j in range(len(found.entries)) if j != k]
+            terms = (*found.terms[: found.declared], *(found.terms[found.declared + j] for j in kept))
+            entries = tuple(found.entries[j] for j in kept)
+            blocked = {**found.blocked, score.name: reason}
+            return _open_seal(replace(found, terms=terms, entries=entries, blocked=blocked))
+    return found, predictions, errors
