@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+
+from thermography import lens_kernel
 
 Array = NDArray[Any]
 
@@ -42,30 +45,26 @@ class Projection:
     focal_length_px: float
     principal_point_px: tuple[float, float]
 
+    @cached_property
+    def as_array(self) -> Array:
+        """One array for the kernels: 9 of the homography, focal length, principal point, k1, k2, p1, p2."""
+        return np.concatenate(
+            [self.plan_to_sensor.ravel(), [self.focal_length_px], self.principal_point_px, self.distortion], dtype=float
+        )
+
     def to_sensor(self, points_mm: Array) -> Array:
         """Project plan points, shape (..., 2) mm, to the sensor, shape (..., 2) px (column, row)."""
-        centre = np.asarray(self.principal_point_px)
-        normalised = (_transform(self.plan_to_sensor, points_mm) - centre) / self.focal_length_px
-        return centre + self.focal_length_px * _distort(normalised, self.distortion)
+        return _each(lens_kernel.project, points_mm, self.as_array)
 
     def to_plan(self, points_px: Array) -> Array:
         """Locate sensor points, shape (..., 2) px (column, row), on the plan, shape (..., 2) mm."""
-        return _transform(np.linalg.inv(self.plan_to_sensor), self.undistort(points_px))
+        return _each(lens_kernel.transform, self.undistort(points_px), np.linalg.inv(self.plan_to_sensor))
 
     def undistort(self, points_px: Array) -> Array:
         """Move sensor points, shape (..., 2) px, to where a lens without distortion would show them."""
-        points_px = np.asarray(points_px, float)
         if not self.distortion.any():
-            return points_px
-        centre = np.asarray(self.principal_point_px)
-        distorted = (points_px - centre) / self.focal_length_px
-        ideal = distorted.copy()
-        for _ in range(40):
-            step = distorted - _distort(ideal, self.distortion)
-            ideal += step
-            if np.nanmax(np.abs(step), initial=0.0) < 1e-11:
-                break
-        return centre + self.focal_length_px * ideal
+            return np.asarray(points_px, float)
+        return _each(lens_kernel.undistort, points_px, self.as_array)
 
     def jacobian(self, points_mm: Array) -> Array:
         """Derivative of the sensor position by the plan position, shape (..., 2, 2), px/mm."""
@@ -241,20 +240,7 @@ def _parameters(
     return pack, unpack
 
 
-def _transform(matrix: Array, points: Array) -> Array:
-    points = np.asarray(points, float)
-    x, y = points[..., 0], points[..., 1]
-    # Written out, because a product with a 2 x 3 matrix spends its time in starting BLAS threads.
-    u, v, w = (row[0] * x + row[1] * y + row[2] for row in matrix)
-    return np.stack([u / w, v / w], axis=-1)
-
-
-def _distort(normalised: Array, coefficients: Array) -> Array:
-    k1, k2, p1, p2 = coefficients
-    x, y = normalised[..., 0], normalised[..., 1]
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + k2 * r2)
-    return np.stack(
-        [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y],
-        axis=-1,
-    )
+def _each(kernel: Callable[[Array, Array], Array], points: Array, parameters: Array) -> Array:
+    """Send points of shape (..., 2) through a kernel for (n, 2)."""
+    points = np.ascontiguousarray(points, float)
+    return kernel(points.reshape(-1, 2), parameters).reshape(points.shape)

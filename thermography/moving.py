@@ -18,13 +18,14 @@ from thermography.cycles import NOT_NUMBERED, CyclePart, annotate, assemble, pix
 from thermography.fields import BLOCK_S, FieldError, check_bounds, check_correction, check_frames, cycle_of
 from thermography.flir import CameraParameters, FrameReference
 from thermography.knocks import RegisteredFrom
+from thermography.lens_kernel import projected
 from thermography.plan import PlanGrid, mask_discs
 from thermography.radiometry import temperature_from_counts
 from thermography.reading import WindowReader
 from thermography.registration import Registration
 from thermography.resampling import LEAST_COVERAGE, centring
 from thermography.scheduling import in_order, open_pool
-from thermography.tracking import Tracker, locate_table, make_tracker, projected
+from thermography.tracking import Tracker, locate_table, make_tracker
 
 Array = NDArray[Any]
 

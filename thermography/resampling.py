@@ -1,4 +1,4 @@
-"""L3 - Sensor pixels to plan cells: area-weighted, fiducials and table edge masked, as one sparse matrix."""
+"""L3 - Sensor pixels to plan cells: area-weighted, fiducials and table edge masked, as sparse matrices."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ class PlanWeights:
 
     Attributes
     ----------
-    matrix
-        (cells, pixels of the window), float64 CSR; rows sum to 1, and are empty where a cell is not seen.
     areas
-        The same by area alone, without what moves partly seen cells to their centre.
+        (cells, pixels of the window), float64 CSR: the part of every cell's seen area that lies in a pixel; rows sum to 1, and are
+        empty where a cell is not seen.
+    centring
+        (cells, cells), what to add to partly seen cells to move them to their own centre, see `centring`.
     window
         Rows and columns of the sensor that hold every pixel with a weight.
     coverage
@@ -40,8 +41,8 @@ class PlanWeights:
         The plan.
     """
 
-    matrix: sparse.csr_array
     areas: sparse.csr_array
+    centring: sparse.csr_array
     window: tuple[slice, slice]
     coverage: Array
     grid: PlanGrid
@@ -62,14 +63,16 @@ class PlanWeights:
     @cached_property
     def noise_factor(self) -> Array:
         """Variance of every cell, (y, x), for independent pixels of unit variance."""
-        squares = sparse.csr_array(
-            (self.matrix.data**2, self.matrix.indices, self.matrix.indptr), shape=self.matrix.shape
-        )
-        return self._on_plan(np.asarray(squares.sum(axis=1)).ravel())
+        variance = _row_squares(self.areas)
+        moved = np.flatnonzero(np.diff(self.centring.indptr))
+        if moved.size:
+            variance[moved] = _row_squares(sparse.csr_array(self.areas[moved] + self.centring[moved] @ self.areas))
+        return self._on_plan(variance)
 
     def resample(self, values: Array) -> Array:
         """Average window pixels, shape (row, column), over every cell; shape (y, x), NaN where a cell is not seen."""
-        return self._on_plan(self.matrix @ values.ravel())
+        cells = self.areas @ values.ravel()
+        return self._on_plan(cells + self.centring @ cells)
 
     def average(self, values: Array) -> Array:
         """As `resample`, but by area alone: for quantities that must not be extrapolated (variances)."""
@@ -78,6 +81,11 @@ class PlanWeights:
     def _on_plan(self, cells: Array) -> Array:
         plane: Array = np.where(self.coverage >= LEAST_COVERAGE, cells.reshape(self.grid.shape), np.nan)
         return plane
+
+
+def _row_squares(matrix: sparse.csr_array) -> Array:
+    rows = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+    return np.bincount(rows, matrix.data**2, matrix.shape[0])
 
 
 def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float = 2.0) -> PlanWeights:
@@ -118,13 +126,15 @@ def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float
     cells = grid.shape[0] * grid.shape[1]
     seen = np.bincount(cell, area, cells)
     coverage = (seen / grid.cell_size_mm**2).reshape(grid.shape).clip(0, 1)
-    by_area = sparse.csr_array((area / seen[cell], (cell, pixel)), shape=(cells, (bottom + 1 - top) * columns))
     centre = np.stack([np.bincount(cell, area * along, cells) for along in (x, y)], axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         offset = centre / seen[:, None] - np.stack(np.meshgrid(grid.x_mm, grid.y_mm), axis=-1).reshape(-1, 2)
-    matrix = sparse.csr_array(by_area + centring(offset, coverage, grid) @ by_area)
-    matrix.sum_duplicates()
-    return PlanWeights(matrix, by_area, window, coverage, grid)
+    # The pixels come in their order, so that sorting by cells alone gives sorted rows.
+    order = np.argsort(cell, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=cells))])
+    shape = (cells, (bottom + 1 - top) * columns)
+    areas = sparse.csr_array(((area / seen[cell])[order], pixel[order], starts), shape=shape)
+    return PlanWeights(areas, centring(offset, coverage, grid), window, coverage, grid)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -135,28 +145,43 @@ def _parts(
     rows, columns = corners.shape[0] - 1, corners.shape[1] - 1
     nx, ny = round(size[0] / cell_mm), round(size[1] / cell_mm)
     most = 4 * rows * columns
-    cell, pixel = np.empty(most, np.int64), np.empty(most, np.int64)
+    cell, pixel = np.empty(most, np.int32), np.empty(most, np.int32)
     area, x_mean, y_mean = np.empty(most), np.empty(most), np.empty(most)
     count = 0
     for row in range(rows):
         for column in range(columns):
-            a, b = corners[row, column], corners[row, column + 1]
-            c, d = corners[row + 1, column], corners[row + 1, column + 1]
-            ux, uy = (b[0] - a[0] + d[0] - c[0]) / 2, (b[1] - a[1] + d[1] - c[1]) / 2
-            vx, vy = (c[0] - a[0] + d[0] - b[0]) / 2, (c[1] - a[1] + d[1] - b[1]) / 2
-            px, py = (a[0] + b[0] + c[0] + d[0]) / 4, (a[1] + b[1] + c[1] + d[1]) / 4
-            margin = margin_px * max(np.hypot(ux, uy), np.hypot(vx, vy))
+            ux, vx, px = _sides(
+                corners[row, column, 0],
+                corners[row, column + 1, 0],
+                corners[row + 1, column, 0],
+                corners[row + 1, column + 1, 0],
+            )
+            uy, vy, py = _sides(
+                corners[row, column, 1],
+                corners[row, column + 1, 1],
+                corners[row + 1, column, 1],
+                corners[row + 1, column + 1, 1],
+            )
+            margin = margin_px * np.sqrt(max(ux * ux + uy * uy, vx * vx + vy * vy))
             if not (margin <= px <= size[0] - margin and margin <= py <= size[1] - margin):
                 continue
-            hidden = False
-            for k in range(len(discs)):
-                if (px - discs[k, 0]) ** 2 + (py - discs[k, 1]) ** 2 < (discs[k, 2] + margin) ** 2:
-                    hidden = True
-                    break
-            if hidden:
+            if _hidden(px, py, discs, margin):
                 continue
             part = abs(ux * vy - uy * vx) / PARTS**2
             first = count
+            reach_x, reach_y = (abs(ux) + abs(vx)) / 2, (abs(uy) + abs(vy)) / 2
+            left, top = int((px - reach_x) / cell_mm), int((py - reach_y) / cell_mm)
+            if (
+                left == int((px + reach_x) / cell_mm)
+                and top == int((py + reach_y) / cell_mm)
+                and left < nx
+                and top < ny
+            ):
+                # Most pixels lie in one cell as a whole.
+                cell[count], pixel[count] = top * nx + left, row * columns + column
+                area[count], x_mean[count], y_mean[count] = part * PARTS**2, part * PARTS**2 * px, part * PARTS**2 * py
+                count += 1
+                continue
             for i in range(PARTS):
                 for j in range(PARTS):
                     s, t = (j + 0.5) / PARTS - 0.5, (i + 0.5) / PARTS - 0.5
@@ -179,6 +204,21 @@ def _parts(
                     x_mean[place] += part * x
                     y_mean[place] += part * y
     return cell[:count], pixel[:count], area[:count], x_mean[:count] / area[:count], y_mean[:count] / area[:count]
+
+
+@numba.njit(cache=True, nogil=True)
+def _sides(a: float, b: float, c: float, d: float) -> tuple[float, float, float]:
+    """Steps along and across, and the middle, of a pixel with corners a, b above and c, d below (one coordinate)."""
+    return (b - a + d - c) / 2, (c - a + d - b) / 2, (a + b + c + d) / 4
+
+
+@numba.njit(cache=True, nogil=True)
+def _hidden(x: float, y: float, discs: Array, margin: float) -> bool:
+    """Whether a point lies on a disc (x, y, radius) or nearer to it than a margin."""
+    hidden = False
+    for k in range(len(discs)):
+        hidden |= (x - discs[k, 0]) ** 2 + (y - discs[k, 1]) ** 2 < (discs[k, 2] + margin) ** 2
+    return hidden
 
 
 def _outline(grid: PlanGrid) -> Array:

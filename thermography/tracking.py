@@ -9,6 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from thermography.lens_kernel import projected
 from thermography.plan import PlanGrid
 from thermography.registration import Registration
 
@@ -35,7 +36,7 @@ class Tracker:
     discs
         (n, 3): x, y, radius, mm.
     lens
-        As `lens_array` gives it.
+        The projection as `thermography.lens.Projection.as_array` gives it.
     direction
         Unit vector on the plan along which the table is displaced.
     size_mm
@@ -85,13 +86,9 @@ def make_tracker(registration: Registration, grid: PlanGrid, direction: Array, *
     projection = registration.projection
     bias = projection.disc_centroids(discs[:, :2], discs[:, 2]) - projection.to_sensor(discs[:, :2])
     margin = 3 * np.linalg.norm(projection.jacobian(discs[:, :2]), axis=-1) * discs[:, 2:]
-    return Tracker(discs, lens_array(registration), unit, size, reach_mm, registration, bias, margin, along, common)
-
-
-def lens_array(registration: Registration) -> Array:
-    """The projection as one array for the kernels: 9 of the homography, focal length, centre, k1, k2, p1, p2."""
-    p = registration.projection
-    return np.concatenate([p.plan_to_sensor.ravel(), [p.focal_length_px], p.principal_point_px, p.distortion])
+    return Tracker(
+        discs, registration.projection.as_array, unit, size, reach_mm, registration, bias, margin, along, common
+    )
 
 
 def locate_table(counts: NDArray[np.uint16], tracker: Tracker, near_mm: Array | None = None) -> TablePlace | None:
@@ -149,19 +146,6 @@ def _refined(counts: NDArray[np.uint16], tracker: Tracker, near_mm: Array) -> Ta
     scatter = np.sqrt(((shifts[kept] - mean) ** 2).sum() / (2 * kept.sum() - 2))
     common = np.interp(mean @ tracker.direction, tracker.common_mm, tracker.common_u_mm)
     return TablePlace(mean, float(np.hypot(scatter / np.sqrt(kept.sum()), common)), int(kept.sum()))
-
-
-@numba.njit(cache=True, nogil=True)
-def projected(x: float, y: float, lens: Array) -> tuple[float, float]:
-    """Sensor column and row of a plan point."""
-    w = lens[6] * x + lens[7] * y + lens[8]
-    u = ((lens[0] * x + lens[1] * y + lens[2]) / w - lens[10]) / lens[9]
-    v = ((lens[3] * x + lens[4] * y + lens[5]) / w - lens[11]) / lens[9]
-    r2 = u * u + v * v
-    radial = 1 + r2 * (lens[12] + lens[13] * r2)
-    du = u * radial + 2 * lens[14] * u * v + lens[15] * (r2 + 2 * u * u)
-    dv = v * radial + lens[14] * (r2 + 2 * v * v) + 2 * lens[15] * u * v
-    return lens[10] + lens[9] * du, lens[11] + lens[9] * dv
 
 
 @numba.njit(cache=True, nogil=True)
