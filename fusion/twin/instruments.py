@@ -112,6 +112,12 @@ def campaign_text(truth: Truth) -> str:
     clock = f'clock_offset = "{camera.clock_offset_s:g} s"\n' if camera.state_clock_offset else ""
     # a .rtl holds no times of readings: they are rebuilt from what the operator set
     motion = f'feed = "{recipe.test.feed_mm_per_min:g} mm/min"\ndwell = "{recipe.test.dwell_s:g} s"\n'
+    duty = recipe.duty
+    law = (
+        f'randomised = ["duty [1]"]\nmean_dwell = "{duty.mean_hold_min:g} min"\nleast_dwell = "{duty.least_hold_min:g} min"\n'
+        if duty.kind == "randomised"
+        else ""
+    )
     return f"""[campaign]
 title = {json.dumps(recipe.campaign.title)}
 axis = {json.dumps(recipe.campaign.axis)}
@@ -142,7 +148,7 @@ expansion_coefficient = "{recipe.laser.stated_expansion_ppm_per_K:g} ppm/K"
 
 [drivers]
 file = "drivers.csv"
-
+{law}
 [model]
 declared = ["axis_expansion", "table_offset"]
 """

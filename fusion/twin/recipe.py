@@ -38,12 +38,16 @@ class Test:
 
 @dataclass(frozen=True)
 class Duty:
-    """Load of the machine: `random` levels held for random times, `constant` = `high`, or `switched` between low and high."""
+    """Load of the machine: `random` levels held for random times, `constant` = `high`, or `switched` between low and high.
+
+    `randomised` switches by the law that the campaign file states: holds of `least_hold_min` and an exponential rest.
+    """
 
     kind: str = "random"
     low: float = 0.0
     high: float = 1.0
     mean_hold_min: float = 30.0
+    least_hold_min: float = 0.0
 
 
 @dataclass(frozen=True)

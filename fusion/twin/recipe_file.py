@@ -18,7 +18,7 @@ from fusion.twin.recipe import EffectRecipe, Recipe, RecipeError, Record
 #: Directions and angles that a record can hold.
 CHANNELS = 6
 CHOICES = {
-    "duty.kind": ("random", "constant", "switched"),
+    "duty.kind": ("random", "constant", "switched", "randomised"),
     "drift.walk": ("none", "random_walk", "integrated", "ou"),
     "laser.tails": ("normal", "t4"),
     "laser.file": ("csv", "rtl"),
@@ -100,6 +100,10 @@ def check_recipe(recipe: Recipe) -> Recipe:
         for name in names:
             if not getattr(getattr(recipe, table), name) > 0:
                 raise RecipeError(f"{table}.{name} = {getattr(getattr(recipe, table), name)}; write a number above 0")
+    if not 0.0 <= recipe.duty.least_hold_min < recipe.duty.mean_hold_min:
+        raise RecipeError(
+            f"duty.least_hold_min = {recipe.duty.least_hold_min}; write a number from 0 to below duty.mean_hold_min"
+        )
     for key in ("plan.origin_mm", "plan.direction", "camera.centre_mm", "camera.knock_px"):
         table, name = key.split(".")
         if len(getattr(getattr(recipe, table), name)) != 2:

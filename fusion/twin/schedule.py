@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.twin.recipe import Duty, RecipeError, Test
-from fusion.twin.streams import random_levels, stream
+from fusion.twin.streams import random_levels, stream, switched_levels
 
 Floats = NDArray[np.floating[Any]]
 
@@ -105,6 +105,9 @@ def duty_levels(duty: Duty, time_s: Floats, seed: int) -> Floats:
     """Return the machine's load (0..1) at the given times, as the recipe's duty asks for it."""
     if duty.kind == "constant":
         return np.full(time_s.size, duty.high)
+    if duty.kind == "randomised":
+        holds = (60.0 * duty.least_hold_min, 60.0 * (duty.mean_hold_min - duty.least_hold_min))
+        return switched_levels(time_s, (duty.low, duty.high), holds, stream(seed, "duty"))
     return random_levels(
         time_s, duty.low, duty.high, duty.mean_hold_min, stream(seed, "duty"), two=duty.kind == "switched"
     )

@@ -31,6 +31,19 @@ def random_levels(
     return level
 
 
+def switched_levels(
+    time_s: Floats, levels: tuple[float, float], holds_s: tuple[float, float], rng: np.random.Generator
+) -> Floats:
+    """Return a load at two levels by turns, the first by a fair coin, each held for a least time plus an exponential one of given mean."""
+    level = np.empty(time_s.size)
+    now, state = time_s[0], int(rng.integers(2))
+    while now <= time_s[-1]:
+        until = now + holds_s[0] + rng.exponential(holds_s[1])
+        level[(time_s >= now) & (time_s < until)] = levels[state]
+        now, state = until, 1 - state
+    return level
+
+
 def first_order(drive: Floats, step_s: float, time_constant_s: float) -> Floats:
     """Return the state of a body with one time constant, starting at 0; exact for a drive that is constant over a step.
 

@@ -5,6 +5,7 @@ Run with ``-m slow -s``: prints for each cause the verdicts as it is set, and th
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from dataclasses import dataclass
 
@@ -15,7 +16,7 @@ from statsmodels.stats.proportion import proportion_confint
 from fusion.diagnosis import THRESHOLDS, Diagnosis, diagnose
 from tests.fusion.residual_simulator import CAUSES, odd_position
 
-RUNS = 60
+RUNS = int(os.environ.get("THERMOFUSE_RUNS", "200"))
 #: Wanted share of right names; None: only wrong names count.
 BARS = {
     "structural": 0.95,
