@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -167,6 +167,9 @@ def assemble(
     grid: PlanGrid,
     covariances: Sequence[Array],
     coverages: Sequence[Array],
+    *,
+    frames: Mapping[str, Any] | None = None,
+    frame_coordinates: Mapping[str, Any] | None = None,
 ) -> xr.Dataset:
     """Put the cycles together: mean, rise, rate, spread, count, uncertainties and flags on the plan.
 
@@ -180,36 +183,78 @@ def assemble(
         The plan.
     covariances, coverages
         Of every registration: `position_covariance`, and the part of every cell that is seen unmasked.
+    frames, frame_coordinates
+        What is known per frame or block of frames besides, as xarray takes it.
     """
-    shape = (cycles, *grid.shape)
-    mean, spread, noise, place = (np.full(shape, np.nan) for _ in range(4))
-    count = np.zeros(shape, np.int32)
-    flags = np.zeros(shape, np.uint8)
+    fields = {name: np.full((cycles, *grid.shape), np.nan) for name in ("mean", "spread", "noise", "place")}
+    count = np.zeros((cycles, *grid.shape), np.int32)
+    flags = np.full((cycles, *grid.shape), FLAGS["no_frame"], np.uint8)
     time = np.full(cycles, np.datetime64("NaT"), "datetime64[ns]")
-    for cycle in range(cycles):
+    for cycle in sorted({part.cycle for part in parts}):
         own = [part for part in parts if part.cycle == cycle]
-        if not own:
-            flags[cycle] = FLAGS["no_frame"]
-            continue
-        frames = np.array([part.frames for part in own], float)
         time[cycle] = own[0].first_time + np.timedelta64(_mean_nanoseconds(own), "ns")
-        mean[cycle], spread[cycle], noise[cycle] = _together(own, frames)
+        together = _together(own)
+        for name, values in zip(("mean", "spread", "noise"), together, strict=True):
+            fields[name][cycle] = values
+        fields["place"][cycle] = _gradient_variance(together[0], covariances[own[-1].span], grid)
         count[cycle] = sum(part.count for part in own)
-        last = covariances[own[-1].span]
-        place[cycle] = _gradient_variance(mean[cycle], last, grid)
-        coverage = np.max([coverages[part.span] for part in own], axis=0)
-        flags[cycle] |= np.where(coverage < PARTLY_SEEN_BELOW, FLAGS["partly_seen"], 0).astype(np.uint8)
-        fell_back = np.any([part.fell_back for part in own], axis=0)
-        flags[cycle] |= np.where(fell_back, FLAGS["calibrated_per_frame"], 0).astype(np.uint8)
-        flags[cycle] |= np.uint8(FLAGS["several_registrations"] if len(own) > 1 else 0)
-        flags[cycle] |= np.where(np.isnan(mean[cycle]), FLAGS["not_seen"], 0).astype(np.uint8)
-    reference = min(part.cycle for part in parts)
+        flags[cycle] = _flags(own, together[0], np.max([coverages[part.span] for part in own], axis=0))
+    plan = ("cycle", "y", "x")
+    first = min(parts, key=lambda part: part.cycle)
+    temperatures = _temperatures(
+        **fields, time=time, reference=first.cycle, covariance=covariances[first.span], grid=grid
+    )
+    dataset = xr.Dataset(
+        {name: (plan, array.astype(np.float32)) for name, array in temperatures.items()}
+        | {
+            "count": (plan, count),
+            "quality_flag": (plan, flags),
+            "cycle_time": ("cycle", time),
+            "position_u": (("y", "x"), np.sqrt(np.trace(covariances[0], axis1=-2, axis2=-1)).astype(np.float32)),
+            "coverage": (("y", "x"), coverages[0].astype(np.float32)),
+        }
+        | dict(frames or {}),
+        coords={
+            "cycle": np.arange(1, cycles + 1, dtype=np.int32), "y": grid.y_mm, "x": grid.x_mm, **(frame_coordinates or {})
+        },
+        attrs={
+            "Conventions": "CF-1.11",
+            "title": "Temperature fields on the table plan",
+            "source": "FLIR radiometric frames",
+            "history": "counts averaged per cycle, calibrated, and averaged by area over the cells of the plan",
+        },
+    )  # fmt: skip
+    return annotate(dataset)
+
+
+def _flags(own: Sequence[CyclePart], mean: Array, coverage: Array) -> NDArray[np.uint8]:
+    """Quality flags of one cycle."""
+    found = {
+        "partly_seen": coverage < PARTLY_SEEN_BELOW,
+        "calibrated_per_frame": np.any([part.fell_back for part in own], axis=0),
+        "several_registrations": np.full(mean.shape, len(own) > 1),
+        "not_seen": np.isnan(mean),
+    }
+    return np.sum([np.where(where, FLAGS[name], 0) for name, where in found.items()], axis=0, dtype=np.uint8)
+
+
+def _temperatures(
+    mean: Array,
+    spread: Array,
+    noise: Array,
+    place: Array,
+    *,
+    time: Array,
+    reference: int,
+    covariance: Array,
+    grid: PlanGrid,
+) -> dict[str, Array]:
+    """Temperature, rise since the reference cycle, rate, spread and uncertainties, (cycle, y, x); `covariance` of its registration."""
     rise = mean - mean[reference]
-    first_covariance = covariances[next(part.span for part in parts if part.cycle == reference)]
-    rise_place = np.stack([_gradient_variance(field, first_covariance, grid) for field in rise])
+    rise_place = np.stack([_gradient_variance(field, covariance, grid) for field in rise])
     # The noise of the first cycle is in every rise but its own, which is zero by definition.
-    rise_noise = np.where(np.arange(cycles)[:, None, None] == reference, 0.0, noise + noise[reference])
-    values = {
+    rise_noise = np.where(np.arange(len(mean))[:, None, None] == reference, 0.0, noise + noise[reference])
+    return {
         "temperature": mean,
         "temperature_u": np.sqrt(noise + place),
         "temperature_rise": rise,
@@ -217,33 +262,14 @@ def assemble(
         "temperature_rate": _rate(mean, time),
         "temperature_spread": spread,
     }
-    plan = ("cycle", "y", "x")
-    dataset = xr.Dataset(
-        {name: (plan, array.astype(np.float32)) for name, array in values.items()}
-        | {
-            "count": (plan, count),
-            "quality_flag": (plan, flags),
-            "cycle_time": ("cycle", time),
-            "position_u": (("y", "x"), np.sqrt(np.trace(covariances[0], axis1=-2, axis2=-1)).astype(np.float32)),
-            "coverage": (("y", "x"), coverages[0].astype(np.float32)),
-        },
-        coords={"cycle": np.arange(1, cycles + 1, dtype=np.int32), "y": grid.y_mm, "x": grid.x_mm},
-        attrs={
-            "Conventions": "CF-1.11",
-            "title": "Temperature fields on the table plan",
-            "source": "FLIR radiometric frames",
-            "history": "counts averaged per cycle, calibrated, and averaged by area over the cells of the plan",
-        },
-    )
-    return annotate(dataset)
 
 
 def annotate(dataset: xr.Dataset) -> xr.Dataset:
     """Give every variable that is known its CF attributes, and coordinates no fill value."""
-    for name in dataset.variables:
-        dataset[name].attrs.update(ATTRIBUTES.get(str(name), {}))
+    for name, variable in dataset.variables.items():
+        variable.attrs.update(ATTRIBUTES.get(str(name), {}))
         if name in dataset.coords:
-            dataset[name].encoding["_FillValue"] = None
+            variable.encoding["_FillValue"] = None
     return dataset
 
 
@@ -254,10 +280,11 @@ def _mean_nanoseconds(own: Sequence[CyclePart]) -> int:
     return round(1e9 * total / sum(part.frames for part in own))
 
 
-def _together(own: Sequence[CyclePart], frames: Array) -> tuple[Array, Array, Array]:
+def _together(own: Sequence[CyclePart]) -> tuple[Array, Array, Array]:
     """Mean, spread and noise variance of a cycle whose frames have one or, after a knock, several registrations."""
     if len(own) == 1:
         return own[0].mean, own[0].spread, own[0].noise_variance
+    frames = np.array([part.frames for part in own], float)
     means = np.stack([part.mean for part in own])
     weight = np.where(np.isfinite(means), frames[:, None, None], 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):

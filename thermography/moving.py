@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermography.averaging import CHUNK_FRAMES
 from thermography.blocks import Block, Override, cut_blocks
-from thermography.cycles import NOT_NUMBERED, CyclePart, annotate, assemble, pixel_noise, position_covariance
+from thermography.cycles import NOT_NUMBERED, CyclePart, assemble, pixel_noise, position_covariance
 from thermography.fields import BLOCK_S, FieldError, check_bounds, check_correction, check_frames, cycle_of
 from thermography.flir import CameraParameters, FrameReference
 from thermography.knocks import RegisteredFrom
@@ -38,6 +38,7 @@ LARGEST_U_MM = 1.0
 NARROW = 600.0
 
 MOVING_ATTRIBUTES: dict[str, dict[str, Any]] = {
+    "temperature_spread": {"long_name": "standard deviation of the cell's temperature over the frames of the cycle"},
     "table_position": {
         "long_name": "displacement of the table along the axis since the registered frame, counted like the axis position",
         "units": "mm",
@@ -149,9 +150,24 @@ def reduce_moving_frames(
             f"no frame in which the table is found lies within a cycle: frames {times[0]} to {times[-1]}, "
             f"cycles {bounds[0, 0]} to {bounds[-1, 1]}; check the time zones and the clock offset"
         )
-    covariance = position_covariance(registration, grid)
-    fields = assemble(parts, len(bounds), grid, [covariance], [samples.coverage])
-    return _with_frames(fields, references, blocks, results, times, cycles, axis, samples, grid)
+    frames = _frame_variables(blocks, results, axis, samples, grid)
+    middles = [times[b.first] + (times[b.first : b.stop] - times[b.first]).mean() for b in blocks]
+    fields = assemble(
+        parts,
+        len(bounds),
+        grid,
+        [position_covariance(registration, grid)],
+        [samples.coverage],
+        frames=frames,
+        frame_coordinates={"time": np.array(middles), "frame_time": times},
+    )
+    for name, attributes in MOVING_ATTRIBUTES.items():
+        fields[name].attrs.update(attributes)
+
+    def named(chosen: Array) -> str:
+        return json.dumps([f"{references[i].path.name}#{references[i].index}" for i in np.flatnonzero(chosen)])
+
+    return fields.assign_attrs(frames_outside_cycles=named(cycles == NOT_NUMBERED), frames_unplaced=named(discs == 0))
 
 
 def sample_points(registration: Registration, grid: PlanGrid, *, margin_px: float = 2.0) -> Samples:
@@ -329,42 +345,19 @@ def _cycle_parts(
     return parts
 
 
-def _with_frames(
-    fields: xr.Dataset,
-    references: Sequence[FrameReference],
-    blocks: Sequence[Block],
-    results: Sequence[MovingResult],
-    times: Array,
-    cycles: Array,
-    axis: Array,
-    samples: Samples,
-    grid: PlanGrid,
-) -> xr.Dataset:
-    """Add the frame stack and the places of the table."""
+def _frame_variables(
+    blocks: Sequence[Block], results: Sequence[MovingResult], axis: Array, samples: Samples, grid: PlanGrid
+) -> dict[str, Any]:
+    """Return the frame stack and the places of the table."""
     shift = np.concatenate([result.shift_mm for result in results])
-    discs = np.concatenate([result.discs for result in results])
     stack = np.stack([_field(result.count, result.mean, samples, grid) for result in results]).astype(np.float32)
-    middles = [times[b.first] + (times[b.first : b.stop] - times[b.first]).mean() for b in blocks]
-    fields = fields.assign(
-        frame_temperature=(("time", "y", "x"), stack),
-        frame_cycle=("time", np.array([b.cycle + 1 for b in blocks], np.int32)),
-        frame_count=("time", np.array([b.stop - b.first for b in blocks], np.int32)),
+    return {
+        "frame_temperature": (("time", "y", "x"), stack),
+        "frame_cycle": ("time", np.array([b.cycle + 1 for b in blocks], np.int32)),
+        "frame_count": ("time", np.array([b.stop - b.first for b in blocks], np.int32)),
         # The table goes one way as the point under the spindle goes the other.
-        table_position=("frame_time", -(shift @ axis)),
-        table_position_u=("frame_time", np.concatenate([result.u_mm for result in results])),
-        table_across=("frame_time", shift @ np.array([-axis[1], axis[0]])),
-        table_discs=("frame_time", discs.astype(np.int32)),
-    ).assign_coords(time=np.array(middles), frame_time=times)
-    fields["temperature_spread"].attrs.pop("long_name", None)
-    fields = annotate(fields)
-    fields["temperature_spread"].attrs["long_name"] = (
-        "standard deviation of the cell's temperature over the frames of the cycle"
-    )
-    for name, attributes in MOVING_ATTRIBUTES.items():
-        fields[name].attrs.update(attributes)
-    fields["frame_time"].encoding["_FillValue"] = None
-
-    def named(chosen: Array) -> str:
-        return json.dumps([f"{references[i].path.name}#{references[i].index}" for i in np.flatnonzero(chosen)])
-
-    return fields.assign_attrs(frames_outside_cycles=named(cycles == NOT_NUMBERED), frames_unplaced=named(discs == 0))
+        "table_position": ("frame_time", -(shift @ axis)),
+        "table_position_u": ("frame_time", np.concatenate([result.u_mm for result in results])),
+        "table_across": ("frame_time", shift @ np.array([-axis[1], axis[0]])),
+        "table_discs": ("frame_time", np.concatenate([result.discs for result in results]).astype(np.int32)),
+    }

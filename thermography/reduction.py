@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from thermography.blocks import Block, BlockResult, Camera, Override
 from thermography.checkpoint import Checkpoint, Finished, Group
-from thermography.cycles import NOT_NUMBERED, CyclePart, annotate, assemble, position_covariance
+from thermography.cycles import NOT_NUMBERED, CyclePart, assemble, position_covariance
 from thermography.flir import FrameReference
 from thermography.knocks import KNOCK_PX, SUSPECT_PX, RegisteredFrom, fiducial_shift, register_anew, watch
 from thermography.plan import PlanGrid
@@ -183,12 +183,6 @@ class Reduction:
         covariances = [position_covariance(span.registration, self.grid) for span in self.spans]
         coverages = [camera.weights.coverage for camera in self.cameras]
         blocks = self.blocks
-        fields = assemble(self.parts, len(bounds), self.grid, covariances, coverages).assign(
-            frame_temperature=(("time", "y", "x"), np.stack(self.stack)),
-            frame_cycle=("time", np.array([b.cycle + 1 for b in blocks], np.int32)),
-            frame_count=("time", np.array([b.stop - b.first for b in blocks], np.int32)),
-            frame_shift=("time", np.array([_largest(self.shift_px[b.first : b.stop]) for b in blocks], np.float32)),
-        )
         middles = [self.times[b.first] + (self.times[b.first : b.stop] - self.times[b.first]).mean() for b in blocks]
         knocks = [
             {"frame": self._name(s.first), "index": s.first, "shift_px": list(s.shift_px)} for s in self.spans[1:]
@@ -199,7 +193,21 @@ class Reduction:
             "frames_shaken": [self._name(i) for i in sorted(self.shaken)],
             "frames_unchecked": [self._name(i) for i in np.flatnonzero(np.isnan(self.shift_px))],
         }
-        fields = annotate(fields.assign_coords(time=np.array(middles)))
+        frames = {
+            "frame_temperature": (("time", "y", "x"), np.stack(self.stack)),
+            "frame_cycle": ("time", np.array([b.cycle + 1 for b in blocks], np.int32)),
+            "frame_count": ("time", np.array([b.stop - b.first for b in blocks], np.int32)),
+            "frame_shift": ("time", np.array([_largest(self.shift_px[b.first : b.stop]) for b in blocks], np.float32)),
+        }
+        fields = assemble(
+            self.parts,
+            len(bounds),
+            self.grid,
+            covariances,
+            coverages,
+            frames=frames,
+            frame_coordinates={"time": np.array(middles)},
+        )
         return fields.assign_attrs({name: json.dumps(value) for name, value in texts.items()})
 
     def _name(self, i: int) -> str:
