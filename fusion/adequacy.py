@@ -160,12 +160,17 @@ def _statistics(matrix: Array, signs: Array, place: Array) -> Array:
     contrasts = [filled @ signs, filled @ stretch, filled @ curved]
     return np.array(
         [
-            np.linalg.norm(filled, 2),
-            np.linalg.norm(blocks, 2) if blocks.shape[0] > 1 else 0.0,
+            _largest(filled),
+            _largest(blocks) if blocks.shape[0] > 1 else 0.0,
             (blocks**2).sum(axis=0).max() if blocks.shape[0] > 1 else 0.0,
             *(_slowness(contrast) for contrast in contrasts),
         ]
     )
+
+
+def _largest(matrix: Array) -> float:
+    """Largest singular value, from the products of its columns: the sites are few, the cycles may be many."""
+    return float(np.sqrt(np.linalg.eigvalsh(matrix.T @ matrix)[-1]))
 
 
 def _slowness(series: Array) -> float:
@@ -179,12 +184,18 @@ def _slowness(series: Array) -> float:
 
 def _freed(readings: Readings, columns: Array) -> Array:
     """Columns (n, q) freed of an offset and a stretch per cycle, which the drift would take."""
-    free = np.empty_like(columns)
-    for number in np.unique(readings.cycle):
-        here = readings.cycle == number
-        basis = np.column_stack([np.ones(here.sum()), readings.share[here]])
-        free[here] = columns[here] - basis @ np.linalg.lstsq(basis, columns[here], rcond=None)[0]
-    return free
+    _, cycle = np.unique(readings.cycle, return_inverse=True)
+    number = np.bincount(cycle)
+
+    def mean(values: Array) -> Array:
+        """Mean over each cycle, at every reading."""
+        return np.asarray((np.bincount(cycle, values) / number)[cycle])
+
+    place = readings.share - mean(readings.share)
+    # A cycle of a single target has no stretch.
+    square = np.maximum(mean(place**2), 1e-12)
+    free = [column - mean(column) - place * mean(place * column) / square for column in columns.T]
+    return np.column_stack(free)
 
 
 def _leading(matrix: Array) -> tuple[Array, Array, float]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from fusion import members as of
 from fusion.episodes import jumps, sensor_jumps, stuck_sensors
-from fusion.members import Member
+from fusion.members import Member, Prior
 from fusion.readings import Readings
 
 
@@ -33,6 +33,7 @@ class Effect:
     members : from the readings, the coefficients of the current model and, for a closer look, a member near which to search, to the
         members that can be tried
     needs : why it cannot be tried with these readings, or None
+    prior : what is known of the first coefficient where the effect is declared
     excited_by : ``"field"`` or ``"driver"`` where the effect is only told apart by switching of that kind, else ``""``
     """
 
@@ -42,6 +43,7 @@ class Effect:
     members: Callable[[Readings, Mapping[str, float], Member | None], Iterator[Member]]
     needs: Callable[[Readings], str | None] = field(default=lambda readings: None)
     excited_by: str = ""
+    prior: Prior | None = None
 
 
 def _needs_field(readings: Readings) -> str | None:
@@ -87,6 +89,9 @@ def _needs_sensor_episode(readings: Readings) -> str | None:
     return "no logged sensor jumps or sticks"
 
 
+#: Standard uncertainty of an expansion coefficient from a table: steels and cast irons lie between 9 and 14 ppm/K.
+EXPANSION_U_PPM_PER_K = 2.0
+
 LIBRARY: tuple[Effect, ...] = (
     Effect(
         "axis_expansion",
@@ -94,6 +99,7 @@ LIBRARY: tuple[Effect, ...] = (
         "ISO/TR 16015; steel 11.7 ppm/K",
         of.declared_members("axis_expansion"),
         _needs_field,
+        prior=Prior(11.7, EXPANSION_U_PPM_PER_K),
     ),
     Effect(
         "table_offset",

@@ -16,8 +16,9 @@ _JUMP_SIGMAS = 8.0
 
 def cycle_starts(readings: Readings) -> Array:
     """Time of the first reading of every cycle, s."""
-    numbers = np.unique(readings.cycle)
-    return np.array([readings.seconds[readings.cycle == number].min() for number in numbers])
+    # Readings are sorted by time, so the first of a cycle is its earliest.
+    _, first = np.unique(readings.cycle, return_index=True)
+    return np.asarray(readings.seconds[first])
 
 
 def event_instants(readings: Readings) -> Array:

@@ -21,12 +21,10 @@ from fusion.episodes import cycle_starts
 from fusion.model import ModelFit, Term, fit_model, refit_fixed
 from fusion.readings import Readings
 from fusion.scoring import FamilyScore
-from fusion.search import Search, member_of
+from fusion.search import SECOND_LEVEL, Search, member_of
 from fusion.shape import wrong_patterns
 from fusion.story import LoopResult, Step, coefficients_of, make_step, nuisance_size, persistence, rmse
 
-#: Chance of adding an effect where nothing is missing, in the second look after the seal has been opened.
-SECOND_LEVEL = 0.02
 SEALED_SHARE = 0.2
 MOST_EFFECTS = 4
 _SUPERFLUOUS_GAIN = 2.0
@@ -188,7 +186,7 @@ def _declare(readings: Readings, declared: Sequence[str], effects: Mapping[str, 
                 f"declared effect {name!r} has parameters that are not known beforehand; leave it out of [model] declared, the "
                 "search tries it anyway"
             )
-        terms.append(Term(name, members[0]))
+        terms.append(Term(name, replace(members[0], prior=effects[name].prior)))
     return terms
 
 

@@ -30,13 +30,25 @@ SHORTEST_LEAD_MM = 4.0
 
 
 @dataclass(frozen=True)
+class Prior:
+    """What is known of a coefficient before the test: its mean and standard uncertainty, in the coefficient's unit."""
+
+    mean: float
+    u: float
+
+
+@dataclass(frozen=True)
 class Member:
-    """One way an effect could enter: columns (n, q) in um per unit coefficient, and the parameters that made them."""
+    """One way an effect could enter: columns (n, q) in um per unit coefficient, and the parameters that made them.
+
+    ``prior`` is what is known of the first coefficient beforehand, None where nothing is.
+    """
 
     columns: Array
     parameters: Mapping[str, float | str]
     units: tuple[str, ...]
     event_s: float | None = None
+    prior: Prior | None = None
 
 
 def _column(*columns: Array) -> Array:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.members import Member
+from fusion.members import Member, Prior
 from fusion.readings import Readings
 from interferometry.statespace import Array, DriftFit, DriftSystem, estimate, fit_fixed_effects
 
@@ -56,6 +56,11 @@ class ModelFit:
                 return slice(start, start + term.width)
             start += other.width
         raise KeyError(term.effect)
+
+    def priors(self) -> list[tuple[int, Prior]]:
+        """Places of the coefficients that something is known of beforehand, and what."""
+        known = [(self.place(term).start, term.member.prior) for term in self.terms]
+        return [(place, prior) for place, prior in known if prior is not None]
 
     def coefficients(self) -> dict[str, float]:
         """First coefficient of every term by effect name; the first term counts where an effect enters twice."""
@@ -130,7 +135,10 @@ def fit_model(
     fit = estimate(
         seconds, loadings, response, design, order=first.system.order, start=first.system.ratios, variance=variance
     )
-    return ModelFit(readings, used, tuple(terms), fit, profile)
+    model = ModelFit(readings, used, tuple(terms), fit, profile)
+    for place, prior in model.priors():
+        fit = condition(fit, place, prior)
+    return replace(model, fit=fit)
 
 
 def unexplained_drift(fit: DriftFit) -> tuple[Array, Array]:
@@ -151,6 +159,16 @@ def unexplained_drift(fit: DriftFit) -> tuple[Array, Array]:
         drift = drift + rates * fit.coefficients[-components:]
     q, _ = np.linalg.qr(named)
     return np.asarray(drift - q @ (q.T @ drift)), np.asarray(q)
+
+
+def condition(fit: DriftFit, place: int, prior: Prior) -> DriftFit:
+    """The fit with one coefficient observed once more, as its prior says; the variances are kept."""
+    gain = fit.covariance[:, place] / (fit.covariance[place, place] + prior.u**2)
+    return replace(
+        fit,
+        coefficients=fit.coefficients + gain * (prior.mean - fit.coefficients[place]),
+        covariance=fit.covariance - np.outer(gain, fit.covariance[place]),
+    )
 
 
 def refit_fixed(model: ModelFit, terms: Sequence[Term]) -> DriftFit:

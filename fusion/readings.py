@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -22,6 +23,19 @@ ENVIRONMENT = ("air_temperature", "air_pressure", "relative_humidity", "material
 
 class ReadingsError(ValueError):
     """A campaign that holds too little to be modelled; the message says what is missing."""
+
+
+@njit(cache=True)
+def _first_order(seconds: Array, values: Array, time_constant_s: float, start: Array) -> Array:
+    """Response (m, columns) of a first-order system to values (m, columns) that are linear between samples."""
+    response = np.empty_like(values)
+    response[0] = start
+    for k in range(seconds.size - 1):
+        step = seconds[k + 1] - seconds[k]
+        decay = np.exp(-step / time_constant_s)
+        ramp = (values[k + 1] - values[k]) / step * time_constant_s
+        response[k + 1] = (response[k] - values[k] + ramp) * decay + values[k + 1] - ramp
+    return response
 
 
 @dataclass(frozen=True)
@@ -46,14 +60,10 @@ class Series:
         """
         if time_constant_s <= 0.0:
             return self
-        response = np.empty_like(self.values)
-        response[0] = self.values[0] if at_rest is None else at_rest
-        steps = np.diff(self.seconds)
-        for k, step in enumerate(steps):
-            decay = np.exp(-step / time_constant_s)
-            ramp = (self.values[k + 1] - self.values[k]) / step * time_constant_s
-            response[k + 1] = (response[k] - self.values[k] + ramp) * decay + self.values[k + 1] - ramp
-        return Series(self.seconds, response, self.units)
+        values = self.values if self.values.ndim == 2 else self.values[:, None]
+        start = values[0] if at_rest is None else np.full(values.shape[1], at_rest)
+        response = _first_order(self.seconds, np.ascontiguousarray(values), time_constant_s, start)
+        return Series(self.seconds, response.reshape(self.values.shape), self.units)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.members import Member
-from fusion.nulls import least_ratio, simulate_null, tail_probability
+from fusion.model import ModelFit
+from fusion.nulls import DRAWS, least_ratio, simulate_null, tail_probability
 from fusion.projections import (
     by_width,
     density_ahead,
@@ -76,6 +77,39 @@ class FamilyScore:
 
 
 @dataclass(frozen=True)
+class Known:
+    """Priors of a model's coefficients as further whitened readings, one each, without drift.
+
+    Attributes
+    ----------
+    design : (k, p)
+    response, draws : (k,) and (k, draws)
+    """
+
+    design: Array
+    response: Array
+    draws: Array
+
+    def append(self, y: Array, x: Array) -> tuple[Array, Array]:
+        """Whitened responses (n + k, r) and design (n + k, p + q); columns beyond the model's are zero in the priors' rows."""
+        responses = np.column_stack([self.response, self.draws])[:, : y.shape[1]]
+        design = np.zeros((self.response.size, x.shape[1]))
+        design[:, : self.design.shape[1]] = self.design
+        return np.vstack([y, responses]), np.vstack([x, design])
+
+
+def known_of(model: ModelFit, rng: np.random.Generator, *, draws: int = DRAWS) -> Known:
+    """What the model's priors say, in units of the noise; in a draw every coefficient is zero and its prior off by chance."""
+    priors = model.priors()
+    design = np.zeros((len(priors), model.fit.design.shape[1]))
+    response = np.zeros(len(priors))
+    for row, (place, prior) in enumerate(priors):
+        design[row, place] = model.fit.sigma / prior.u
+        response[row] = model.fit.sigma * prior.mean / prior.u
+    return Known(design, response, model.fit.sigma * rng.standard_normal((len(priors), draws)))
+
+
+@dataclass(frozen=True)
 class Judge:
     """A fitted model with simulated campaigns in which it is complete.
 
@@ -86,6 +120,7 @@ class Judge:
     early : (n,) True for the cycles from which the others are predicted when an effect is confirmed in time
     halves : (n,) True for one half of the targets, for events that cannot be confirmed in time
     used : (all readings,) the training readings among those that members have columns for
+    known : what is known of the model's coefficients beforehand
     """
 
     fit: DriftFit
@@ -93,6 +128,7 @@ class Judge:
     early: NDArray[np.bool_]
     halves: NDArray[np.bool_]
     used: NDArray[np.bool_]
+    known: Known
 
     def score(self, families: Mapping[str, Sequence[Member]]) -> list[FamilyScore]:
         """Score all members of all effects; none is confirmed yet."""
@@ -168,10 +204,11 @@ class Judge:
             root, log_determinant = np.sqrt(spread)[:, None], float(np.log(spread).sum())
             c /= root
             whitened = system.innovations(known)[0] / root
-            q, _ = np.linalg.qr(whitened[:, count:])
-            y = whitened[:, :count] - q @ (q.T @ whitened[:, :count])
+            y, x = self.known.append(whitened[:, :count], whitened[:, count:])
+            q, _ = np.linalg.qr(x)
+            y -= q @ (q.T @ y)
             rss = (y**2).sum(axis=0)
-            reduced, separate = reductions(c, y, q, groups)
+            reduced, separate = reductions(c, y[:n], q[:n], groups)
             # In place: these matrices are large, and fetching memory for new ones takes as long as the sums.
             likelihood = np.subtract(rss[:, None], reduced, out=reduced)
             np.log(np.maximum(likelihood, 1e-12 * rss[:, None], out=likelihood), out=likelihood)
@@ -193,7 +230,11 @@ class Judge:
             np.column_stack([responses, self.fit.design, member.columns[self.used]])
         )
         y, x, c = np.split(whitened, [responses.shape[1], responses.shape[1] + self.fit.design.shape[1]], axis=1)
-        return gain_across(without(x, y), without(x, c), self.halves) / (2.0 * without(x, y[:, :1]).var())
+        n = c.shape[0]
+        y, x = self.known.append(y, x)
+        c = np.vstack([c, np.zeros((y.shape[0] - n, c.shape[1]))])
+        y, c = without(x, y)[:n], without(x, c)[:n]
+        return gain_across(y, c, self.halves) / (2.0 * y[:, :1].var())
 
     def _gains_in_time(self, members: Sequence[Member]) -> list[Array]:
         """Gain in log-density of the later half, predicted forward from the readings before, of every member (1 + draws,).
@@ -212,7 +253,9 @@ class Judge:
             errors, spread = system.innovations(columns)
             errors /= np.sqrt(spread)[:, None]
             y, x = errors[:, :count], errors[:, count:]
-            whole, early = moments_of(y, x, spread), moments_of(y[self.early], x[self.early], spread[self.early])
+            # What is known beforehand is known before the early cycles too.
+            whole = moments_of(*self.known.append(y, x), spread)
+            early = moments_of(*self.known.append(y[self.early], x[self.early]), spread[self.early])
             for k, design in enumerate(designs):
                 known[k].append(profile_likelihood(whole.of(design)))
                 ahead[k].append(density_ahead(early.of(design), whole.of(design), p))
@@ -223,16 +266,12 @@ class Judge:
         return [np.asarray(one - chosen[0]) for one in chosen[1:]]
 
 
-def ask_sealed(
-    fit: DriftFit, whole: DriftSystem, response: Array, design: Array, member: Member, rng: np.random.Generator
-) -> tuple[float, float, float]:
+def ask_sealed(model: ModelFit, member: Member, rng: np.random.Generator) -> tuple[float, float, float]:
     """Put one candidate to the sealed readings, predicted in open loop.
 
     Parameters
     ----------
-    fit : the model without the candidate, fitted to the readings before the seal
-    whole : all readings, those before the seal marked as observed
-    response, design : (n,) and (n, p) for all readings
+    model : without the candidate, fitted to the readings before the seal
     member : the candidate, with columns for all readings
 
     Returns
@@ -241,9 +280,11 @@ def ask_sealed(
         Root mean square errors without and with the candidate, and the chance of so small an error after where the candidate is not
         there and the model's own drift is all that happens. Coefficients, noise and drift come from before the seal alone.
     """
+    fit, whole, design = model.fit, model.whole_system(), model.whole_design()
     train = whole.observed
+    known = known_of(model, rng)
     null = simulate_null(fit, rng, over=replace(whole, observed=np.ones_like(train)))
-    responses = np.column_stack([response, null])
+    responses = np.column_stack([model.readings.response, null])
     p, count = design.shape[1], responses.shape[1]
     centre = np.maximum(fit.system.ratios, least_ratio(fit.system))
     likelihood: dict[bool, list[Array]] = {False: [], True: []}
@@ -254,7 +295,7 @@ def ask_sealed(
         root = np.sqrt(spread[train])[:, None]
         for with_member in (False, True):
             used = slice(count, count + p + (member.columns.shape[1] if with_member else 0))
-            y, x = errors[train, :count] / root, errors[train, used] / root
+            y, x = known.append(errors[train, :count] / root, errors[train, used] / root)
             beta = solve(x.T @ x, x.T @ y)
             variance = ((y - x @ beta) ** 2).mean(axis=0)
             likelihood[with_member].append(-0.5 * (y.shape[0] * np.log(variance) + np.log(spread[train]).sum()))

@@ -15,10 +15,12 @@ from fusion.members import Member
 from fusion.model import ModelFit, Term, fit_model
 from fusion.nulls import simulate_null
 from fusion.readings import Readings
-from fusion.scoring import FamilyScore, Judge, ask_sealed
+from fusion.scoring import FamilyScore, Judge, ask_sealed, known_of
 
-#: Chance of adding an effect where nothing is missing, over the whole search.
+#: Chance of adding an effect where nothing is missing, over everything that is tried. The search before the seal has the largest part
+#: of it; the rest is for the one question to the sealed cycles and for the look at all cycles after that.
 ENTRY_LEVEL = 0.05
+SEARCH_LEVEL, ASKED_LEVEL, SECOND_LEVEL = 0.03, 0.01, 0.01
 #: Chance that an effect which is not there passes its confirmation on unused readings; the search has been paid for already.
 CONFIRMATION_LEVEL = 0.2
 #: Evidence so strong that an inconclusive confirmation does not stop it: few switchings of a load leave early blocks without a say.
@@ -26,8 +28,6 @@ CONFIRMATION_LEVEL = 0.2
 STRONG_LEVEL = 0.001
 #: An effect with a larger p-value, uncorrected, is not worth the one question to the sealed readings.
 _WORTH_ASKING = 0.1
-#: Chance that the one question to the sealed readings is answered with yes where the effect is not there.
-ASKED_LEVEL = 0.02
 #: Effects whose log-likelihoods differ by less than this (odds of 20 to 1) are reported as a tie.
 TIE_GAIN = 3.0
 #: Effects with a larger p-value are not looked at more closely, because they will not enter anyway.
@@ -117,10 +117,17 @@ class Search:
         part = self.readings.subset(model.used)
         numbers = np.unique(part.cycle)
         early = np.searchsorted(numbers, part.cycle) < _EARLY_SHARE * numbers.size
-        return Judge(model.fit, simulate_null(model.fit, self.rng), early, part.target_index % 2 == 0, model.used)
+        return Judge(
+            model.fit,
+            simulate_null(model.fit, self.rng),
+            early,
+            part.target_index % 2 == 0,
+            model.used,
+            known_of(model, self.rng),
+        )
 
     def choose(
-        self, scores: Sequence[FamilyScore], model: ModelFit, *, level: float = ENTRY_LEVEL
+        self, scores: Sequence[FamilyScore], model: ModelFit, *, level: float = SEARCH_LEVEL
     ) -> FamilyScore | None:
         """Best effect that is significant, confirmed and not blocked."""
         strongest = -np.inf
@@ -158,14 +165,7 @@ class Search:
             if reason is not None:
                 self.blocked[score.name] = reason
                 continue
-            before, after, p_value = ask_sealed(
-                model.fit,
-                model.whole_system(),
-                self.readings.response,
-                model.whole_design(),
-                member_of(score),
-                self.rng,
-            )
+            before, after, p_value = ask_sealed(model, member_of(score), self.rng)
             entered = after < before and p_value <= ASKED_LEVEL
             self.question = SealedQuestion(score.name, member_of(score).parameters, before, after, p_value, entered)
             return replace(score, held_out_p=p_value) if entered else None

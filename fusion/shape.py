@@ -20,16 +20,15 @@ from interferometry.statespace import Array
 LEVEL = 1e-3
 #: Share of a column that must lie outside the model for a site to have a say.
 _SEPARABLE = 1e-6
-#: Effects that have nothing but their pattern to be told by, and the correlation of two courses above which they are one.
+#: Effects that have nothing but their pattern to be told by.
 _PATTERNED = frozenset({"angular_growth", "pitch_error", "reversal_drift"})
-_ONE_COURSE = 0.95
 
 
 def wrong_patterns(model: ModelFit, terms: Sequence[Term]) -> dict[int, str]:
     """Places of the terms that do not deserve their names, each with the reason.
 
-    An effect is wrong where a free pattern fits its course in time better; and two patterns that follow one course are more likely one
-    pattern that the library does not have.
+    An effect is wrong where a free pattern fits its course in time better; and two patterns of which one course would do are more likely
+    one pattern that the library does not have.
     """
     wrong = {}
     courses = {k: _course(model, term) for k, term in enumerate(terms) if term.member.event_s is None}
@@ -42,12 +41,45 @@ def wrong_patterns(model: ModelFit, terms: Sequence[Term]) -> dict[int, str]:
             )
     patterned = [k for k in courses if terms[k].effect in _PATTERNED]
     for first, second in combinations(patterned, 2):
-        alike = abs(float(np.corrcoef(courses[first], courses[second])[0, 1]))
-        if alike > _ONE_COURSE:
+        if _one_pattern(model, (terms[first], terms[second]), (courses[first], courses[second])):
             names = f"{terms[first].effect} and {terms[second].effect}"
-            reason = f"{names} would follow one course in time (correlation {alike:.3f}): together they are one pattern without a name"
+            reason = f"{names} fit no better than one course in time with a free pattern: together they are one pattern without a name"
             wrong[first] = wrong[second] = reason
     return wrong
+
+
+def _one_pattern(model: ModelFit, terms: tuple[Term, Term], courses: tuple[Array, Array]) -> bool:
+    """Whether one of two courses in time, with a size of its own at every site, fits as well as both terms.
+
+    What so many free sizes gain by chance, half a unit of log-likelihood each, is taken off.
+    """
+    own = [place for term in terms for place in range(*model.place(term).indices(model.fit.design.shape[1]))]
+    design = np.delete(model.fit.design, own, axis=1)
+    both = _left(model, model.fit.design)
+    for course in courses:
+        free = _free_pattern(model, course)
+        alone = _left(model, np.column_stack([design, free]))
+        more = free.shape[1] - len(own)
+        if 0.5 * model.fit.response.size * np.log(both / alone) >= 0.5 * more:
+            return True
+    return False
+
+
+def _left(model: ModelFit, design: Array) -> float:
+    """Whitened residual sum of squares beside a design whose columns may depend on each other."""
+    whitened, _ = model.fit.system.whiten(np.column_stack([model.fit.response, design]))
+    scale = np.maximum(np.linalg.norm(whitened[:, 1:], axis=0), 1e-12)
+    u, s, _ = np.linalg.svd(whitened[:, 1:] / scale, full_matrices=False)
+    u = u[:, s > np.sqrt(_SEPARABLE) * s[0]]
+    left = whitened[:, 0] - u @ (u.T @ whitened[:, 0])
+    return float(left @ left)
+
+
+def _free_pattern(model: ModelFit, course: Array) -> Array:
+    """A course in time (n,) with a size of its own at every site, (n, sites)."""
+    readings = model.readings.subset(model.used)
+    site = readings.target_index * 2 + (readings.sign < 0)
+    return (site[:, None] == np.unique(site)[None, :]) * course[:, None]
 
 
 def pattern_p_value(model: ModelFit, term: Term) -> float:
@@ -59,7 +91,7 @@ def pattern_p_value(model: ModelFit, term: Term) -> float:
     site = readings.target_index * 2 + (readings.sign < 0)
     course = _course(model, term)
     sites = np.unique(site)
-    free = (site[:, None] == sites[None, :]) * course[:, None]
+    free = _free_pattern(model, course)
     whitened, _ = model.fit.system.whiten(np.column_stack([model.fit.response, model.fit.design, free]))
     p = model.fit.design.shape[1]
     q, _ = np.linalg.qr(whitened[:, 1 : p + 1])

@@ -12,7 +12,7 @@ from fusion.adequacy import Remainder
 from fusion.model import ModelFit, Term, unexplained_drift
 from fusion.readings import Readings
 from fusion.scoring import FamilyScore
-from fusion.search import CONFIRMATION_LEVEL, ENTRY_LEVEL, TIE_GAIN, SealedQuestion
+from fusion.search import CONFIRMATION_LEVEL, SEARCH_LEVEL, TIE_GAIN, SealedQuestion
 from interferometry.statespace import Array
 
 #: An effect that is not even significant alone is no rival.
@@ -100,12 +100,18 @@ class LoopResult:
         }
 
     def _nearest(self) -> dict[str, object]:
-        """The effect that comes nearest to what is left, its p-value in the search, and the share of the remainder that it explains."""
-        score = next((score for score in self.rounds[-1] if score.member is not None), None) if self.rounds else None
-        if not self.remainder.shape or score is None or score.member is None:
+        """The effect that explains the largest share of what is left, its p-value in the search, and that share."""
+        added = {step.effect for step in self.steps}
+        rivals = [score for scores in self.rounds for score in scores if score.member and score.name not in added]
+        if not self.remainder.shape or not rivals:
             return {"nearest": "", "nearest_p": None, "nearest_share": None}
-        share = self.remainder.share_of(score.member.columns)
-        return {"nearest": score.name, "nearest_p": score.family_wise_p, "nearest_share": share}
+        shares = [self.remainder.share_of(score.member.columns) for score in rivals if score.member]
+        best = int(np.argmax(shares))
+        return {
+            "nearest": rivals[best].name,
+            "nearest_p": rivals[best].family_wise_p,
+            "nearest_share": shares[best],
+        }
 
 
 def _step_json(step: Step) -> dict[str, object]:
@@ -127,13 +133,16 @@ def _score_json(score: FamilyScore) -> dict[str, object]:
 
 
 def coefficients_of(model: ModelFit, term: Term) -> list[dict[str, float | str]]:
-    """Coefficients of a term with their standard uncertainty and unit."""
+    """Coefficients of a term with their standard uncertainty and unit, and with the prior that went into the first one."""
     place = model.place(term)
     values, u = model.fit.coefficients[place], model.fit.coefficients_u[place]
-    return [
+    found: list[dict[str, float | str]] = [
         {"value": float(value), "u": float(spread), "unit": unit}
         for value, spread, unit in zip(values, u, term.member.units, strict=True)
     ]
+    if term.member.prior is not None:
+        found[0] |= {"prior": term.member.prior.mean, "prior_u": term.member.prior.u}
+    return found
 
 
 def _size(model: ModelFit, term: Term) -> float:
@@ -176,12 +185,12 @@ def make_step(
 
 def _entry_p(score: FamilyScore) -> float:
     """The p-value that let an effect in: of the search, or of the one question that was put to the sealed cycles."""
-    return score.family_wise_p if score.family_wise_p <= ENTRY_LEVEL else score.held_out_p
+    return score.family_wise_p if score.family_wise_p <= SEARCH_LEVEL else score.held_out_p
 
 
 def _confirmation(term: Term, score: FamilyScore) -> str:
     """How an effect was confirmed, in words."""
-    if score.family_wise_p > ENTRY_LEVEL:
+    if score.family_wise_p > SEARCH_LEVEL:
         return (
             "the strongest candidate of a search that could not decide; the sealed cycles, asked once about it, agree"
         )
