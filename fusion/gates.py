@@ -11,13 +11,14 @@ import numpy as np
 from fusion.effects import Effect
 from fusion.members import Member, warm_up
 from fusion.model import ModelFit
+from fusion.projections import residual_squares
 from fusion.readings import Readings, Series
 from interferometry.statespace import Array, fit_fixed_effects
 
 #: Temperature noise over range beyond which a lag is not believed: where the machine is switched, and for one warm-up only.
 _NOISE_SHARE = {"switched": 0.01, "warm-up": 0.003}
 #: A state of which one plain warm-up explains more than this share has been excited by nothing else: simulated warm-ups reach 0.991.
-_WARM_UP_SHARE = 0.99
+WARM_UP_SHARE = 0.99
 #: Log-likelihood that must be left beside free warm-ups of every time constant (protected test), and over a smoothed copy.
 _PROTECTED_GAIN = 4.0
 _SMOOTH_GAIN = 2.0
@@ -35,8 +36,8 @@ def blocked_reason(effect: Effect, member: Member, part: Readings, model: ModelF
     """
     if not effect.excited_by:
         return None
-    share = _warm_up_share(part, member)
-    single = share > _WARM_UP_SHARE
+    share = warm_up_share(part, member)
+    single = share > WARM_UP_SHARE
     if effect.excited_by == "field":
         noise = noise_share(part.series["mean_rise"])
         limit = _NOISE_SHARE["warm-up" if single else "switched"]
@@ -98,7 +99,7 @@ def _centred_mean(series: Series, half_width_s: float) -> Series:
     return Series(series.seconds, smoothed.reshape(series.values.shape), series.units)
 
 
-def _warm_up_share(part: Readings, member: Member) -> float:
+def warm_up_share(part: Readings, member: Member) -> float:
     """Share of the candidate's course at the far end of the travel that one plain warm-up explains (least of its columns)."""
     far = np.abs(part.position_mm) == np.abs(part.position_mm).max()
     curves = [warm_up(part, minutes)[far] for minutes in np.geomspace(5.0, 400.0, 40)]
@@ -129,6 +130,8 @@ def _follows_the_rate(model: ModelFit, member: Member) -> bool:
 def _gain(model: ModelFit, member: Member, beside: Array | None) -> float:
     """Log-likelihood that the candidate gains beside the model and further columns, the drift's variances kept."""
     base = model.fit.design if beside is None else np.column_stack([model.fit.design, beside])
-    without = fit_fixed_effects(model.fit.system, model.fit.response, base)
-    with_member = fit_fixed_effects(model.fit.system, model.fit.response, np.column_stack([base, member.columns]))
-    return 0.5 * model.fit.response.size * float(np.log(without.rss / with_member.rss))
+    whitened, _ = model.fit.system.whiten(np.column_stack([model.fit.response, base, member.columns]))
+    y, x = whitened[:, 0], whitened[:, 1:]
+    # A copy that is smoothed over the whole campaign is a constant, which the model has already.
+    without, with_member = residual_squares(y, x[:, : base.shape[1]]), residual_squares(y, x)
+    return 0.5 * y.size * float(np.log(without / with_member))

@@ -106,6 +106,7 @@ def close_loop(
         not_tried=search.not_tried,
         blocked=search.blocked,
         question=search.question,
+        identifiable=search.identifiable,
         nuisance=nuisance_size(whole),
         before=models[0],
         after=whole,

@@ -268,6 +268,15 @@ def aliased_lead_mm(readings: Readings, frequency: float) -> str:
     return ", ".join(f"{lead:.3g}" for lead in sorted(leads, reverse=True)) + " mm"
 
 
+def hidden_leads_mm(readings: Readings) -> str:
+    """Leads between 2 and 50 mm of which evenly spaced targets see one phase only; empty where the spacing is uneven."""
+    if not _evenly_spaced(readings):
+        return ""
+    spacing = float(np.ptp(readings.positions_mm)) / (readings.positions_mm.size - 1)
+    leads = [spacing / k for k in range(1, int(spacing / 2.0) + 1) if 2.0 <= spacing / k <= 50.0]
+    return ", ".join(f"{lead:.3g}" for lead in leads) + " mm" if leads else ""
+
+
 def _close_periods(readings: Readings, found_min: float) -> Array:
     """Periods around one that was found, as close as the record can tell apart."""
     span = float(readings.seconds[-1] - readings.seconds[0]) / 60.0

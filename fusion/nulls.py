@@ -25,6 +25,13 @@ def tail_probability(value: float, null: Array) -> float:
     return float(0.1 * np.exp(-(value - threshold) / excess))
 
 
+def critical_gain(p_value: float, null: Array) -> float:
+    """The gain whose chance is ``p_value`` (at most 0.1): the inverse of :func:`tail_probability`."""
+    threshold = float(np.quantile(null, 0.9))
+    excess = max(1.0, float((null[null > threshold] - threshold).mean()))
+    return threshold + excess * float(np.log(0.1 / min(p_value, 0.1)))
+
+
 def plausible_ratios(fit: DriftFit, rng: np.random.Generator, *, draws: int) -> Array:
     """Drift variance ratios (draws, components) that the readings leave possible, drawn by their restricted likelihood.
 

@@ -18,15 +18,33 @@ from interferometry.statespace import Array
 #: A candidate of which the model explains all but this share adds nothing that these data can show.
 _SEPARABLE_SHARE = 1e-4
 _RIDGE = 1e-9
+#: Singular value, relative to the largest, below which a direction of scaled columns counts as given by the others.
+_INDEPENDENT = 1e-3
 
 
 def gain_across(y: Array, c: Array, half: NDArray[np.bool_]) -> Array:
-    """An event cannot be confirmed in time: its size from one half of the targets, its error on the other, and back."""
+    """An event cannot be confirmed in time: its instant and size from one half of the targets, its error on the other, and back.
+
+    ``y`` (n, r) responses, each of which chooses its own of the events ``c`` (n, events); reduction of the squared error, (r,).
+    """
     gain = np.zeros(y.shape[1])
     for train, test in ((half, ~half), (~half, half)):
-        size = solve(c[train].T @ c[train], c[train].T @ y[train])
-        gain += (y[test] ** 2).sum(axis=0) - ((y[test] - c[test] @ size) ** 2).sum(axis=0)
+        energy = np.maximum((c[train] ** 2).sum(axis=0), 1e-12)
+        moment = c[train].T @ y[train]
+        chosen = np.argmax(moment**2 / energy[:, None], axis=0)
+        size = np.take_along_axis(moment, chosen[None, :], axis=0)[0] / energy[chosen]
+        along = np.einsum("nr,nr->r", c[test][:, chosen], y[test])
+        gain += 2.0 * size * along - size**2 * (c[test] ** 2).sum(axis=0)[chosen]
     return gain
+
+
+def residual_squares(y: Array, x: Array) -> float:
+    """Residual sum of squares of y (n,) beside columns x (n, p), which may depend on each other."""
+    scale = np.maximum(np.linalg.norm(x, axis=0), 1e-12)
+    u, s, _ = np.linalg.svd(x / scale, full_matrices=False)
+    u = u[:, s > _INDEPENDENT * s[0]]
+    left = y - u @ (u.T @ y)
+    return float(left @ left)
 
 
 def without(x: Array, y: Array) -> Array:

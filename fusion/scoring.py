@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from fusion.members import Member
 from fusion.model import ModelFit
-from fusion.nulls import DRAWS, least_ratio, simulate_null, tail_probability
+from fusion.nulls import DRAWS, critical_gain, least_ratio, simulate_null, tail_probability
 from fusion.projections import (
     by_width,
     density_ahead,
@@ -62,6 +62,7 @@ class FamilyScore:
     held_out_gain, held_out_p : gain on blocks that were not used for the coefficients, and its chance where nothing is missing
     collinear : share of members that the model already contains
     drift_place : which drift of the grid suits the member best
+    critical : gain from which on the effect enters, as far as chance is concerned
     """
 
     name: str
@@ -74,6 +75,7 @@ class FamilyScore:
     held_out_p: float
     collinear: float
     drift_place: int = 0
+    critical: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -130,13 +132,14 @@ class Judge:
     used: NDArray[np.bool_]
     known: Known
 
-    def score(self, families: Mapping[str, Sequence[Member]]) -> list[FamilyScore]:
-        """Score all members of all effects; none is confirmed yet."""
+    def score(self, families: Mapping[str, Sequence[Member]], *, level: float = 0.05) -> list[FamilyScore]:
+        """Score all members of all effects; none is confirmed yet. ``level`` is the chance that any enters where nothing is missing."""
         named = [(name, member) for name, members in families.items() for member in members]
         if not named:
             return []
         gains, places, separable = self._gains([member for _, member in named], self.draws)
         scores: list[FamilyScore] = []
+        tried = sum(bool(members) for members in families.values())
         for name in families:
             rows = np.array([k for k, (family, _) in enumerate(named) if family == name], int)
             if rows.size == 0:
@@ -151,8 +154,8 @@ class Judge:
             gain = float(gains[best, 0])
             p_value, excess = tail_probability(gain, null), gain - float(null.mean())
             place = int(places[best])
-            scores.append(FamilyScore(name, named[best][1], gain, excess, p_value, 1.0, 0.0, 1.0, collinear, place))
-        tried = len(scores)
+            found = FamilyScore(name, named[best][1], gain, excess, p_value, 1.0, 0.0, 1.0, collinear, place)
+            scores.append(replace(found, critical=critical_gain(1.0 - (1.0 - level) ** (1.0 / tried), null)))
         return [replace(score, family_wise_p=1.0 - (1.0 - score.p_value) ** tried) for score in scores]
 
     def refine(self, score: FamilyScore, near: Sequence[Member]) -> FamilyScore:
@@ -165,22 +168,41 @@ class Judge:
         excess = score.excess + gain - score.gain
         return replace(score, member=near[best], gain=gain, excess=excess, drift_place=int(places[best]))
 
-    def confirm(self, scores: Sequence[FamilyScore]) -> list[FamilyScore]:
-        """The same scores with the gain in predictive log-density on unused readings, and its chance where nothing is missing."""
-        lasting = [score.member for score in scores if score.member is not None and score.member.event_s is None]
-        in_time = iter(self._gains_in_time(lasting) if lasting else ())
+    def confirm(self, scores: Sequence[FamilyScore], families: Mapping[str, Sequence[Member]]) -> list[FamilyScore]:
+        """The same scores with the gain in predictive log-density on unused readings, and its chance where nothing is missing.
+
+        Which member of an effect is confirmed is decided without those readings, or their chance would be understated.
+        """
+        lasting = [score for score in scores if not _is_event(score)]
+        early = [self._strongest_early(families[score.name]) for score in lasting]
+        in_time = iter(self._gains_in_time(early) if early else ())
         confirmed = []
         for score in scores:
-            if score.member is None:
-                confirmed.append(score)
-                continue
-            event = score.member.event_s is not None
-            gain = self._event_gain(score.member, score.drift_place) if event else next(in_time)
+            events = families[score.name]
+            gain = self._event_gain(events, score.drift_place) if _is_event(score) else next(in_time)
             chance = float((1 + (gain[1:] >= gain[0]).sum()) / gain.size)
             confirmed.append(replace(score, held_out_gain=float(gain[0]), held_out_p=chance))
         return confirmed
 
-    def _systems(self) -> list[DriftSystem]:
+    def _strongest_early(self, members: Sequence[Member]) -> Member:
+        """The member with the largest gain on the early readings alone."""
+        system, early = self.fit.system, self.early
+        cut = replace(
+            system,
+            seconds=system.seconds[early],
+            loadings=system.loadings[early],
+            variance=system.variance[early],
+            observed=system.observed[early],
+        )
+        fit = replace(self.fit, system=cut, response=self.fit.response[early], design=self.fit.design[early])
+        used = self.used.copy()
+        used[self.used] = early
+        judge = replace(self, fit=fit, draws=np.empty((int(early.sum()), 0)), used=used)
+        gains, _, separable = judge._gains(members, judge.draws)
+        return members[int(np.argmax(np.where(separable, gains[:, 0], -np.inf)))]
+
+    def systems(self) -> list[DriftSystem]:
+        """The fit's drift with every set of variances of the grid."""
         system = self.fit.system
         centre = np.maximum(system.ratios, least_ratio(system))
         return [replace(system, ratios=centre * np.resize(10.0 ** np.asarray(pair), centre.size)) for pair in _GRID]
@@ -199,7 +221,7 @@ class Judge:
         best = np.full((count, len(members)), -np.inf)
         best_grid = np.zeros(len(members), int)
         separable = np.zeros(len(members), bool)
-        for place, system in enumerate(self._systems()):
+        for place, system in enumerate(self.systems()):
             c, spread = system.innovations(columns)
             root, log_determinant = np.sqrt(spread)[:, None], float(np.log(spread).sum())
             c /= root
@@ -223,12 +245,11 @@ class Judge:
         widths = np.array([member.columns.shape[1] for member in members])
         return (best - best_null[:, None] - (widths - 1.0)).T, best_grid, separable
 
-    def _event_gain(self, member: Member, place: int) -> Array:
-        """Gain of an event whose size comes from one half of the targets on the other half, (1 + draws,)."""
+    def _event_gain(self, members: Sequence[Member], place: int) -> Array:
+        """Gain of an event whose instant and size come from one half of the targets on the other half, and back, (1 + draws,)."""
         responses = self._responses()
-        whitened, _ = self._systems()[place].whiten(
-            np.column_stack([responses, self.fit.design, member.columns[self.used]])
-        )
+        columns = np.column_stack([member.columns[self.used, 0] for member in members])
+        whitened, _ = self.systems()[place].whiten(np.column_stack([responses, self.fit.design, columns]))
         y, x, c = np.split(whitened, [responses.shape[1], responses.shape[1] + self.fit.design.shape[1]], axis=1)
         n = c.shape[0]
         y, x = self.known.append(y, x)
@@ -249,7 +270,7 @@ class Judge:
         columns = np.column_stack([responses, self.fit.design, *(member.columns[self.used] for member in members)])
         known: list[list[Array]] = [[] for _ in designs]
         ahead: list[list[Array]] = [[] for _ in designs]
-        for system in self._systems():
+        for system in self.systems():
             errors, spread = system.innovations(columns)
             errors /= np.sqrt(spread)[:, None]
             y, x = errors[:, :count], errors[:, count:]
@@ -264,6 +285,10 @@ class Judge:
             for before, after in zip(known, ahead, strict=True)
         ]
         return [np.asarray(one - chosen[0]) for one in chosen[1:]]
+
+
+def _is_event(score: FamilyScore) -> bool:
+    return score.member is not None and score.member.event_s is not None
 
 
 def ask_sealed(model: ModelFit, member: Member, rng: np.random.Generator) -> tuple[float, float, float]:

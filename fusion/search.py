@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fusion.effects import LIBRARY, Effect
 from fusion.episodes import cycle_starts
 from fusion.gates import blocked_reason
+from fusion.identifiability import Identifiable, identify
 from fusion.members import Member
 from fusion.model import ModelFit, Term, fit_model
 from fusion.nulls import simulate_null
@@ -22,7 +23,7 @@ from fusion.scoring import FamilyScore, Judge, ask_sealed, known_of
 ENTRY_LEVEL = 0.05
 SEARCH_LEVEL, ASKED_LEVEL, SECOND_LEVEL = 0.03, 0.01, 0.01
 #: Chance that an effect which is not there passes its confirmation on unused readings; the search has been paid for already.
-CONFIRMATION_LEVEL = 0.2
+CONFIRMATION_LEVEL = 0.1
 #: Evidence so strong that an inconclusive confirmation does not stop it: few switchings of a load leave early blocks without a say.
 #: The sealed cycles then decide, because an effect that makes their error larger is withdrawn.
 STRONG_LEVEL = 0.001
@@ -72,6 +73,7 @@ class Search:
         }
         self.blocked: dict[str, str] = {}
         self.question: SealedQuestion | None = None
+        self.identifiable: list[Identifiable] = []
 
     def fit(self, terms: Sequence[Term]) -> ModelFit:
         """Fit terms to the readings that are not sealed."""
@@ -101,9 +103,12 @@ class Search:
         """
         judge = self._judge(model)
         families = {name: self._inside(members, model) for name, members in self._families(model).items()}
-        scores = judge.score({name: members for name, members in families.items() if members})
+        families = {name: members for name, members in families.items() if members}
+        scores = judge.score(families, level=SEARCH_LEVEL)
+        if not self.identifiable:
+            self.identifiable = identify(judge, model, families, scores, self.effects)
         worth = [k for k, score in enumerate(scores) if score.member is not None and score.p_value < _WORTH_CONFIRMING]
-        closer = judge.confirm([self._refined(scores[k], judge, model) for k in worth])
+        closer = judge.confirm([self._refined(scores[k], judge, model) for k in worth], families)
         for k, score in zip(worth, closer, strict=True):
             scores[k] = score
         return sorted(scores, key=lambda score: -score.excess)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import stats
 
 from fusion.model import ModelFit, Term
+from fusion.projections import residual_squares
 from interferometry.statespace import Array
 
 #: Chance at which a right effect is denied its name.
@@ -68,11 +69,7 @@ def _one_pattern(model: ModelFit, terms: tuple[Term, Term], courses: tuple[Array
 def _left(model: ModelFit, design: Array) -> float:
     """Whitened residual sum of squares beside a design whose columns may depend on each other."""
     whitened, _ = model.fit.system.whiten(np.column_stack([model.fit.response, design]))
-    scale = np.maximum(np.linalg.norm(whitened[:, 1:], axis=0), 1e-12)
-    u, s, _ = np.linalg.svd(whitened[:, 1:] / scale, full_matrices=False)
-    u = u[:, s > np.sqrt(_SEPARABLE) * s[0]]
-    left = whitened[:, 0] - u @ (u.T @ whitened[:, 0])
-    return float(left @ left)
+    return residual_squares(whitened[:, 0], whitened[:, 1:])
 
 
 def _free_pattern(model: ModelFit, course: Array) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.adequacy import Remainder
+from fusion.identifiability import Identifiable
 from fusion.model import ModelFit, Term, unexplained_drift
 from fusion.readings import Readings
 from fusion.scoring import FamilyScore
@@ -68,6 +69,7 @@ class LoopResult:
     not_tried: dict[str, str]
     blocked: dict[str, str]
     question: SealedQuestion | None
+    identifiable: list[Identifiable]
     nuisance: dict[str, float | str]
     before: ModelFit
     after: ModelFit
@@ -95,6 +97,7 @@ class LoopResult:
             if self.question
             else {},
             "search": [[_score_json(score) for score in scores] for scores in self.rounds],
+            "identifiability": [vars(one) for one in self.identifiable],
             "not_tried": self.not_tried,
             "blocked": self.blocked,
         }
