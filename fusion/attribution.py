@@ -40,9 +40,9 @@ _POWER_80 = 0.8416
 #: Bins of the pooled null distribution of one cell's statistic.
 _BINS = np.concatenate([np.arange(0.0, 40.0, 0.1), [np.inf]])
 
-#: Mean length of the runs of whitened residuals that stay together when they are put into other orders. Switched loads leave traces of
-#: several cycles in the residuals; single values in free order gave twice the promised false alarms there.
-_BLOCK = 10
+#: Mean length of the runs of whitened residuals that stay together when they are put into other orders, as a share of the session.
+#: Switched loads leave traces of several cycles in the residuals; single values in free order gave twice the promised false alarms there.
+_RUN_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -200,13 +200,12 @@ class _Tally:
             false_alarm_rate=false_alarm_rate,
         )
 
-    def add(self, channel: int, cells: slice, ratio: Array32, effects: Array) -> None:
-        """Enter ratios (1 + nulls, cells, lags) and effects (3, cells, lags) of one channel."""
+    def add(self, channel: int, cells: slice, ratio: Array32, chosen: NDArray[np.int64], effects: Array) -> None:
+        """Enter ratios (1 + nulls, cells, lags) of one channel, the chosen lags (cells,) and the effects there (3, cells)."""
         best = ratio.max(axis=2)
-        chosen = ratio[0].argmax(axis=1)
         self.statistic[channel, cells] = best[0]
         self.lag_index[channel, cells] = chosen
-        self.effects[:, channel, cells] = np.take_along_axis(effects, chosen[None, :, None], axis=2)[:, :, 0]
+        self.effects[:, channel, cells] = effects
         if best.shape[0] > 1:
             self.maxima[channel] = np.maximum(self.maxima[channel], best[1:].max(axis=1))
             bins = np.minimum((best[1:] / _BINS[1]).astype(np.int64), _BINS.size - 2)
@@ -230,19 +229,21 @@ def _test_film(sources: Sequence[_Source], film: Film, lags: int, tally: _Tally)
 def _test_tile(sources: Sequence[_Source], film32: Array32, cells: slice, lags: int, tally: _Tally) -> None:
     """Test a tile of cells against every series, and the first two together where the tally has room for that."""
     count = cells.stop - cells.start
-    ratios, effects = [], []
-    for source in sources:
-        regressors = _respond_tile(source.response, film32)
-        ratios.append(likelihood_ratios(source.bank, source.whitened, regressors).reshape(-1, count, lags))
-        effects.append(_stack(estimate_effects(source.bank, regressors)).reshape(3, count, lags))
+    regressors = [_respond_tile(source.response, film32) for source in sources]
+    ratios = [
+        likelihood_ratios(source.bank, source.whitened, moved).reshape(-1, count, lags)
+        for source, moved in zip(sources, regressors, strict=True)
+    ]
+    members = [[k] for k in range(len(sources))]
     if tally.statistic.shape[0] > len(sources):
         ratios.append(ratios[0] + ratios[1])
         # The joint effect is that at the far end of travel: common plus proportional at +1.
-        effects.append(
-            np.stack([effects[0][0] + effects[1][0], *[np.hypot(effects[0][row], effects[1][row]) for row in (1, 2)]])
-        )
-    for channel, (ratio, effect) in enumerate(zip(ratios, effects, strict=True)):
-        tally.add(channel, cells, ratio, effect)
+        members.append([0, 1])
+    for channel, (ratio, together) in enumerate(zip(ratios, members, strict=True)):
+        chosen = ratio[0].argmax(axis=1)
+        columns = np.arange(count) * lags + chosen
+        parts = np.stack([_stack(estimate_effects(sources[k].bank, regressors[k][:, columns])) for k in together])
+        tally.add(channel, cells, ratio, chosen, np.stack([parts[:, 0].sum(axis=0), *np.hypot.reduce(parts[:, 1:])]))
 
 
 def _stack(estimate: Estimate) -> Array:
@@ -275,8 +276,8 @@ def _draw(
 
 
 def _shuffle_blocks(length: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """A new order of 0..length-1 that keeps runs of about ten together: what one event does to its neighbours stays with it."""
-    cuts = np.flatnonzero(rng.random(length) < 1.0 / _BLOCK)
+    """A new order of 0..length-1 that keeps runs together: what one event does to its neighbours stays with it."""
+    cuts = np.flatnonzero(rng.random(length) < 1.0 / (_RUN_SHARE * length))
     turned = np.roll(np.arange(length), int(rng.integers(length)))
     blocks = np.split(turned, cuts[cuts > 0])
     return np.concatenate([blocks[k] for k in rng.permutation(len(blocks))])

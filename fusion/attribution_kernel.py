@@ -43,6 +43,7 @@ class Whitening:
     per_hour : standard deviation of the drift's increment over one hour, in units of one value's noise
     project, project32 : (n, n) whitens and removes the nuisance columns, in double and single precision
     colour : (n, n) inverse of the whitening
+    basis : (n, k) orthonormal columns that the whitened nuisance columns span
     log_penalty : log-determinant terms of the restricted likelihood divided by the degrees of freedom
     """
 
@@ -51,6 +52,7 @@ class Whitening:
     project: Array
     project32: Array32
     colour: Array
+    basis: Array
     log_penalty: float
 
 
@@ -142,7 +144,7 @@ def whitening_grid(seconds: Array, variance: Array, nuisance: Array, *, integrat
         log_normal = 2.0 * float(np.log(np.abs(np.diag(triangle))).sum())
         penalty = float(log_determinant + log_normal) / freedom
         whitenings.append(
-            Whitening(order, per_hour, project, project.astype(np.float32), _invert_lower(white), penalty)
+            Whitening(order, per_hour, project, project.astype(np.float32), _invert_lower(white), basis, penalty)
         )
     return Grid(tuple(whitenings), freedom, scale)
 
@@ -177,10 +179,14 @@ def resample(bank: NullBank, orders: NDArray[np.int64], rng: np.random.Generator
         null = bank.whitenings[g]
         rows = np.flatnonzero(chosen == g)
         residual = null.project @ bank.values
-        residual = (residual - residual.mean()) * np.sqrt(residual.size / bank.freedom)
-        innovations = (
-            rng.standard_normal((rows.size, residual.size)) * residual.std() if gaussian else residual[orders[rows]]
-        )
+        spread = float(np.sqrt(residual @ residual / bank.freedom))
+        if gaussian:
+            innovations = spread * rng.standard_normal((rows.size, residual.size))
+        else:
+            # What the nuisance columns took out of the residuals is put back at random: without it, orders that keep runs together
+            # would lack slow parts, and their maxima would be too small.
+            taken = spread * rng.standard_normal((rows.size, null.basis.shape[1])) @ null.basis.T
+            innovations = np.take_along_axis(residual + taken, orders[rows], axis=1)
         series[rows] = innovations @ null.colour.T
     return series
 

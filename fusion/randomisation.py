@@ -172,8 +172,8 @@ def randomisation_test(
     -------
     Dataset
         Per source ``p_value`` (family-wise over sources, exact), ``statistic``, ``response`` (index into the bank, with
-        ``time_constant`` and ``second_time_constant`` in s), ``sensitivity`` and ``sensitivity_u`` (um for full duty, common
-        channel). Attribute ``source`` names the source found, or is empty.
+        ``time_constant`` and ``second_time_constant`` in s), ``sensitivity`` and ``sensitivity_u`` (um for full duty, at the
+        far end of travel). Attribute ``source`` names the source found, or is empty.
 
     Raises
     ------
@@ -201,7 +201,13 @@ def randomisation_test(
     chosen = measured.argmax(axis=1)
     responses = duty_responses(seconds, courses)
     picked = responses[:, np.arange(len(names)), chosen]
-    effect = estimate_effects(banks[0], np.ascontiguousarray(series[0].sampling @ picked, np.float32))
+    effects = [
+        estimate_effects(bank, np.ascontiguousarray(one.sampling @ picked, np.float32))
+        for one, bank in zip(series, banks, strict=True)
+    ]
+    # At the far end of travel, what is common and what grows with position add up.
+    size = np.sum([effect.coefficient for effect in effects], axis=0)
+    size_u = np.sqrt(np.sum([effect.coefficient_u**2 for effect in effects], axis=0))
     found = names[int(best.argmax())] if p_value[int(best.argmax())] <= LEVEL else ""
     constants = np.array(RESPONSES_S)[chosen]
     return xr.Dataset(
@@ -210,8 +216,12 @@ def randomisation_test(
             "statistic": (("source",), best, {"units": "1"}),
             "time_constant": (("source",), constants[:, 0], {"units": "s"}),
             "second_time_constant": (("source",), constants[:, 1], {"units": "s"}),
-            "sensitivity": (("source",), effect.coefficient, {"units": "um", "long_name": "drift at full duty"}),
-            "sensitivity_u": (("source",), effect.coefficient_u, {"units": "um"}),
+            "sensitivity": (
+                ("source",),
+                size,
+                {"units": "um", "long_name": "drift at the far end of travel at full duty"},
+            ),
+            "sensitivity_u": (("source",), size_u, {"units": "um"}),
         },
         coords={"source": names},
         attrs={"source": found, "draws": draws},

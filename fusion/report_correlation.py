@@ -108,14 +108,16 @@ def _channel_row(maps: xr.Dataset, channel: str) -> Row:
     ]
 
 
-def _candidate_rows(maps: xr.Dataset, name: str, kind: str) -> list[dict[str, Any]]:
-    """Modes or regions: per part of the drift p, sensitivity, lag, and what would have been found."""
+def _candidate_rows(maps: xr.Dataset, name: str, kind: str) -> dict[str, list[dict[str, Any]]]:
+    """Modes or regions: the strongest part of the drift for each, and all parts, with p, sensitivity, lag, and what would be found."""
     if not has(maps, name):
-        return []
+        return {"strongest": [], "all": []}
     few = group(maps, name)
-    rows = []
+    ratio = (few["statistic"] / few["threshold"]).fillna(0.0)
+    strongest, everything = [], []
     for at in range(few.sizes[kind]):
         one = few.isel({kind: at})
+        rows = []
         for channel in map(str, few["channel"].values):
             part = one.sel(channel=channel)
             cells = [
@@ -128,7 +130,9 @@ def _candidate_rows(maps: xr.Dataset, name: str, kind: str) -> list[dict[str, An
                 number(float(part["detectable_sensitivity"]), 2),
             ]
             rows.append({"cells": cells, "passed": bool(part["p_value"] <= LEVEL)})
-    return rows
+        strongest.append(rows[int(ratio.isel({kind: at}).values.argmax())])
+        everything += rows
+    return {"strongest": strongest, "all": everything}
 
 
 def leading_region(maps: xr.Dataset) -> str:
