@@ -24,6 +24,7 @@ def _filter(
     loadings: Array,
     order: int,
     ratios: Array,
+    pace: Array,
     variance: Array,
     observed: NDArray[np.bool_],
     weights: Array,
@@ -41,7 +42,7 @@ def _filter(
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
         kalman.advance(state[:m], order, step)
-        kalman.predict(covariance, order, ratios, step)
+        kalman.predict(covariance, order, ratios, pace[k], step)
         predicted[k] = covariance
         if observed[k]:
             spread = kalman.look(covariance, order, loadings, k, variance[k], seen)
@@ -114,6 +115,7 @@ def average_drift(system: DriftSystem, weights: Array, columns: Array) -> tuple[
         system.loadings,
         system.order,
         system.ratios,
+        system.paces,
         system.variance,
         system.observed,
         weights,

@@ -178,6 +178,7 @@ def _fit(
         design,
         order=order,
         robust=robust,
+        settling=True,
         start=start,
     )
     return JointFit(readings, cells, cell, components, fit)

@@ -14,23 +14,23 @@ Array = NDArray[np.float64]
 
 
 @njit(cache=True)
-def predict(covariance: Array, order: int, ratios: Array, step: float) -> None:
-    """Carry the state's covariance over a step in s, in place."""
+def predict(covariance: Array, order: int, ratios: Array, pace: float, step: float) -> None:
+    """Carry the state's covariance over a step in s, in place; pace multiplies the ratios during it."""
     m = covariance.shape[0]
     for c in range(ratios.size):
-        level = c * order
+        level, ratio = c * order, ratios[c] * pace
         if order == 2:
             rate = level + 1
             for j in range(m):
                 covariance[level, j] += step * covariance[rate, j]
             for j in range(m):
                 covariance[j, level] += step * covariance[j, rate]
-            covariance[level, level] += ratios[c] * step**3 / 3.0
-            covariance[level, rate] += ratios[c] * step**2 / 2.0
-            covariance[rate, level] += ratios[c] * step**2 / 2.0
-            covariance[rate, rate] += ratios[c] * step
+            covariance[level, level] += ratio * step**3 / 3.0
+            covariance[level, rate] += ratio * step**2 / 2.0
+            covariance[rate, level] += ratio * step**2 / 2.0
+            covariance[rate, rate] += ratio * step
         else:
-            covariance[level, level] += ratios[c] * step
+            covariance[level, level] += ratio * step
 
 
 @njit(cache=True)
@@ -86,7 +86,14 @@ def correct(
 
 @njit(cache=True)
 def gains(
-    seconds: Array, loadings: Array, order: int, ratios: Array, variance: Array, observed: NDArray[np.bool_], keep: bool
+    seconds: Array,
+    loadings: Array,
+    order: int,
+    ratios: Array,
+    pace: Array,
+    variance: Array,
+    observed: NDArray[np.bool_],
+    keep: bool,
 ) -> tuple[Array, Array, Array]:
     """Kalman gains (n, m), innovation variances (n,) in units of sigma^2, and predicted covariances (n, m, m) if kept."""
     n, components = loadings.shape
@@ -98,7 +105,7 @@ def gains(
     seen = np.zeros(m)
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        predict(covariance, order, ratios, step)
+        predict(covariance, order, ratios, pace[k], step)
         if keep:
             kept[k] = covariance
         spread[k] = look(covariance, order, loadings, k, variance[k], seen)
@@ -224,6 +231,7 @@ def normal_equations(
     loadings: Array,
     order: int,
     ratios: Array,
+    pace: Array,
     variance: Array,
     observed: NDArray[np.bool_],
     columns: Array,
@@ -243,7 +251,7 @@ def normal_equations(
     log_determinant = 0.0
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        predict(covariance, order, ratios, step)
+        predict(covariance, order, ratios, pace[k], step)
         advance(state, order, step)
         if not observed[k]:
             continue

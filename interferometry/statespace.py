@@ -16,16 +16,25 @@ analysis by state space methods*, sections 4.4-4.5 (smoothing and disturbances) 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
 from interferometry import kalman
+from interferometry.driftsystem import Array, DriftModelError, DriftSystem, Order, drift_system, start_columns
 
-Array = NDArray[np.float64]
-Order = Literal[1, 2]
+__all__ = [
+    "Array",
+    "DriftFit",
+    "DriftModelError",
+    "DriftSystem",
+    "Order",
+    "drift_system",
+    "estimate",
+    "fit_fixed_effects",
+    "start_columns",
+]
 
 #: Search limits of log10(drift variance ratio): from a drift that nobody can see to one that hides everything else.
 _LOG_RATIO_LIMITS = (-14.0, 4.0)
@@ -36,77 +45,14 @@ _DEPENDENCE_TOLERANCE = 1e-10
 #: A drift is called smooth (integrated walk) only on this much more restricted log-likelihood: where both fit, the rougher one is
 #: the safer nuisance, because it claims less of what lies ahead.
 _SMOOTH_MARGIN = 2.0
+#: A drift that settles has two parameters more; by the Bayesian information criterion they have to raise the log-likelihood of some
+#: thousand readings by 8.
+_SETTLING_MARGIN = 8.0
+#: First guess of its time as a share of the test, and search limits: below a hundredth it concerns a cycle or two.
+_SETTLING_SHARE, _SETTLING_LIMITS = 1.0 / 15.0, (1.0 / 100.0, 1.0)
+_FASTEST_SETTLING = 6.0
 _ROBUST_ROUNDS = 2
 _ROBUST_PASSES = 3
-
-
-class DriftModelError(ValueError):
-    """The readings or columns cannot be fitted; the message names what is wrong and what to do."""
-
-
-@dataclass(frozen=True)
-class DriftSystem:
-    """Readings' times and loadings with the variances of their drift.
-
-    Attributes
-    ----------
-    seconds : (n,) time of each reading in s, not decreasing
-    loadings : (n, components) how each drift component enters each reading
-    order : 1 random walk, 2 integrated random walk
-    ratios : (components,) drift variance over reading variance, per s (order 1) or per s^3 (order 2)
-    variance : (n,) relative variance of each reading, 1 for an ordinary one
-    observed : (n,) False for a reading that must not update the drift (held out: predicted in open loop)
-    """
-
-    seconds: Array
-    loadings: Array
-    order: Order
-    ratios: Array
-    variance: Array
-    observed: NDArray[np.bool_]
-
-    def _filter(self, keep: bool) -> tuple[Array, Array, Array]:
-        return kalman.gains(self.seconds, self.loadings, self.order, self.ratios, self.variance, self.observed, keep)
-
-    def innovations(self, columns: Array) -> tuple[Array, Array]:
-        """Prediction errors (n, p) of columns (n, p), and their variances (n,) in units of sigma^2."""
-        gains, spread, _ = self._filter(False)
-        errors, _ = kalman.innovations(
-            self.seconds, self.loadings, self.order, gains, np.ascontiguousarray(columns), False
-        )
-        return errors, spread
-
-    def normal_equations(self, columns: Array) -> tuple[Array, float]:
-        """Gram matrix (p, p) of the whitened columns (n, p) of the observed readings, and the log-determinant of their covariance."""
-        return kalman.normal_equations(
-            self.seconds,
-            self.loadings,
-            self.order,
-            self.ratios,
-            self.variance,
-            self.observed,
-            np.ascontiguousarray(columns),
-        )
-
-    def whiten(self, columns: Array) -> tuple[Array, float]:
-        """Standardised prediction errors of the observed readings (n_observed, p), and the log-determinant of their covariance."""
-        errors, spread = self.innovations(columns)
-        kept = spread[self.observed]
-        return errors[self.observed] / np.sqrt(kept)[:, None], float(np.log(kept).sum())
-
-    def smooth(self, columns: Array) -> tuple[Array, Array, Array, Array]:
-        """Smoothed drift levels (n, components, p) of columns (n, p), covariance (n, components, components), u (n, p) and D (n,).
-
-        ``u / D`` is each observed reading's deletion residual, ``1 / D`` its variance, ``variance * u`` its estimated noise
-        (Durbin and Koopman, 4.69).
-        """
-        gains, spread, covariances = self._filter(True)
-        errors, states = kalman.innovations(
-            self.seconds, self.loadings, self.order, gains, np.ascontiguousarray(columns), True
-        )
-        return kalman.smooth(
-            self.seconds, self.loadings, self.order, gains, spread, self.observed, errors, states, covariances
-        )
 
 
 @dataclass(frozen=True)
@@ -171,40 +117,6 @@ class DriftFit:
             ordinary = 1.0 / d - self.system.variance + 1.0
             standardised = (u[:, 0] / d) / (self.sigma * np.sqrt(ordinary))
         return np.where(d > 0, standardised, np.nan)
-
-
-def start_columns(seconds: Array, loadings: Array, order: Order) -> Array:
-    """Fixed effects of the drift's start: levels, and for an integrated walk also rates per hour, (n, components * order)."""
-    if order == 1:
-        return loadings
-    return np.column_stack([loadings, loadings * (seconds / 3600.0)[:, None]])
-
-
-def drift_system(
-    seconds: Array,
-    loadings: Array,
-    *,
-    order: Order,
-    ratios: Array,
-    variance: Array | None = None,
-    observed: NDArray[np.bool_] | None = None,
-) -> DriftSystem:
-    """Build a drift system; raises DriftModelError where times run backwards, are missing, or shapes disagree."""
-    seconds = np.ascontiguousarray(seconds, float)
-    loadings = np.ascontiguousarray(loadings, float)
-    n = seconds.size
-    if loadings.ndim != 2 or loadings.shape[0] != n:
-        raise DriftModelError(f"loadings has shape {loadings.shape}; expected ({n}, number of drift components)")
-    if not np.isfinite(seconds).all() or (np.diff(seconds) < 0).any():
-        raise DriftModelError("seconds must be finite and must not decrease; sort the readings by time first")
-    return DriftSystem(
-        seconds,
-        loadings,
-        order,
-        np.ascontiguousarray(ratios, float),
-        np.ones(n) if variance is None else np.ascontiguousarray(variance, float),
-        np.ones(n, bool) if observed is None else np.ascontiguousarray(observed, bool),
-    )
 
 
 def fit_fixed_effects(system: DriftSystem, response: Array, design: Array) -> DriftFit:
@@ -302,6 +214,56 @@ def _maximise(system: DriftSystem, response: Array, design: Array, start: Array 
     return fitted(found.x)
 
 
+def settling_pace(seconds: Array, time_s: float, exponent: float) -> Array:
+    """Factor (n,) on the drift's variance that starts at 1 and falls as a power of the time since the first reading.
+
+    A warm-up is a sum of exponentials from fast to slow, whose curvature falls about like that. With one constant variance the
+    drift is taken to be as calm at the start as it is later: it is then smoothed too much there, and its bands are too narrow.
+    """
+    return (1.0 + (seconds - seconds[0]) / time_s) ** -exponent
+
+
+def _settle(fit: DriftFit) -> DriftFit:
+    """Return the fit with a livelier drift at the start, where the readings clearly say that it settles; else the fit as it was.
+
+    Later on the drift keeps the variance of the fit, though the likelihood would lower it: the rougher drift claims less.
+    """
+    system, problem = fit.system, _Problem.of(fit.response, fit.design)
+    span = float(system.seconds[-1] - system.seconds[0])
+    first = _SETTLING_SHARE * span
+
+    def fitted(log_ratio: Array, time_s: float, exponent: float) -> DriftFit:
+        pace = settling_pace(system.seconds, time_s, exponent)
+        return _solve(replace(system, ratios=10.0**log_ratio, pace=pace), problem)
+
+    def scaled(exponent: float) -> Array:
+        return np.log10(system.ratios / settling_pace(system.seconds, first, exponent).mean())
+
+    likely = max((1.0, 2.0), key=lambda exponent: fitted(scaled(exponent), first, exponent).log_likelihood)
+    if fitted(scaled(likely), first, likely).log_likelihood < fit.log_likelihood:
+        return fit
+    components = system.ratios.size
+    guess = np.r_[scaled(likely), np.log10(first), likely]
+    limits = np.log10(span * np.array(_SETTLING_LIMITS))
+    found = optimize.minimize(
+        lambda x: -fitted(x[:components], 10.0 ** x[-2], x[-1]).log_likelihood,
+        guess,
+        method="Nelder-Mead",
+        bounds=[(None, None)] * components + [tuple(limits), (0.0, _FASTEST_SETTLING)],
+        options={
+            "initial_simplex": np.vstack([guess, guess + np.diag([1.0] * components + [0.5, 1.0])]),
+            "xatol": 0.03,
+            "fatol": 1e-2,
+            "maxfev": 80 * guess.size,
+        },
+    )
+    settled = fitted(found.x[:components], 10.0 ** found.x[-2], found.x[-1]).system
+    if -found.fun < fit.log_likelihood + _SETTLING_MARGIN:
+        return fit
+    livelier = float(np.exp(np.log(settled.ratios / system.ratios).mean()))
+    return _solve(replace(system, pace=np.maximum(1.0, livelier * settled.paces)), problem)
+
+
 def _downweight(fit: DriftFit) -> Array:
     """Relative variances (n,) under which a reading far from all others stops to pull, with a redescending influence."""
     excess = np.abs(np.nan_to_num(fit.deletion_residuals())) / _OUTLIER_LIMIT
@@ -316,6 +278,7 @@ def estimate(
     *,
     order: Order | None = None,
     robust: bool = False,
+    settling: bool = False,
     start: Array | None = None,
     observed: NDArray[np.bool_] | None = None,
     variance: Array | None = None,
@@ -330,6 +293,8 @@ def estimate(
         None chooses between both by the restricted likelihood with identical fixed effects (statistics study, section 1.2).
     robust : bool
         Give readings whose deletion residual exceeds 3 standard deviations a larger variance, and repeat.
+    settling : bool
+        Let the drift's variance be larger at the start where the restricted likelihood clearly asks for it, as in a warm-up.
     start : (components,) variance ratios to start from.
     observed : (n,) readings that may inform the fit; the others are predicted in open loop.
     variance : (n,) relative variances of the readings.
@@ -360,4 +325,4 @@ def estimate(
             if (fit.system.variance == 1.0).all():
                 break
             fit = _maximise(fit.system, response, columns, fit.system.ratios)
-    return fit
+    return _settle(fit) if settling else fit

@@ -119,6 +119,24 @@ def test_profile_rmse(case: str, bar: float) -> None:
         assert np.mean(half_width) <= 0.078
 
 
+@pytest.mark.parametrize("kind", ["warmup", "duty", "rw"])
+@pytest.mark.parametrize("state", ["start", "end"])
+def test_coverage_at_either_end_of_the_test(kind: str, state: str) -> None:
+    inside, relative_inside = [], []
+    for seed in range(RUNS):
+        deviations, truth = simulate(np.random.default_rng(80_000 + seed), kind=kind)
+        estimated = estimate_drift(deviations, state=state)
+        at = (0, 0, 0) if state == "start" else (-1, 1, 0)
+        profile = truth.profile + truth.shift[at] + truth.stretch[at] * truth.position
+        error = np.abs(estimated["profile"].values - profile)
+        inside.append(np.mean(error < 1.96 * estimated["profile_u"].values))
+        relative = estimated["profile_relative"].values - (profile - profile[:, :1])
+        relative_inside.append(np.mean((np.abs(relative) < 1.96 * estimated["profile_relative_u"].values)[:, 1:]))
+    print(f"\n{state} of {kind}: N={RUNS} profile {with_error(inside)}, relative {with_error(relative_inside)}")
+    assert reaches(inside, 0.92, 0.98)
+    assert reaches(relative_inside, 0.92, 0.98)
+
+
 def with_error(by_run: list[float]) -> str:
     """Mean over campaigns with its standard error: the values of one campaign are not independent."""
     return f"{np.mean(by_run):.3f} +- {np.std(by_run) / np.sqrt(len(by_run)):.3f}"

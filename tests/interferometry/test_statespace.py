@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from interferometry.statespace import DriftModelError, drift_system, estimate, fit_fixed_effects, start_columns
+from interferometry.statespace import (
+    DriftModelError,
+    drift_system,
+    estimate,
+    fit_fixed_effects,
+    settling_pace,
+    start_columns,
+)
 
 POSITIONS = np.r_[np.arange(16), np.arange(15, -1, -1)]
 
@@ -148,3 +155,42 @@ def test_bad_input_is_named(rng, change, message):
     seconds, loadings, y, design = change(seconds, loadings, y, loadings)
     with pytest.raises(DriftModelError, match=message):
         fit_fixed_effects(drift_system(seconds, loadings, order=1, ratios=[0.01, 0.02]), y, design)
+
+
+@pytest.mark.parametrize(("order", "ratio"), [(1, 0.01), (2, 1e-6)])
+def test_a_pace_multiplies_the_variance_of_its_own_steps(rng, order, ratio):
+    seconds, _, y = readings(rng, 40)
+    loadings, pace = np.ones((40, 1)), rng.uniform(0.2, 5.0, 40)
+    system = drift_system(seconds, loadings, order=order, ratios=[ratio], pace=pace)
+    fit = fit_fixed_effects(system, y, start_columns(seconds, loadings, order))
+
+    steps = np.diff(seconds, prepend=seconds[0]) * ratio * pace
+    after = np.maximum(np.subtract.outer(seconds, seconds), 0.0)
+    begun = np.subtract.outer(seconds, seconds) >= 0
+    if order == 1:
+        walk = (begun * steps) @ begun.T
+    else:
+        h = np.diff(seconds, prepend=seconds[0])
+        walk = (begun * (steps * h**2 / 3)) @ begun.T + after * steps @ after.T
+        cross = (begun * (steps * h / 2)) @ after.T
+        walk += cross + cross.T
+    inverse = np.linalg.inv(walk + np.eye(40))
+    design = fit.design
+    beta = np.linalg.solve(design.T @ inverse @ design, design.T @ inverse @ y)
+    np.testing.assert_allclose(fit.coefficients, beta, atol=1e-8)
+    drift, _ = fit.drift()
+    np.testing.assert_allclose(drift[:, 0], walk @ inverse @ (y - design @ beta), atol=1e-8)
+
+
+def test_a_drift_that_settles_is_livelier_at_the_start_only(rng):
+    seconds = np.arange(600) * 40.0
+    loadings = np.ones((600, 1))
+    warming = 12.0 * (1.0 - np.exp(-seconds / 1200.0)) + rng.normal(0, 0.4, 600)
+    columns = np.ones((600, 1))
+    fit = estimate(seconds, loadings, warming, columns, settling=True)
+    assert fit.system.paces[0] > 10.0
+    assert fit.system.paces[-1] == 1.0
+    assert (np.diff(fit.system.paces) <= 0).all()
+    assert settling_pace(seconds, 600.0, 2.0)[15] == pytest.approx(0.25)
+    wandering = np.cumsum(rng.normal(0, 0.1, 600)) + rng.normal(0, 0.4, 600)
+    assert (estimate(seconds, loadings, wandering, columns, settling=True).system.paces == 1.0).all()
