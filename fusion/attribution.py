@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,6 +113,7 @@ def evaluate_films(
     lags_s: Sequence[float] = LAGS_S,
     draws: int = 499,
     checks: int = 199,
+    favour: Mapping[str, float] = MappingProxyType({}),
     rng: np.random.Generator,
     progress: Callable[[float], None] | None = None,
 ) -> Findings:
@@ -124,6 +126,8 @@ def evaluate_films(
     ----------
     series : drift series, all on the films' clock
     films : sets of temperatures by name, all at the same instants
+    favour : sets that get a larger share of the error probability, by how much sooner they pass: in units of the distance from the
+        median of a set's null maxima to their 95 % point
     """
     seconds = next(iter(films.values())).seconds
     operators = lag_operators(seconds, lags_s)
@@ -146,7 +150,8 @@ def evaluate_films(
                 progress((done + cells.stop) / whole)
         done += film.values.shape[1]
     maxima = np.concatenate([tally.maxima for tally in tallies])
-    p_values, thresholds = _family_wise([row for tally in tallies for row in tally.statistic], maxima[:, :draws])
+    ease = np.repeat([favour.get(name, 0.0) for name in films], len(names))
+    p_values, thresholds = _family_wise([row for tally in tallies for row in tally.statistic], maxima[:, :draws], ease)
     alarms = (maxima[:, draws:] > thresholds[:, None]).reshape(len(films), len(names), checks)
     rows = [slice(k * len(names), (k + 1) * len(names)) for k in range(len(films))]
     return Findings(
@@ -289,17 +294,19 @@ def _respond_tile(response: Array32, cells: Array32) -> Array32:
     return np.ascontiguousarray(seen.transpose(1, 2, 0)).reshape(seen.shape[1], -1)
 
 
-def _family_wise(statistics: Sequence[Array], maxima: Array) -> tuple[list[Array], Array]:
+def _family_wise(statistics: Sequence[Array], maxima: Array, ease: Array) -> tuple[list[Array], Array]:
     """Family-wise p of every row of statistics, and thresholds (rows,), from the rows' maxima (rows, draws) in the same nulls.
 
     A row is one series in one set. Rows of very different length have one error probability together because each is measured in its own
     unit, the distance from the median of its maxima to their 95 % point; the largest such value over the rows is ranked. Measured and
-    redrawn maxima set the units together, so that the rank is exact for any number of draws.
+    redrawn maxima set the units together, so that the rank is exact for any number of draws. `ease` (rows,) is added to a row's values:
+    it gives the row a larger share of the error probability, at the others' cost.
     """
     draws = maxima.shape[1]
     measured = np.array([values.max() for values in statistics])
     middle, upper = np.quantile(np.column_stack([measured, maxima]), [0.5, 0.95], axis=1)
     unit = np.maximum(upper - middle, 1e-9)
+    middle = middle - ease * unit
     largest = np.sort(((maxima - middle[:, None]) / unit[:, None]).max(axis=0))
     p_values = []
     for values, centre, step in zip(statistics, middle, unit, strict=True):
