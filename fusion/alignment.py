@@ -123,7 +123,7 @@ def align(
     fused = deviations[["deviation", "time", "position", "quality_flag"]].copy()
     fused["inside_frames"] = (DIMS, inside, {"long_name": "the reading lies between the first and the last frame"})
     for name, values in series.items():
-        at_readings = _interpolate(reading_time, frame_time, values)
+        at_readings = interpolate_series(reading_time, frame_time, values)
         fused[name] = (DIMS, np.where(inside, at_readings, np.nan), _ATTRIBUTES[name])
         dims = ("frame_time",) if values.ndim == 1 else ("frame_time", "target")
         fused[f"{name}_series"] = (dims, values, _ATTRIBUTES[name])
@@ -157,7 +157,7 @@ def field_series(fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -> 
     if not seen.any():
         raise AlignmentError("no plan cell is seen by every frame; check the registration and the plan's size")
     mean_rise = rise[:, seen].mean(axis=1)
-    line = _MeasuredLine(fields, axis, position_mm)
+    line = MeasuredLine(fields, axis, position_mm)
     samples = line.sample(rise)
     reach = line.reach
     local = np.stack([samples[:, max(0, k - reach) : k + reach + 1].mean(axis=1) for k in line.nearest], axis=1)
@@ -174,8 +174,15 @@ def _cell_size(fields: xr.Dataset) -> float:
     return float(np.median(np.diff(fields["x"].values)))
 
 
-class _MeasuredLine:
-    """The measured line on the plan, sampled four times per cell, and averaged across its width."""
+class MeasuredLine:
+    """The measured line on the plan, sampled four times per cell, and averaged across its width.
+
+    Attributes
+    ----------
+    along_mm : (sample,) axis positions of the samples
+    nearest : (target,) sample at every target
+    reach : samples on either side that a point average takes
+    """
 
     def __init__(self, fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -> None:
         cell = _cell_size(fields)
@@ -241,7 +248,9 @@ def _shown(time: np.datetime64) -> str:
     return f"{np.datetime_as_string(time, unit='s')}Z"
 
 
-def _interpolate(reading_time: NDArray[np.datetime64], series_time: NDArray[np.datetime64], values: Array) -> Array:
+def interpolate_series(
+    reading_time: NDArray[np.datetime64], series_time: NDArray[np.datetime64], values: Array
+) -> Array:
     """Linear interpolation of a series (time,) or (time, target) at readings (cycle, direction, target); ends are held."""
     start = series_time[0]
     at = (reading_time - start) / np.timedelta64(1, "s")
@@ -261,7 +270,7 @@ def _add_table(fused: xr.Dataset, table: xr.Dataset, dim: str) -> xr.Dataset:
         if known.sum() < 2:
             continue
         time = table["time"].values.astype("datetime64[ns]")[known]
-        at_readings = _interpolate(fused["time"].values, time, column.values[known].astype(float))
+        at_readings = interpolate_series(fused["time"].values, time, column.values[known].astype(float))
         outside = (fused["time"].values < time[0]) | (fused["time"].values > time[-1])
         added[str(name)] = (DIMS, np.where(outside, np.nan, at_readings), dict(column.attrs))
         added[f"{name}_series"] = ((dim,), column.values.astype(float), dict(column.attrs))

@@ -22,6 +22,8 @@ VACUUM_WAVELENGTH_NM = 632.990625
 REFERENCE_TEMPERATURE_DEGC = 20.0
 #: Readings farther than this from any logged condition are refused.
 LONGEST_GAP_S = 900.0
+#: Air and 40 K of steel together change a length by less than this.
+LARGEST_SCALE = 1e-3
 
 
 class CompensationError(ValueError):
@@ -116,11 +118,28 @@ def dead_path_error_um(index: Array, start_index: float, *, dead_path_mm: float)
     return dead_path_mm * 1e3 * (np.asarray(index) - start_index) / np.asarray(index)
 
 
+def followed_factor_um(
+    deviations: xr.Dataset,
+    environment: xr.Dataset,
+    *,
+    expansion_coefficient_ppm_per_K: float,
+    wavelength_nm: float = VACUUM_WAVELENGTH_NM,
+) -> Array:
+    """Return the factor (cycle, direction, target) of an instrument that followed the logged air and the logged probe."""
+    air, _ = _conditions_at(deviations, environment)
+    return environment_factor(
+        _index_of(air, wavelength_nm),
+        material_temperature_degC=air["material_temperature"],
+        expansion_coefficient_ppm_per_K=expansion_coefficient_ppm_per_K,
+        wavelength_nm=wavelength_nm,
+    )
+
+
 def compensate(
     deviations: xr.Dataset,
     environment: xr.Dataset,
     *,
-    applied_factor_um: tuple[float, float] | None = None,
+    applied_factor_um: tuple[float, float] | Array | None = None,
     expansion_coefficient_ppm_per_K: float = 11.7,
     material_temperature_degC: xr.DataArray | None = None,
     dead_path_mm: float = 0.0,
@@ -137,9 +156,9 @@ def compensate(
         Keeps ``contract.DEVIATIONS``; every reading needs a time.
     environment : xarray.Dataset
         What `readers.read_environment` returns.
-    applied_factor_um : (float, float), optional
-        Environment factor at the start and end of the test, as a .rtl holds it; between them it is taken as linear in
-        time. Left out: the instrument followed the same conditions, and only the dead path remains to be corrected.
+    applied_factor_um : (float, float) or (cycle, direction, target) ndarray, optional
+        Environment factor at the start and end of the test, as a .rtl holds it, between them taken as linear in time; or
+        that of every reading, as `followed_factor_um` returns it. Left out: only the dead path remains to be corrected.
     expansion_coefficient_ppm_per_K : float
         Of the axis or workpiece that is brought to 20 degC; 0 leaves the material as it is.
     material_temperature_degC : xarray.DataArray, optional
@@ -165,50 +184,61 @@ def compensate(
     Raises
     ------
     CompensationError
-        Readings have no time, or lie more than 15 minutes from any logged condition.
+        Readings have no time, or lie more than 15 minutes from any logged condition; or the applied factor is none of a
+        HeNe laser in air.
     """
     sensors = uncertainty or SensorUncertainty()
     air, outside = _conditions_at(deviations, environment)
-    index = air_index(
-        air["air_temperature"], air["air_pressure"], air["relative_humidity"], wavelength_nm=wavelength_nm
-    )
+    index = _index_of(air, wavelength_nm)
     material = air["material_temperature"] if material_temperature_degC is None else material_temperature_degC.values
     travel_mm = deviations["position"].values - zero_mm
-    scale = np.zeros(index.shape)
-    if applied_factor_um is not None:
-        wanted = environment_factor(
-            index,
-            material_temperature_degC=material,
-            expansion_coefficient_ppm_per_K=expansion_coefficient_ppm_per_K,
-            wavelength_nm=wavelength_nm,
-        )
-        scale = wanted / _interpolate_factor(deviations, applied_factor_um) - 1.0
-    correction_scale = (travel_mm * 1e3 + deviations["deviation"].values) * scale
-    first = np.unravel_index(int(np.nanargmin(_seconds(deviations))), index.shape)
-    sign = 1.0 if away else -1.0
-    correction_dead_path = -sign * dead_path_error_um(index, float(index[first]), dead_path_mm=dead_path_mm)
+    wanted = environment_factor(
+        index,
+        material_temperature_degC=material,
+        expansion_coefficient_ppm_per_K=expansion_coefficient_ppm_per_K,
+        wavelength_nm=wavelength_nm,
+    )
+    scale = _scale(deviations, wanted, applied_factor_um)
+    seconds = _seconds(deviations)
+    start_index = float(index.ravel()[int(np.nanargmin(seconds))])
+    correction = {
+        "correction_scale": (travel_mm * 1e3 + deviations["deviation"].values) * scale,
+        "correction_dead_path": dead_path_error_um(index, start_index, dead_path_mm=dead_path_mm)
+        * (-1.0 if away else 1.0),
+    }
     length_m = np.abs(travel_mm) * 1e-3
-    parts = {
+    u = {
         "air_u": length_m * _air_ppm(air, sensors, wavelength_nm),
         "material_u": length_m * _material_ppm(np.asarray(material), expansion_coefficient_ppm_per_K, sensors),
-        "dead_path_u": sensors.dead_path_mm * 1e3 * np.abs(index - index[first]) * (dead_path_mm > 0),
+        "dead_path_u": sensors.dead_path_mm * 1e3 * np.abs(index - start_index) * (dead_path_mm > 0),
     }
-    parts["compensation_u"] = np.sqrt(sum(np.square(one) for one in parts.values()))
-    compensated = deviations.copy()
+    u["compensation_u"] = np.sqrt(sum(np.square(one) for one in u.values()))
     dims = deviations["deviation"].dims
-    attributes = deviations["deviation"].attrs
-    compensated["deviation"] = (
-        dims,
-        deviations["deviation"].values + correction_scale + correction_dead_path,
-        attributes,
-    )
-    compensated["correction_scale"] = (dims, correction_scale, {"units": "um"})
-    compensated["correction_dead_path"] = (dims, correction_dead_path, {"units": "um"})
-    for name, u in parts.items():
-        compensated[name] = (dims, np.broadcast_to(u, index.shape), {"units": "um"})
+    corrected = deviations["deviation"].values + sum(correction.values())
+    compensated = deviations.assign(deviation=(dims, corrected, deviations["deviation"].attrs))
+    for name, values in {**correction, **u}.items():
+        compensated[name] = (dims, np.broadcast_to(values, index.shape), {"units": "um"})
     compensated["air_index"] = (dims, index, {"units": "1"})
     compensated.attrs["outside_environment"] = outside
     return compensated
+
+
+def _index_of(air: dict[str, Array], wavelength_nm: float) -> Array:
+    return air_index(air["air_temperature"], air["air_pressure"], air["relative_humidity"], wavelength_nm=wavelength_nm)
+
+
+def _scale(deviations: xr.Dataset, wanted_um: Array, applied_um: tuple[float, float] | Array | None) -> Array:
+    """Return by which share a displayed length has to grow, (cycle, direction, target)."""
+    if applied_um is None:
+        return np.zeros(wanted_um.shape)
+    applied = _interpolate_factor(deviations, applied_um) if isinstance(applied_um, tuple) else applied_um
+    scale = wanted_um / applied - 1.0
+    if np.nanmax(np.abs(scale)) > LARGEST_SCALE:
+        raise CompensationError(
+            f"the environment factor {float(np.nanmean(applied)):.6g} um differs by {np.nanmax(np.abs(scale)) * 1e6:.0f} ppm from "
+            f"the {float(np.nanmean(wanted_um)):.6f} um that these conditions ask for; give the factor in um of the file of this test"
+        )
+    return scale
 
 
 def _seconds(deviations: xr.Dataset) -> Array:
