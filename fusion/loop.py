@@ -89,11 +89,7 @@ def close_loop(
     report(MOST_EFFECTS + 2, MOST_EFFECTS + 2, "loop closed")
     return LoopResult(
         declared=list(declared),
-        declared_coefficients=[
-            {"effect": term.effect, **entry}
-            for term in whole.terms[: len(terms)]
-            for entry in coefficients_of(whole, term)
-        ],
+        declared_coefficients=_declared_coefficients(whole, len(terms)),
         held_out=description,
         noise_floor_um=whole.fit.sigma,
         rmse_persistence_um=persistence(readings, used),
@@ -144,6 +140,61 @@ def set_aside_sites(found: LoopResult, sites: Collection[tuple[int, str]], *, se
     """The same result with sites (target, direction) whose anomaly has its own diagnosis no longer counted as a remainder."""
     remainder = _remainder(found.after, seed, sites)
     return replace(found, remainder=remainder, verdict=_verdict(bool(found.steps), bool(remainder.shape)))
+
+
+def on_corrected_fields(
+    found: LoopResult,
+    readings: Readings,
+    errors: Collection[str],
+    *,
+    effects: Mapping[str, Effect] | None = None,
+    seed: int = 1,
+) -> LoopResult:
+    """The same result with the model fitted again on fields from which the camera's errors have been taken out.
+
+    Parameters
+    ----------
+    found : with the camera's errors as effects
+    readings : the same readings beside the corrected fields
+    errors : names of the effects that the correction has made superfluous
+    """
+    effects = library() if effects is None else effects
+    terms = [_again(term, readings, found, effects) for term in found.after.terms if term.effect not in errors]
+    used, _ = seal(readings)
+    whole = fit_model(readings, terms)
+    remainder = _remainder(whole, seed, ())
+    return replace(
+        found,
+        declared_coefficients=_declared_coefficients(whole, len(found.declared)),
+        noise_floor_um=whole.fit.sigma,
+        rmse_final_um=rmse(fit_model(readings, terms, used=used).open_loop_errors()[0]),
+        verdict=_verdict(bool(found.steps), bool(remainder.shape)),
+        remainder=remainder,
+        nuisance=nuisance_size(whole),
+        after=whole,
+    )
+
+
+def _again(term: Term, readings: Readings, found: LoopResult, effects: Mapping[str, Effect]) -> Term:
+    """A term with the columns that the same parameters give on other fields; one that does not offer them again stays."""
+    near = term.member if term.member.parameters else None
+    offered = effects[term.effect].members(readings, found.after.coefficients(), near)
+    same = (member for member in offered if _same_parameters(member.parameters, term.member.parameters))
+    member = next(same, term.member)
+    return Term(term.effect, replace(member, prior=term.member.prior))
+
+
+def _same_parameters(one: Mapping[str, float | str], other: Mapping[str, float | str]) -> bool:
+    return one.keys() == other.keys() and all(
+        one[name] == value if isinstance(value, str) else np.isclose(float(one[name]), float(value), rtol=1e-9)
+        for name, value in other.items()
+    )
+
+
+def _declared_coefficients(whole: ModelFit, declared: int) -> list[dict[str, float | str]]:
+    return [
+        {"effect": term.effect, **entry} for term in whole.terms[:declared] for entry in coefficients_of(whole, term)
+    ]
 
 
 def _remainder(whole: ModelFit, seed: int, set_aside: Collection[tuple[int, str]]) -> adequacy.Remainder:

@@ -166,7 +166,7 @@ def run_campaign(
         "model",
         (*joint, "model"),
         ("fields", "deviations"),
-        lambda: stages.model_drift(source, fused, deviations, report=report),
+        lambda: stages.model_drift(source, fields, fused, deviations, report=report),
     )
     fusion = run.described(stages.join_fusion(fused, maps, model))
     write_dataset(folder / "fusion.nc", fusion)

@@ -12,13 +12,15 @@ import xarray as xr
 from fusion import cf
 from fusion.alignment import align
 from fusion.diagnosis import Diagnosis, diagnose
-from fusion.effects import library
+from fusion.effects import EXPANSION_U_PPM_PER_K, Effect, library
+from fusion.field_correction import FieldError, correct_fields, corrected_variables, find_field_errors
 from fusion.groups import joined
-from fusion.loop import LoopResult, close_loop, set_aside_sites
+from fusion.loop import LoopResult, close_loop, on_corrected_fields, set_aside_sites
+from fusion.members import Prior
 from fusion.model import ModelFit, fit_model
 from fusion.outcome import Outcome
 from fusion.progress import Report
-from fusion.readings import Readings, read_fused
+from fusion.readings import read_fused
 from fusion.results import Notice
 from fusion.sources import Source, counted, listed
 from interferometry import iso230, neighbours
@@ -48,7 +50,7 @@ def evaluate_interferometry(source: Source) -> Outcome:
     drift = estimate_drift(deviations)
     deviations = flag_outliers(deviations, drift)
     comparison = neighbours.compare(deviations, drift)
-    windows = iso230.evaluate_windows(deviations)
+    windows = iso230.evaluate_windows(deviations, budget=source.iso_budget)
     dataset = joined(
         deviations,
         conventional=neighbours.evaluate_conventional(deviations),
@@ -125,18 +127,37 @@ def align_recordings(source: Source, fields: xr.Dataset, deviations: xr.Dataset)
     return fused, outside_notices(fused)
 
 
-def model_drift(source: Source, fused: xr.Dataset, deviations: xr.Dataset, *, report: Report) -> Outcome:
+def model_drift(
+    source: Source, fields: xr.Dataset, fused: xr.Dataset, deviations: xr.Dataset, *, report: Report
+) -> Outcome:
     """Close the loop, then look for positions that stand out from what the model explains, and for their cause.
 
     An effect that moves whole stretches of the axis makes their positions stand out too; it is taken out before positions are judged.
+    Where the camera erred, the fields are put right and the model is fitted again to them.
     """
     readings = read_fused(fused)
     found = close_loop(
         readings,
         source.campaign.model.declared,
+        effects=library_for(source),
         progress=lambda done, total, what: report("closed loop", done, total),
     )
-    variables = loop_variables(fused, readings, found)
+    errors = find_field_errors(found, fields, fused)
+    if errors:
+        right = align(
+            deviations,
+            correct_fields(fields, errors),
+            source.axis,
+            environment=source.environment,
+            drivers=source.drivers,
+        )
+        found = on_corrected_fields(
+            found, read_fused(right), {one.effect for one in errors}, effects=library_for(source)
+        )
+    variables = loop_variables(fused, found)
+    if errors:
+        corrected = {f"{name}_corrected": right[name] for name in ("mean_rise", "axis_integral", "local_rise")}
+        variables = variables.assign(corrected_variables(fields, fused, errors)).assign(corrected)
     report("anomalies", 0, 1)
     explained = variables["contribution"].sum("effect", skipna=False)
     cleaned = deviations.assign(deviation=deviations["deviation"].copy(data=(fused["deviation"] - explained).values))
@@ -154,9 +175,31 @@ def model_drift(source: Source, fused: xr.Dataset, deviations: xr.Dataset, *, re
     report("anomalies", 1, 1)
     parts = {
         "anomalies": [anomaly_part(*pair) for pair in zip(anomalies, diagnoses, strict=True)],
-        "loop": found.as_json(),
+        "loop": {**found.as_json(), "field_corrections": [one.as_json() for one in errors]},
     }
-    return Outcome(variables, parts)
+    return Outcome(variables, parts, tuple(field_notices(errors)))
+
+
+def library_for(source: Source) -> dict[str, Effect]:
+    """Return the library with what the campaign file says of the machine: the expansion coefficient that is expected."""
+    effects, table = library(), source.campaign.interferometry
+    if table is None:
+        return effects
+    expected = Prior(table.expansion_coefficient_ppm_per_K, EXPANSION_U_PPM_PER_K)
+    return {**effects, "axis_expansion": replace(effects["axis_expansion"], prior=expected)}
+
+
+def field_notices(errors: Sequence[FieldError]) -> list[Notice]:
+    """Return a notice for every error of the camera that was taken out of the fields."""
+    return [
+        Notice(
+            f"field_corrected_{one.effect}",
+            f"{one.text[0].upper()}{one.text[1:]}: taken out of the frames, and the model was fitted again to the corrected fields. "
+            "Maps and correlation show the fields as the camera gave them.",
+            "Give the camera a reference patch, or shield it from warm bodies; the correction is loop_field_correction in fusion.nc.",
+        )
+        for one in errors
+    ]
 
 
 def join_fusion(fused: xr.Dataset, maps: xr.Dataset, loop: xr.Dataset) -> xr.Dataset:
@@ -225,9 +268,11 @@ def outside_notices(fused: xr.Dataset) -> list[Notice]:
     ]
 
 
-def loop_variables(fused: xr.Dataset, readings: Readings, found: LoopResult) -> xr.Dataset:
+def loop_variables(fused: xr.Dataset, found: LoopResult) -> xr.Dataset:
     """Return the residuals before and after, and what each effect contributes, at every reading."""
-    declared = fit_model(readings, found.after.terms[: len(found.declared)])
+    readings = found.after.readings
+    # The declared model is shown on the fields as they came, also where they were put right afterwards.
+    declared = fit_model(found.before.readings, found.before.terms)
     dims = ("cycle", "direction", "target")
     shape = tuple(fused.sizes[name] for name in dims)
     place = (
