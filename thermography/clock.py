@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import least_squares
+
+from thermography.motion import FAR_MM, Motion, commanded_position
 
 Array = NDArray[Any]
 
-#: Residuals beyond this count no further in the search: whoever is that far off is simply elsewhere, mm.
-FAR_MM = 20.0
 #: The seen table must travel at least this many times the uncertainty of its place.
 LEAST_TRAVEL = 20.0
 #: Another offset makes the clock ambiguous if its misfit is less than this much larger, ...
@@ -23,12 +22,6 @@ DECIDING_FRAMES = 8
 ONE_MINIMUM_S = 5.0
 #: Consecutive groups of frames that are left out in turn for the uncertainty (delete-a-group jackknife).
 GROUPS = 20
-#: Below this length of record the rate of one clock against the other is taken as zero, s.
-RATE_AFTER_S = 3600.0
-#: From here on a deviation counts as itself, not as its square, mm.
-HUBER_MM = 0.5
-#: What the grid of starts misfits by its steps alone, mm.
-GRID_MM = 1.0
 
 
 class ClockError(ValueError):
@@ -63,38 +56,6 @@ class ClockOffset:
     feed_mm_per_min: float
     rms_mm: float
     frames: int
-
-
-def commanded_position(
-    time_s: Array, reading_s: Array, reading_mm: Array, feed_mm_s: float, *, reading_at: float = 1.0
-) -> Array:
-    """Axis position (mm) of a positioning test at any time: stand, read, go on at the feed to the next target, stand.
-
-    Parameters
-    ----------
-    time_s
-        Times wanted, any shape, s.
-    reading_s, reading_mm
-        Times of the readings in order, and the targets, (readings,).
-    feed_mm_s
-        Between targets; where it is too slow to arrive, the table arrives at the next reading.
-    reading_at
-        When during the stand the reading is taken: 0 on arrival, 1 just before going on, as a controller with a dwell time does.
-
-    Returns
-    -------
-    ndarray
-        NaN before the first and after the last reading: nothing is known of what the machine did there.
-    """
-    gap = np.diff(reading_s)
-    stand = np.maximum(gap - np.abs(np.diff(reading_mm)) / feed_mm_s, 0.0)
-    leave = reading_s[:-1] + (1 - reading_at) * stand
-    arrive = reading_s[1:] - reading_at * stand
-    way_s = np.concatenate([[reading_s[0]], np.column_stack([leave, arrive]).ravel(), [reading_s[-1]]])
-    way_mm = np.concatenate(
-        [[reading_mm[0]], np.column_stack([reading_mm[:-1], reading_mm[1:]]).ravel(), [reading_mm[-1]]]
-    )
-    return np.interp(time_s, way_s, way_mm, left=np.nan, right=np.nan)
 
 
 def estimate_clock_offset(
@@ -149,16 +110,8 @@ def estimate_clock_offset(
     # Until the feed is known, the table is taken to travel all the time between readings: wrong by less than FAR_MM.
     feed = feed_mm_per_min / 60 if feed_mm_per_min is not None else 1e-9
     start = _search(frame_s, seen, reading_s, target, feed, reading_at, expected_s, search_s)
-    model = _Motion(frame_s, seen, reading_s, target, None if feed_mm_per_min is None else feed, reading_at)
-    fits = model.fits(start)
-    best = fits[0]
-    groups = np.array_split(np.arange(len(frame_s)), min(GROUPS, len(frame_s) // 5))
-    left_out = np.array([model.without(group).fit(best) for group in groups])
-    u = np.sqrt((len(groups) - 1) / len(groups) * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0))
-    # A jackknife of few groups scatters by itself: never less than the scatter of the residuals gives.
-    u = np.maximum(u, model.formal_u(best))
-    # Solutions that the frames cannot tell apart: any offset between them is as good, a rectangular distribution (GUM 4.3.7).
-    u = np.hypot(u, np.ptp(fits, axis=0) / np.sqrt(12))
+    model = Motion(frame_s, seen, reading_s, target, None if feed_mm_per_min is None else feed, reading_at)
+    best, u = _fit(model, start)
     residual = model.residual(best)
     inside = np.isfinite(residual)
     return ClockOffset(
@@ -173,104 +126,19 @@ def estimate_clock_offset(
     )
 
 
-@dataclass(frozen=True)
-class _Motion:
-    """Seen against commanded motion; parameters are offset (s), zero of the seen position (mm), feed (mm/s) and clock rate."""
-
-    frame_s: Array
-    seen: Array
-    reading_s: Array
-    target: Array
-    feed: float | None
-    reading_at: float
-
-    @property
-    def middle(self) -> float:
-        return float(self.frame_s.mean())
-
-    def without(self, group: Array) -> _Motion:
-        return _Motion(
-            np.delete(self.frame_s, group),
-            np.delete(self.seen, group),
-            self.reading_s,
-            self.target,
-            self.feed,
-            self.reading_at,
-        )
-
-    @property
-    def free(self) -> NDArray[np.bool_]:
-        """Which of the parameters are fitted."""
-        return np.array([True, True, self.feed is None, np.ptp(self.frame_s) > RATE_AFTER_S])
-
-    def formal_u(self, best: Array) -> Array:
-        """Standard uncertainties of the parameters as if the residuals were independent and the model linear, (4,)."""
-        steps = np.diag([0.02, 0.01, 1e-3 * best[2], 1e-6])[self.free]
-        columns = [(self.residual(best + step) - self.residual(best - step)) / (2 * step.sum()) for step in steps]
-        jacobian = np.nan_to_num(np.stack(columns, axis=-1))
-        residual = np.nan_to_num(self.residual(best))
-        variance = float(residual @ residual) / max(int(np.count_nonzero(residual)) - len(steps), 1)
-        u = np.zeros(4)
-        u[self.free] = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * variance)
-        return u
-
-    def residual(self, parameters: Array) -> Array:
-        offset, zero, feed, rate = parameters
-        machine_s = self.frame_s - offset - rate * (self.frame_s - self.middle)
-        commanded = commanded_position(machine_s, self.reading_s, self.target, feed, reading_at=self.reading_at)
-        residual: Array = self.seen - zero - commanded
-        return residual
-
-    def fits(self, offset: float) -> Array:
-        """Solutions near an offset that the frames cannot tell apart at three standard deviations, (solutions, 4), best first."""
-        found = np.array([self.fit(start) for start in self._starts(offset)])
-        misfits = np.array([np.nanmean(np.minimum(np.abs(self.residual(one)), FAR_MM) ** 2) for one in found])
-        order = np.argsort(misfits)
-        alike = misfits[order] <= misfits[order[0]] * (1 + 9 / len(self.seen))
-        return found[order[alike]]
-
-    def fit(self, start: Array) -> Array:
-        """Least squares of the near, least absolute deviations of the far frames."""
-        free = self.free
-        scale = np.array([1.0, 1.0, 1.0, 1e-5])
-
-        def residuals(values: Array) -> Array:
-            parameters = start.copy()
-            parameters[free] = values * scale[free]
-            parameters[2] = max(parameters[2], 1e-3)
-            return np.nan_to_num(self.residual(parameters), nan=0.0)
-
-        found = least_squares(
-            residuals,
-            start[free] / scale[free],
-            loss="soft_l1",
-            f_scale=HUBER_MM,
-            diff_step=1e-4,
-            x_scale="jac",
-            xtol=1e-10,
-        )
-        best = start.copy()
-        best[free] = found.x * scale[free]
-        return best
-
-    def _starts(self, offset: float) -> list[Array]:
-        """Offset, zero and feed to start from: the best of a grid, and the outermost ones that fit about as well.
-
-        Frames at a few phases of the motion only (every 10 s of a motion of 6 s) leave feed and offset to each other.
-        """
-        feeds = [self.feed]
-        if self.feed is None:
-            moves = np.abs(np.diff(self.target)) / np.diff(self.reading_s)
-            feeds = list(float(np.median(moves[moves > 0])) * np.geomspace(1.0, 20.0, 40))
-        grid = np.array([(offset + step, 0.0, feed, 0.0) for feed in feeds for step in np.arange(-4.0, 4.25, 0.5)])
-        costs = np.empty(len(grid))
-        for i, parameters in enumerate(grid):
-            residual = self.residual(parameters)
-            grid[i, 1] = np.nanmedian(residual)
-            costs[i] = np.nanmean(np.minimum(np.abs(residual - grid[i, 1]), FAR_MM))
-        alike = grid[costs <= 1.5 * costs.min() + GRID_MM]
-        outer = [alike[np.argmin(alike[:, k])] for k in (0, 2)] + [alike[np.argmax(alike[:, k])] for k in (0, 2)]
-        return [grid[np.argmin(costs)], *outer]
+def _fit(model: Motion, start: float) -> tuple[Array, Array]:
+    """Offset, zero, feed and rate near an offset, and their standard uncertainties, (4,) each."""
+    fits = model.fits(start)
+    best = fits[0]
+    groups = np.array_split(np.arange(len(model.seen)), min(GROUPS, len(model.seen) // 5))
+    left_out = np.array([model.without(group).fit(best) for group in groups])
+    u = np.sqrt((len(groups) - 1) / len(groups) * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0))
+    # A jackknife of few groups scatters by itself: never less than the scatter of the residuals gives.
+    u = np.maximum(u, model.formal_u(best))
+    # Solutions that the frames cannot tell apart: any offset up to the farthest is as good, a rectangular distribution (GUM 4.3.7).
+    u = np.hypot(u, np.abs(fits - best).max(axis=0) / np.sqrt(3))
+    u[0] = max(u[0], model.profile_u(best, u[0] / 4))
+    return best, u
 
 
 def _search(
