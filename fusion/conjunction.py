@@ -15,8 +15,11 @@ from numpy.typing import NDArray
 from fusion.attribution import LEVEL
 from fusion.channels import Array
 from fusion.correlation import ATTRIBUTABLE, NOT_ATTRIBUTABLE, NOT_SEPARABLE
+from fusion.verdict import find_source
 
 Mask = NDArray[np.bool_]
+#: Strongest candidates near every place, per session.
+Places = list[dict[str, Array]]
 
 #: Places of the two sessions count as the same within this distance: half the width of a heat source's halo.
 SAME_PLACE_MM = 50.0
@@ -53,6 +56,122 @@ class Common:
     reason: str
 
 
+@dataclass(frozen=True)
+class Agreement:
+    """One source that either session shows, and what the other one shows there.
+
+    Attributes
+    ----------
+    channel : part of the drift that it goes with
+    x_mm, y_mm : place in the session that shows it
+    shown_by : 0 first session, 1 second, or both
+    p_value, sensitivity_um_per_K, sensitivity_u_um_per_K, lag_s : of the first and the second session near that place
+    agrees : both sessions pass there, with one sign and one size: a cause
+    """
+
+    channel: str
+    x_mm: float
+    y_mm: float
+    shown_by: tuple[int, ...]
+    p_value: tuple[float, float]
+    sensitivity_um_per_K: tuple[float, float]
+    sensitivity_u_um_per_K: tuple[float, float]
+    lag_s: tuple[float, float]
+    agrees: bool
+
+
+def compare_sources(first: xr.Dataset, second: xr.Dataset) -> list[Agreement]:
+    """Return every source that passes in either of two sessions, once, and whether the other session agrees.
+
+    A session's sources are its thermal modes that pass, each with the part of the drift that it goes with most; where none passes, its
+    leading cell. Sessions that are one warm-up show none.
+
+    Raises
+    ------
+    ConjunctionError
+        if the grids differ.
+    """
+    _refuse_other_grids(first, second)
+    reach = _reach(first)
+    near = {
+        channel: [_strongest_nearby(_candidates(one, channel), reach) for one in (first, second)]
+        for channel in _shared_channels(first, second)
+    }
+    found: list[Agreement] = []
+    for at, session in enumerate((first, second)):
+        for channel, x_mm, y_mm in _passing(session):
+            if channel not in near or _already(found, channel, x_mm, y_mm):
+                continue
+            row = int(np.argmin(np.abs(first["y"].values - y_mm)))
+            column = int(np.argmin(np.abs(first["x"].values - x_mm)))
+            places = near[channel]
+            p_value = _at(places, "p_value", row, column)
+            agrees = max(p_value) <= LEVEL and bool(_consistent(*places)[row, column])
+            found.append(
+                Agreement(
+                    channel=channel,
+                    x_mm=x_mm,
+                    y_mm=y_mm,
+                    shown_by=(0, 1) if agrees else (at,),
+                    p_value=p_value,
+                    sensitivity_um_per_K=_at(places, "sensitivity", row, column),
+                    sensitivity_u_um_per_K=_at(places, "sensitivity_u", row, column),
+                    lag_s=_at(places, "lag", row, column),
+                    agrees=agrees,
+                )
+            )
+    return found
+
+
+def _at(places: Places, name: str, row: int, column: int) -> tuple[float, float]:
+    """One quantity of both sessions at one place."""
+    return float(places[0][name][row, column]), float(places[1][name][row, column])
+
+
+def _passing(session: xr.Dataset) -> list[tuple[str, float, float]]:
+    """Part of the drift and place (x, y in mm) of every source that a session shows."""
+    if session.attrs["verdict"] != "attributable":
+        return []
+    leading = find_source(session)
+    if leading.kind != "mode":
+        return [(leading.channel, leading.x_mm, leading.y_mm)]
+    ratio = (session["modes_statistic"] / session["modes_threshold"]).fillna(0.0).transpose("channel", "mode").values
+    passed = session["modes_p_value"].transpose("channel", "mode").values <= LEVEL
+    sources = []
+    for k in np.flatnonzero(passed.any(axis=0)):
+        channel = str(session["channel"].values[int(np.where(passed[:, k], ratio[:, k], -1.0).argmax())])
+        sources.append((channel, float(session["modes_at_x"][k]), float(session["modes_at_y"][k])))
+    return sources
+
+
+def _already(found: list[Agreement], channel: str, x_mm: float, y_mm: float) -> bool:
+    """Whether a source at this place is listed as one on which both sessions agree."""
+    return any(
+        one.agrees and one.channel == channel and np.hypot(one.x_mm - x_mm, one.y_mm - y_mm) <= SAME_PLACE_MM
+        for one in found
+    )
+
+
+def _refuse_other_grids(first: xr.Dataset, second: xr.Dataset) -> None:
+    for name in ("x", "y"):
+        if first.sizes[name] != second.sizes[name] or not np.allclose(first[name], second[name]):
+            raise ConjunctionError(
+                f"the plan grids differ along {name}; give both campaigns the same [plan] size, cell_size and fiducials"
+            )
+
+
+def _shared_channels(first: xr.Dataset, second: xr.Dataset) -> list[str]:
+    channels = [str(name) for name in first["channel"].values if name in second["channel"].values]
+    if not channels:
+        raise ConjunctionError("the two campaigns share no drift channel; both need readings at several targets")
+    return channels
+
+
+def _reach(session: xr.Dataset) -> int:
+    """Cells within which places count as the same."""
+    return max(1, round(SAME_PLACE_MM / float(np.median(np.diff(session["x"].values)))))
+
+
 def agree(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, list[Common]]:
     """Join the maps of two campaigns.
 
@@ -72,16 +191,9 @@ def agree(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, list[Commo
     ConjunctionError
         if the grids differ or no channel is common.
     """
-    for name in ("x", "y"):
-        if first.sizes[name] != second.sizes[name] or not np.allclose(first[name], second[name]):
-            raise ConjunctionError(
-                f"the plan grids differ along {name}; give both campaigns the same [plan] size, cell_size and fiducials"
-            )
-    channels = [str(name) for name in first["channel"].values if name in second["channel"].values]
-    if not channels:
-        raise ConjunctionError("the two campaigns share no drift channel; both need readings at several targets")
-    cell = float(np.median(np.diff(first["x"].values)))
-    reach = max(1, round(SAME_PLACE_MM / cell))
+    _refuse_other_grids(first, second)
+    channels = _shared_channels(first, second)
+    reach = _reach(first)
     separable = any(one.attrs["excitation"] != "warm-up only" for one in (first, second))
     maps, verdicts, found = [], [], []
     for channel in channels:
@@ -152,7 +264,7 @@ def _consistent(first: dict[str, Array], second: dict[str, Array]) -> Mask:
 
 def _conclude(
     channel: str,
-    places: list[dict[str, Array]],
+    places: Places,
     separable: bool,
 ) -> Common:
     """Verdict on one channel from the strongest places (per session) near every cell."""

@@ -8,13 +8,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from fusion.conjunction import Common, agree
+from fusion.conjunction import Agreement, Common, agree, compare_sources
 from fusion.groups import correlation_of
 from fusion.plots_correlation import CHANNELS
 from fusion.products import read_dataset, write_dataset, write_json, write_text
 from fusion.report import render_report
 from fusion.report_findings import readable
-from fusion.wording import number, p_value
+from fusion.wording import duration, measured, number, p_value
 
 PRODUCTS = ("fields", "deviations", "fusion")
 
@@ -40,21 +40,40 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
         If the campaigns cannot be compared.
     """
     datasets = [{name: read_dataset(folder / f"{name}.nc") for name in PRODUCTS} for folder in folders]
-    maps, found = agree(*(correlation_of(one["fusion"]) for one in datasets))
+    sessions = [correlation_of(one["fusion"]) for one in datasets]
+    maps, found = agree(*sessions)
+    sources = compare_sources(*sessions)
     write_dataset(out / "joint.nc", maps)
     write_json(
         out / "joint.json",
-        {"campaigns": [_title(folder) for folder in folders], "sources": [asdict(one) for one in found]},
+        {
+            "campaigns": [_title(folder) for folder in folders],
+            "sources": [asdict(one) for one in found],
+            "agreement": [asdict(one) for one in sources],
+        },
     )
     rows = [(CHANNELS.get(one.channel, one.channel), in_words(one)) for one in found]
-    causes = [CHANNELS.get(one.channel, one.channel) for one in found if one.verdict == "attributable"]
+    causes = [f"x {one.x_mm:.0f} mm, y {one.y_mm:.0f} mm" for one in sources if one.agrees]
+    table = [source_row(one, [_title(folder) for folder in folders]) for one in sources]
     for at, folder in enumerate(folders):
-        joint = {"other": _title(folders[1 - at]), "rows": rows, "causes": causes}
+        joint = {"other": _title(folders[1 - at]), "rows": rows, "causes": causes, "sources": table}
         write_text(
             folder / "report.html",
             render_report(_json(folder, "results"), _json(folder, "provenance"), datasets[at], joint=joint),
         )
     return rows
+
+
+def source_row(one: Agreement, titles: Sequence[str]) -> list[str]:
+    """Return one source as cells of a table: place, part of the drift, what each session shows there, and whether it is a cause."""
+    shown = [
+        f"p {p_value(p)}, {measured(value, u, 'µm/K')}, lag {duration(lag)}"
+        for p, value, u, lag in zip(
+            one.p_value, one.sensitivity_um_per_K, one.sensitivity_u_um_per_K, one.lag_s, strict=True
+        )
+    ]
+    verdict = "a cause: both agree" if one.agrees else f"shown by {titles[one.shown_by[0]]} alone"
+    return [f"{one.x_mm:.0f}, {one.y_mm:.0f}", CHANNELS.get(one.channel, one.channel), *shown, verdict]
 
 
 def in_words(found: Common) -> str:

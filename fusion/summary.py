@@ -50,11 +50,26 @@ def summary_rows(results: Mapping[str, Any]) -> list[tuple[str, str]]:
             for item in results["anomalies"]
         ]
         rows.append(("anomalies", "\n".join(named) or "none"))
+    if "correlation" in results:
+        rows.append(("drift and field", _field_text(results["correlation"])))
     if "loop" in results:
         rows += _loop_rows(results["loop"])
     for warning in results["warnings"]:
         rows.append(("warning", warning["message"]))
     return rows
+
+
+def _field_text(found: Mapping[str, Any]) -> str:
+    """Return what the correlation says in one sentence, and which switched load is a cause."""
+    source = found["source"]
+    place = f"x {source['x_mm']:.0f} mm, y {source['y_mm']:.0f} mm (p {wording.p_value(source['p_value'])})"
+    text = {
+        "attributable": f"the drift goes with the temperature around {place}",
+        "not attributable": f"no part of the field goes with the drift; closest is {place}",
+        "not separable": "these data cannot tell: the session is one warm-up",
+    }[found["verdict"]]
+    causes = [one["name"] for one in found["randomised_duty"] or [] if one["cause"]]
+    return f"{text}\ncause by randomised duty: {wording.join(causes)}" if causes else text
 
 
 def _loop_rows(loop: Mapping[str, Any]) -> list[tuple[str, str]]:

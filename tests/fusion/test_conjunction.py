@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fusion.conjunction import ConjunctionError, agree
+from fusion.conjunction import ConjunctionError, agree, compare_sources
 from fusion.correlation import correlate
 from tests.fusion import film_simulator as simulator
 
@@ -29,6 +29,26 @@ def test_a_source_that_both_sessions_show_is_a_cause(first):
     assert joint.p_value <= 0.05
     assert simulator.distance_cells(joint.y_mm / 10 - 0.5, joint.x_mm / 10 - 0.5, 0) <= 7
     assert (joined["p_value"].sel(channel="joint") <= 0.05).any()
+
+
+def test_each_source_is_listed_once_with_what_both_sessions_show(first):
+    second = maps_of(simulator.driven_session(np.random.default_rng(9), source=0))
+    sources = compare_sources(first, second)
+    (cause,) = [one for one in sources if one.agrees]
+    assert cause.shown_by == (0, 1)
+    assert simulator.distance_cells(cause.y_mm / 10 - 0.5, cause.x_mm / 10 - 0.5, 0) <= 5
+    assert max(cause.p_value) <= 0.05
+    # 3 um per 3 K at the source, common and stretch together at the far end: 2 um/K.
+    for value, u in zip(cause.sensitivity_um_per_K, cause.sensitivity_u_um_per_K, strict=True):
+        assert value == pytest.approx(2.0, abs=4 * u)
+
+
+def test_a_source_of_one_session_is_listed_as_its_own(first):
+    second = maps_of(simulator.driven_session(np.random.default_rng(9), source=0, um_per_unit=0.0))
+    alone = compare_sources(first, second)
+    assert {one.shown_by for one in alone} == {(0,)}
+    assert min(simulator.distance_cells(one.y_mm / 10 - 0.5, one.x_mm / 10 - 0.5, 0) for one in alone) <= 5
+    assert all(one.p_value[0] <= 0.05 < one.p_value[1] for one in alone)
 
 
 def test_what_only_one_session_shows_is_not(first):
