@@ -6,7 +6,7 @@ time constant; drivers are averaged after they are raised to a power, because he
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +25,7 @@ EXPONENTS = (1, 2)
 #: A load cycle starts where a driver leaves its rest; rest is this share of its range above its minimum.
 _REST_SHARE = 0.02
 #: A driver is switched where it changes by this share of its range from one block to the next.
-_SWITCHED = 0.05
+_SWITCHED = 0.2
 #: Shortest and most chained blocks that a record is cut into.
 _MOST_CHAINED = 8
 _LEAST_CHAINED = 4
@@ -48,7 +48,7 @@ class Record:
     temperature : (blocks, sensors) mean, degC, gaps interpolated
     temperature_noise : (sensors,) standard uncertainty of a block mean from the scatter of the samples, K
     drivers : driver to its powers, exponent to (blocks,) values as a share of the driver's largest size
-    channels, sensors, driver_units : names, and units by driver
+    channels, sensors : names
     duplicates : sensors left out because they are a linear combination of the others
     chained : (blocks,) number of the chronological block of each row for forward chaining, from 0
     gaps : values that were interpolated, by column
@@ -63,7 +63,6 @@ class Record:
     drivers: Mapping[str, Mapping[int, Array]]
     channels: tuple[str, ...]
     sensors: tuple[str, ...]
-    driver_units: Mapping[str, str]
     duplicates: tuple[str, ...]
     chained: NDArray[np.int64]
     gaps: Mapping[str, int]
@@ -74,11 +73,11 @@ class Record:
         return self.temperature - self.temperature[0]
 
     def switched(self) -> NDArray[np.bool_]:
-        """Blocks within three blocks of a switching of any driver (blocks,): what happens there may be its consequence."""
+        """Blocks within two blocks of a switching of any driver (blocks,): what happens there may be its consequence."""
         near = np.zeros(self.seconds.size, bool)
         for powers in self.drivers.values():
             change = np.abs(np.diff(powers[1], prepend=powers[1][0])) > _SWITCHED * np.ptp(powers[1])
-            near |= np.convolve(change, np.ones(7), "same") > 0
+            near |= np.convolve(change, np.ones(5), "same") > 0
         return near
 
     def view(self) -> Readings:
@@ -104,8 +103,39 @@ class Record:
         )
 
 
+@dataclass(frozen=True)
+class _Blocks:
+    """How samples fall into blocks: place of each sample among the blocks that hold any, middle of each of those, s."""
+
+    source: str
+    place: NDArray[np.intp]
+    seconds: Array
+    length_s: float
+    gaps: dict[str, int]
+
+    def mean(self, values: Array) -> Array:
+        """Mean over each block, NaN where it holds no value."""
+        known = np.isfinite(values)
+        total = np.bincount(self.place[known], values[known], minlength=self.seconds.size)
+        number = np.bincount(self.place[known], minlength=self.seconds.size)
+        return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+    def filled(self, name: str, values: Array) -> Array:
+        """Mean over each block, gaps interpolated and counted."""
+        column = self.mean(values)
+        known = np.isfinite(column)
+        if known.sum() < 0.5 * known.size:
+            raise RecordError(
+                f'{self.source}: column "{name}" has values in {known.sum()} of {known.size} blocks of {self.length_s:g} s; leave it '
+                "out of [record]"
+            )
+        if not known.all():
+            self.gaps[name] = int((~known).sum())
+        return np.asarray(np.interp(self.seconds, self.seconds[known], column[known]))
+
+
 def reduce_record(table: xr.Dataset) -> Record:
-    """Average a record over blocks.
+    """Average a record over blocks; blocks without any sample (a pause) are left out.
 
     Parameters
     ----------
@@ -115,68 +145,51 @@ def reduce_record(table: xr.Dataset) -> Record:
     Raises
     ------
     RecordError
-        if it is too short, or a channel or a sensor holds too few values.
+        if it is too short, or a channel, a sensor or a driver holds too few values.
     """
     time = table["time"].values.astype("datetime64[ns]")
-    elapsed = (time - time[0]) / np.timedelta64(1, "s")
-    if np.unique(elapsed).size < LEAST_BLOCKS:
-        raise RecordError(
-            f"{table.attrs.get('source', 'record')}: {np.unique(elapsed).size} samples are too few to hold a part out; "
-            f"a record needs at least {LEAST_BLOCKS}"
-        )
-    step = float(np.median(np.diff(np.unique(elapsed))))
-    block = step * max(1, int(np.ceil((elapsed[-1] + step) / step / MOST_BLOCKS)))
-    place = (elapsed // block).astype(int)
-    count = int(place[-1]) + 1
-
-    def mean(values: Array) -> Array:
-        known = np.isfinite(values)
-        total = np.bincount(place[known], values[known], minlength=count)
-        number = np.bincount(place[known], minlength=count)
-        return np.where(number > 0, total / np.maximum(number, 1), np.nan)
-
-    seconds = (np.arange(count) + 0.5) * block
-    gaps: dict[str, int] = {}
-
-    def filled(name: str, values: Array) -> Array:
-        column = mean(values)
-        known = np.isfinite(column)
-        if known.sum() < 0.5 * count:
-            raise RecordError(
-                f'{table.attrs.get("source", "record")}: column "{name}" has values in {known.sum()} of {count} blocks of '
-                f"{block:g} s; leave it out of [record]"
-            )
-        if not known.all():
-            gaps[name] = int((~known).sum())
-        return np.asarray(np.interp(seconds, seconds[known], column[known]))
-
+    elapsed = np.asarray((time - time[0]) / np.timedelta64(1, "s"), np.float64)
+    blocks = _lay_blocks(str(table.attrs.get("source", "record")), elapsed)
     channels = tuple(str(name) for name in table["channel"].values)
-    displacement = np.column_stack([mean(table["displacement"].values[:, k]) for k in range(len(channels))])
+    displacement = np.column_stack([blocks.mean(table["displacement"].values[:, k]) for k in range(len(channels))])
     for k, name in enumerate(channels):
         if np.isfinite(displacement[:, k]).sum() < LEAST_BLOCKS:
-            raise RecordError(
-                f'{table.attrs.get("source", "record")}: channel "{name}" holds too few values; leave it out of [record]'
-            )
+            raise RecordError(f'{blocks.source}: channel "{name}" holds too few values; leave it out of [record]')
     sensors = [str(name) for name in table["sensor"].values]
-    temperature = np.column_stack([filled(name, table["temperature"].values[:, k]) for k, name in enumerate(sensors)])
+    samples = table["temperature"].values
+    temperature = np.column_stack([blocks.filled(name, samples[:, k]) for k, name in enumerate(sensors)])
     kept = independent(temperature)
-    drivers, units = _drivers(table, filled)
+    per_block = max(1.0, elapsed.size / blocks.seconds.size)
+    drivers = _drivers(table, blocks)
     return Record(
         start=time[0],
-        seconds=seconds,
-        block_s=block,
+        seconds=blocks.seconds,
+        block_s=blocks.length_s,
         displacement=displacement,
         temperature=temperature[:, kept],
-        temperature_noise=np.array([_noise(table["temperature"].values[:, k]) for k in kept])
-        / np.sqrt(max(1.0, block / step)),
+        temperature_noise=np.array([_noise(samples[:, k]) for k in kept]) / np.sqrt(per_block),
         drivers=drivers,
         channels=channels,
         sensors=tuple(sensors[k] for k in kept),
-        driver_units=units,
         duplicates=tuple(name for k, name in enumerate(sensors) if k not in kept),
-        chained=chained_blocks(seconds, [powers[1] for powers in drivers.values()]),
-        gaps=gaps,
+        chained=chained_blocks(blocks.seconds, [powers[1] for powers in drivers.values()]),
+        gaps=blocks.gaps,
     )
+
+
+def _lay_blocks(source: str, elapsed: Array) -> _Blocks:
+    """Cut the time of the samples (s since the first) into blocks of equal length."""
+    times = np.unique(elapsed)
+    if times.size < LEAST_BLOCKS:
+        raise RecordError(
+            f"{source}: {times.size} samples are too few to hold a part out; a record needs at least {LEAST_BLOCKS}"
+        )
+    step = float(np.median(np.diff(times)))
+    length = step * max(1, int(np.ceil(times.size / MOST_BLOCKS)))
+    # A sample that comes a little early still belongs to its own block.
+    number = np.floor((elapsed + 0.5 * step) / length).astype(int)
+    numbers, place = np.unique(number, return_inverse=True)
+    return _Blocks(source, place, np.asarray((numbers + 0.5) * length - 0.5 * step, np.float64), length, {})
 
 
 def _noise(samples: Array) -> float:
@@ -185,20 +198,16 @@ def _noise(samples: Array) -> float:
     return float(1.4826 * np.median(np.abs(second - np.median(second))) / np.sqrt(6.0))
 
 
-def _drivers(
-    table: xr.Dataset, filled: Callable[[str, Array], Array]
-) -> tuple[dict[str, dict[int, Array]], dict[str, str]]:
+def _drivers(table: xr.Dataset, blocks: _Blocks) -> dict[str, dict[int, Array]]:
     """Powers of every driver as shares of its largest size; one that never changes is left out."""
     drivers: dict[str, dict[int, Array]] = {}
-    units: dict[str, str] = {}
     for k, name in enumerate(str(one) for one in table["driver_name"].values):
         values = table["driver"].values[:, k]
         largest = float(np.nanmax(np.abs(values), initial=0.0))
         if largest == 0.0 or np.nanmin(values) == np.nanmax(values):
             continue
-        drivers[name] = {exponent: filled(name, (values / largest) ** exponent) for exponent in EXPONENTS}
-        units[name] = str(table["driver_units"].values[k])
-    return drivers, units
+        drivers[name] = {exponent: blocks.filled(name, (values / largest) ** exponent) for exponent in EXPONENTS}
+    return drivers
 
 
 def independent(columns: Array, *, tolerance: float = 1e-8) -> list[int]:

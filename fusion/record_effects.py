@@ -15,13 +15,13 @@ from fusion.record import EXPONENTS, Record
 
 #: What a record is modelled with where nothing else is declared: every displacement a linear function of the temperatures.
 QUASI_STATIC = "quasi_static"
+#: Name of the mean of all sensors among the sensors that may lag.
+MEAN = "mean of all"
 #: A load acts at once (bearings widen with the speed), warms the part beside it, then what that part is joined to: states a factor of
 #: four apart in their time constants.
 _CHAIN = (0.0, 0.25, 1.0, 4.0)
 #: Time constants of the middle part, min.
 _SOURCE_MIN = (5.0, 10.0, 20.0, 40.0, 80.0)
-#: Response times of a sensor, min.
-_RESPONSES_MIN = (2.5, 5.0, 10.0)
 #: An event needs this share of the record on either side to be told from a drift.
 _EVENT_MARGIN = 0.05
 #: Instants at which an event is tried.
@@ -62,7 +62,7 @@ def thermal_lag_members(record: Record, near: Member | None) -> Iterator[Member]
     """Lagged copies of one sensor, or of the mean of all."""
     block_min = record.block_s / 60.0
     named = {name: record.rise[:, k] for k, name in enumerate(record.sensors)}
-    named["mean of all"] = record.rise.mean(axis=1)
+    named[MEAN] = record.rise.mean(axis=1)
     for name, rise in named.items():
         if near is not None and near.parameters["sensor"] != name:
             continue
@@ -70,13 +70,6 @@ def thermal_lag_members(record: Record, near: Member | None) -> Iterator[Member]
             if minutes >= 2.0 * block_min:
                 lagged = Series(record.seconds, rise, "K").lagged(60.0 * minutes).values
                 yield Member(lagged[:, None], {"sensor": name, "time_constant_min": minutes}, ("um/K",))
-
-
-def sensor_lag_members(record: Record, near: Member | None) -> Iterator[Member]:
-    """What sensors of a common response time have not shown yet: the temperatures minus their own delayed copies."""
-    for minutes in _around(near, _RESPONSES_MIN):
-        late = Series(record.seconds, record.rise, "K").lagged(60.0 * minutes).values
-        yield Member(record.rise - late, {"time_constant_min": minutes}, ("um/K",) * len(record.sensors))
 
 
 def unseen_heat_source_members(record: Record, near: Member | None) -> Iterator[Member]:
@@ -162,7 +155,6 @@ def _around(near: Member | None, grid: tuple[float, ...]) -> tuple[float, ...]:
 
 
 _MEMBERS = {
-    "sensor_lag": sensor_lag_members,
     "thermal_lag": thermal_lag_members,
     "unseen_heat_source": unseen_heat_source_members,
     "step_event": step_event_members,
@@ -184,15 +176,6 @@ def _needs(name: str) -> Callable[[Record], str | None]:
     return needs
 
 
-SENSOR_LAG = RecordEffect(
-    "sensor_lag",
-    "Sensors on a surface or in a pocket show the temperature of what moves only after their own response time: the displacement leads them.",
-    "first-order response of a contact sensor",
-    sensor_lag_members,
-    lambda record: None,
-)
-
-
 def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[str, RecordEffect], dict[str, str]]:
     """Effects that can act in a record by name, and why the others of the library are not tried.
 
@@ -200,7 +183,6 @@ def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[st
     """
     built_in = {effect.name for effect in LIBRARY}
     found, not_tried = {}, {}
-    found["sensor_lag"] = SENSOR_LAG
     for name, effect in (library() if effects is None else effects).items():
         if name in _MEMBERS:
             found[name] = RecordEffect(name, effect.physics, effect.source, _MEMBERS[name], _needs(name))

@@ -11,30 +11,30 @@ from fusion.members import Member
 from fusion.record import Record
 from fusion.record_effects import RecordEffect
 from fusion.record_model import RecordFit, gains
-from interferometry.statespace import Array
+from interferometry.statespace import Array, fit_fixed_effects
 
 #: Temperature noise over range beyond which a lag is not believed (statistics study, section 3.4).
 _NOISE_SHARE = 0.01
-#: A load state of which one plain warm-up explains more than this share has been excited by nothing else.
-_WARM_UP_SHARE = 0.99
+#: A driver of which one switching explains more than this share was switched once only.
+_ONE_SWITCHING = 0.99
 #: Log-likelihood that a lag must gain over a copy that is only smoothed.
 _SMOOTH_GAIN = 2.0
-_WARM_UPS_MIN = np.geomspace(5.0, 400.0, 40)
 
 
 def blocked_reason(effect: RecordEffect, member: Member, model: RecordFit) -> str | None:
     """Why this effect must not be named although it fits, or None."""
     record = model.record
+    if member.event_s is not None and record.switched()[np.searchsorted(record.seconds, member.event_s)]:
+        hours = f"{member.event_s / 3600.0:.2f} h"
+        return f"at {hours} a driver was switched: a shift there is a response to the load, not an event of its own"
     if effect.name == "unseen_heat_source":
-        share = warm_up_share(record, member.columns[model.used])
-        if share > _WARM_UP_SHARE:
+        driver = str(member.parameters["follows"])
+        share = one_switching_share(record.drivers[driver][1][model.used])
+        if share > _ONE_SWITCHING:
             return (
-                f"the load was switched on once only ({100 * share:.1f} % of the source's course is a plain warm-up), and one warm-up "
-                "looks like every other; switch the load on purpose to tell"
+                f"{driver} was switched once only ({100 * share:.1f} % of its course is one step), and one warm-up looks like every "
+                "other; switch the load on purpose to tell"
             )
-    if effect.name == "step_event" and member.event_s is not None:
-        if record.switched()[np.searchsorted(record.seconds, member.event_s)]:
-            return f"at {member.event_s / 3600.0:.2f} h a driver was switched: a shift there is a response to the load, not an event of its own"
     if effect.name == "thermal_lag":
         rise = sensor_rise(record, str(member.parameters["sensor"]))
         noise = sensor_noise(record, str(member.parameters["sensor"])) / max(float(np.ptp(rise[model.used])), 1e-12)
@@ -42,6 +42,11 @@ def blocked_reason(effect: RecordEffect, member: Member, model: RecordFit) -> st
             return (
                 f"the noise of {member.parameters['sensor']} is {100 * noise:.1f} % of its range; above {100 * _NOISE_SHARE:g} % a "
                 "lagged, smoother copy wins by its smoothness alone"
+            )
+        if _follows_the_rate(model, rise, member):
+            return (
+                f"with the delayed copy of {member.parameters['sensor']} the displacement follows the rate of the sensor or leads it, as "
+                "with a late sensor or a source nearby; that is not a lag"
             )
         smooth = Member(smoothed(record, rise, float(member.parameters["time_constant_min"]))[:, None], {}, ("um/K",))
         found, _ = gains(model, [np.empty((rows.size, 0)) for rows in model.rows], [member, smooth])
@@ -52,6 +57,27 @@ def blocked_reason(effect: RecordEffect, member: Member, model: RecordFit) -> st
                 "wins by denoising, not by physics"
             )
     return None
+
+
+def _follows_the_rate(model: RecordFit, rise: Array, member: Member) -> bool:
+    """True where most of what a delayed copy explains is the sensor's rate, or acts before the sensor.
+
+    Alike sensors share their coefficients in any way, so the sensitivity to a sensor is that of all columns to its course. A rate is
+    the sensor and its delayed copy with opposite signs that nearly cancel; a lead is a delayed copy that acts against the sensor.
+    """
+    weight = {True: 0.0, False: 0.0}
+    for fit, rows in zip(model.channels, model.rows, strict=True):
+        course = rise[rows] - rise[rows].mean()
+        size = fit.design.shape[1]
+        found = fit_fixed_effects(fit.system, fit.response, np.column_stack([fit.design, member.columns[rows]]))
+        delayed = float(found.coefficients[-1])
+        alone, beside = (
+            float((fit.design[:, 1:] @ coefficients[1:size]) @ course) / max(float(course @ course), 1e-300)
+            for coefficients in (fit.coefficients, found.coefficients)
+        )
+        cancels = beside * delayed < 0.0 and abs(beside + delayed) < 0.5 * max(abs(beside), abs(delayed))
+        weight[cancels or alone * delayed < 0.0] += abs(delayed) / fit.sigma
+    return weight[True] > weight[False]
 
 
 def sensor_rise(record: Record, name: str) -> Array:
@@ -73,14 +99,10 @@ def smoothed(record: Record, values: Array, minutes: float) -> Array:
     return np.asarray(np.convolve(values, kernel, "same") / np.convolve(np.ones_like(values), kernel, "same"))
 
 
-def warm_up_share(record: Record, columns: Array) -> float:
-    """Share of the columns' course that one plain warm-up from the record's start explains (least of the columns)."""
-    seconds = record.seconds[: columns.shape[0]]
-    curves = [1.0 - np.exp(-seconds / (60.0 * minutes)) for minutes in _WARM_UPS_MIN]
-    return min(1.0 - min(_left(column, curve) for curve in curves) for column in columns.T)
-
-
-def _left(course: Array, curve: Array) -> float:
-    basis = np.column_stack([np.ones(course.size), curve])
-    left = course - basis @ np.linalg.lstsq(basis, course, rcond=None)[0]
-    return float(left @ left) / max(float(((course - course.mean()) ** 2).sum()), 1e-300)
+def one_switching_share(driver: Array) -> float:
+    """Share of a driver's variance that the best single step explains."""
+    n = driver.size
+    before = np.cumsum(driver)[:-1]
+    count = np.arange(1, n)
+    between = (before / count - (driver.sum() - before) / (n - count)) ** 2 * count * (n - count) / n
+    return float(between.max() / max(float(((driver - driver.mean()) ** 2).sum()), 1e-300))

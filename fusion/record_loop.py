@@ -8,7 +8,7 @@ shrunk together. The last fifth of the time is sealed and touched once, at the e
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ MOST_EFFECTS = 4
 WORSE = 1.05
 _SUPERFLUOUS_GAIN = 2.0
 #: An effect must bring the forward-chained error down to this share of what it was, or it only follows chance.
-_EARNED = 0.99
+_EARNED = 0.98
 #: An event may make the forward-chained error larger by this factor: chance, not harm.
 _HARMLESS = 1.01
 _MAY_REPEAT = frozenset({"step_event", "periodic_disturbance", "sensor_fault"})

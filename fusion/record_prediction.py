@@ -17,6 +17,8 @@ from interferometry.statespace import Array
 
 #: Shares of a column's variance that are added to it: from ordinary least squares to hardly any coefficient at all.
 PENALTIES = 10.0 ** np.arange(-5.0, 1.6, 0.5)
+#: Share of the training blocks that must lie before a part for its prediction to be counted.
+_LATER = 0.5
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Prediction:
     coefficients : (p, channels) of the columns, um per unit of each
     centre : (p,) values of the columns at which the prediction is the channel's mean
     penalty : the shrinkage that forward chaining chose
-    chained_rmse : error of the forward-chained training blocks under it, mean over channels, um; NaN with fewer than two blocks
+    chained_rmse : error of the forward-chained training blocks under it, mean over channels, um; NaN where there is none
     """
 
     predicted: Array
@@ -48,15 +50,25 @@ def predict(record: Record, columns: Array, train: NDArray[np.bool_]) -> Predict
     columns : (blocks, p) of the model, known for all blocks
     train : (blocks,) those whose displacements may be used
     """
-    numbers = np.unique(record.chained[train])
-    errors = np.full((numbers.size, PENALTIES.size), np.nan)
-    for place, number in enumerate(numbers[1:], start=1):
-        before, next_one = train & (record.chained < number), train & (record.chained == number)
+    asked = chained_parts(record, train)
+    errors = np.full((len(asked), PENALTIES.size), np.nan)
+    for place, number in enumerate(asked):
+        before, part = train & (record.chained < number), train & (record.chained == number)
         for k, (predicted, _, _) in enumerate(_paths(record, columns, before)):
-            errors[place, k] = rmse(record, predicted, next_one)
-    mean = errors[1:].mean(axis=0) if numbers.size > 1 else np.full(PENALTIES.size, np.nan)
-    best = int(np.argmin(mean)) if numbers.size > 1 else PENALTIES.size // 2
+            errors[place, k] = rmse(record, predicted, part)
+    mean = errors.mean(axis=0) if asked else np.full(PENALTIES.size, np.nan)
+    best = int(np.argmin(mean)) if asked else PENALTIES.size // 2
     return Prediction(*_paths(record, columns, train)[best], float(PENALTIES[best]), float(mean[best]))
+
+
+def chained_parts(record: Record, train: NDArray[np.bool_]) -> list[int]:
+    """Parts of the training blocks that are predicted from those before them: those of the later half.
+
+    Before that, a load that has been switched only a few times leaves the coefficients undetermined.
+    """
+    numbers, counts = np.unique(record.chained[train], return_counts=True)
+    before = np.cumsum(counts) - counts
+    return [int(number) for number, rows in zip(numbers, before, strict=True) if rows >= _LATER * counts.sum()]
 
 
 def rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> float:

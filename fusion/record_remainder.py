@@ -10,8 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion.adequacy import LEVEL
+from fusion.record import Record
 from fusion.record_model import RecordFit
 from interferometry.statespace import Array
 
@@ -32,14 +34,14 @@ class RecordRemainder:
     p_values : the same for each statistic alone
     shape : in words, empty where nothing is left
     rms_um : error on the sealed part that the shape stands for, mean over channels; 0 where nothing is left
-    variance_share : share of the displacements' variance that the model leaves in the sealed part
+    variance_share : (channels,) share of the displacement's variance that the model leaves in the sealed part
     """
 
     p_value: float
     p_values: dict[str, float]
     shape: str
     rms_um: float
-    variance_share: float
+    variance_share: Array
 
 
 def examine(model: RecordFit, sealed_rmse: Array, rng: np.random.Generator) -> RecordRemainder:
@@ -69,7 +71,7 @@ def examine(model: RecordFit, sealed_rmse: Array, rng: np.random.Generator) -> R
         name: float((1 + (null[:, k] >= observed[k]).sum()) / (1 + _PERMUTATIONS)) for k, name in enumerate(names)
     }
     p_value = float((1 + (largest >= values.max()).sum()) / (1 + _PERMUTATIONS))
-    share = float(np.mean(sealed_rmse**2) / np.mean(np.nanvar(record.displacement, axis=0)))
+    share = sealed_rmse**2 / np.nanvar(record.displacement, axis=0)
     words = []
     if p_value < LEVEL:
         period_min = record.seconds.size * record.block_s / 60.0 / line
@@ -80,13 +82,15 @@ def examine(model: RecordFit, sealed_rmse: Array, rng: np.random.Generator) -> R
                 "switching": "quick responses where a driver is switched",
             }[names[int(np.argmax(values))]]
         )
-    if share > _VARIANCE_SHARE:
-        words.append("a slow drift that neither temperatures nor drivers follow")
-    shape = f"{' and '.join(words)}; largest in {_largest(record.channels, sealed_rmse)}" if words else ""
+    if np.mean(sealed_rmse**2) > _VARIANCE_SHARE * np.mean(np.nanvar(record.displacement, axis=0)):
+        words.append(
+            f"a slow drift that neither temperatures nor drivers follow, largest in {_largest(record, sealed_rmse)}"
+        )
+    shape = " and ".join(words)
     return RecordRemainder(p_value, p_values, shape, float(np.mean(sealed_rmse)) if words else 0.0, share)
 
 
-def _statistics(innovations: Array, switched: Array) -> tuple[Array, int]:
+def _statistics(innovations: Array, switched: NDArray[np.bool_]) -> tuple[Array, int]:
     """Three statistics that grow with structure, of the channels' leading common course; and the strongest line's number."""
     u, s, _ = np.linalg.svd(innovations, full_matrices=False)
     course = u[:, 0] * s[0]
@@ -100,7 +104,7 @@ def _statistics(innovations: Array, switched: Array) -> tuple[Array, int]:
     return np.array([float((autocorrelation**2).sum()), float(spectrum.max() / spectrum.mean()), excess]), line
 
 
-def _largest(channels: tuple[str, ...], rmse: Array) -> str:
+def _largest(record: Record, rmse: Array) -> str:
     """Channels with the larger errors, in words."""
-    strong = [name for name, error in zip(channels, rmse, strict=True) if error >= 0.7 * rmse.max()]
-    return "all channels alike" if len(strong) == len(channels) and len(strong) > 1 else ", ".join(strong)
+    strong = [name for name, error in zip(record.channels, rmse, strict=True) if error >= 0.7 * rmse.max()]
+    return "all channels alike" if 1 < len(strong) == len(record.channels) else ", ".join(strong)

@@ -18,15 +18,14 @@ from fusion.record_loop import (
     Chained,
     Progress,
     Round,
-    RecordScore,
     Search,
     chain_forward,
     declare,
     seal,
     search,
 )
-from fusion.record_model import RecordFit, columns_of, fit_record
-from fusion.record_prediction import Prediction, channel_rmse, predict
+from fusion.record_model import RecordFit, fit_record
+from fusion.record_prediction import Prediction, channel_rmse
 from fusion.record_remainder import RecordRemainder, examine
 from fusion.search import TIE_GAIN
 from interferometry.statespace import Array
@@ -88,7 +87,7 @@ class RecordResult:
                 "rms_um": self.remainder.rms_um,
                 "p_value": self.remainder.p_value,
                 "p_values": self.remainder.p_values,
-                "variance_share": self.remainder.variance_share,
+                "variance_share": float(self.remainder.variance_share.mean()),
                 "nearest": last[0].name if self.remainder.shape and last else "",
             },
             "channels": {
@@ -97,6 +96,7 @@ class RecordResult:
                     "rmse_declared_um": float(self.errors[0, k]),
                     "rmse_final_um": float(self.errors[-1, k]),
                     "noise_um": float(self.whole.sigma[k]),
+                    "variance_share": float(self.remainder.variance_share[k]),
                 }
                 for k, name in enumerate(record.channels)
             },

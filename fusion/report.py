@@ -14,7 +14,7 @@ import jinja2
 import numpy as np
 import xarray as xr
 
-from fusion import plots, plots_correlation, plots_fusion, plots_plan, report_text, wording
+from fusion import plots, plots_correlation, plots_fusion, plots_plan, report_record, report_text, wording
 from fusion.groups import correlation_of, group, has
 from fusion.report_correlation import leading_region
 from fusion.verdict import find_source
@@ -42,7 +42,8 @@ def render_report(
     results, provenance : mapping
         Content of results.json and provenance.json.
     datasets : mapping
-        ``fields``, ``deviations``, ``fusion`` as they were written; those that a campaign does not have may be missing.
+        ``fields``, ``deviations``, ``fusion`` as they were written; those that a campaign does not have may be missing. A ``record``
+        stands alone.
     joint : mapping, optional
         What this campaign and another one of the machine agree on: ``other``, its title, and ``rows`` of name and text.
     """
@@ -58,6 +59,15 @@ def render_report(
         joined=wording.join,
     )
     environment.globals.update(measured=wording.measured, duration=wording.duration)
+    if "record" in datasets:
+        return environment.get_template("record.html.j2").render(
+            results=results,
+            provenance=provenance,
+            summary=report_record.describe_record(results, provenance, datasets["record"]),
+            figures={
+                name: svg_text(draw, name) for name, draw in report_record.draw_record(datasets["record"]).items()
+            },
+        )
     return environment.get_template("report.html.j2").render(
         results={name: results.get(name) for name in (*results, *_OPTIONAL)},
         provenance=provenance,

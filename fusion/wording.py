@@ -10,6 +10,10 @@ import numpy as np
 
 #: Effect -> its name in plain words, and what to look at on the machine or the measurement when it was found missing.
 EFFECTS: dict[str, tuple[str, str]] = {
+    "quasi_static": (
+        "quasi-static response to the temperatures",
+        "Check that the sensors sit on the parts that move the tool and the work.",
+    ),
     "axis_expansion": (
         "expansion of the axis",
         "Check the expansion coefficient and the probe place that the laser's compensation uses.",
@@ -23,8 +27,8 @@ EFFECTS: dict[str, tuple[str, str]] = {
         "Wait longer before measuring, or log the temperature of the column and the bed.",
     ),
     "unseen_heat_source": (
-        "heat source that the camera does not see",
-        "Look for it outside the picture: spindle motor, drive, screw bearing, hydraulics; log its duty.",
+        "unseen heat source",
+        "Look for it where neither camera nor sensors reach: spindle, motor, drive, screw bearing, hydraulics; log its duty.",
     ),
     "dead_path": (
         "dead path of the laser",
@@ -167,7 +171,7 @@ def verdict_headline(loop: Mapping[str, Any]) -> str:
     return {
         "complete": "The declared model explains the drift; nothing in these data shows that an effect is missing.",
         "explained": f"The declared model lacked {noun}: {added}. With {pronoun}, nothing is left that these data can show.",
-        "partial": f"The declared model lacked {added}; after adding it, something without a name is left ({left}).",
+        "partial": f"The declared model lacked {noun}: {added}. With {pronoun}, something without a name is left ({left}).",
         "unexplained": f"Something is left that no effect of the library explains ({left}).",
     }[loop["verdict"]]
 

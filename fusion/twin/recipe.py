@@ -204,7 +204,10 @@ class AnomalyRecipe:
 
 @dataclass(frozen=True)
 class Record:
-    """A record instead of a positioning test: sensors and channels over hours, under a spindle speed that changes at random."""
+    """A record instead of a positioning test: sensors and channels over hours, under a spindle speed that changes at random.
+
+    Sensors follow their part late, each by a time between the two of `sensor_lag_min`.
+    """
 
     hours: float = 24.0
     step_s: float = 60.0
@@ -216,6 +219,7 @@ class Record:
     room_swing_K: float = 1.0
     sensitivity_um_per_K: float = 1.5
     noise_K: float = 0.03
+    sensor_lag_min: tuple[float, float] = (0.5, 2.0)
     noise_um: float = 0.3
     walk_um_per_sqrt_h: float = 0.2
 

@@ -47,8 +47,6 @@ JOINTS = (
 )
 SPINDLE_W = 320.0
 MOTOR_W = 90.0
-#: Sensors stand on the surface and follow their part late, minutes.
-SENSOR_LAG_MIN = (2.0, 9.0)
 #: Effects of the library that mean something without positions.
 IN_A_RECORD = ("thermal_lag", "unseen_heat_source", "step_event", "periodic_disturbance")
 CHANNELS = ("X", "Y", "Z", "A", "B", "C")
@@ -91,7 +89,7 @@ def simulate_record(recipe: Recipe) -> RecordTruth:
     names, channels = _sensors(record), CHANNELS[: record.channels]
     rng = stream(seed, "sensors")
     own = seen[:, np.arange(record.sensors) % seen.shape[1]] * rng.uniform(0.85, 1.1, record.sensors)
-    for column, minutes in enumerate(rng.uniform(*SENSOR_LAG_MIN, record.sensors)):
+    for column, minutes in enumerate(rng.uniform(*record.sensor_lag_min, record.sensors)):
         own[:, column] = first_order(own[:, column], record.step_s, 60.0 * minutes)
     logged = 20.0 + own + record.noise_K * rng.standard_normal(own.shape)
 

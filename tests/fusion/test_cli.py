@@ -10,9 +10,11 @@ from pathlib import Path
 
 import jsonschema
 import pytest
+import xarray as xr
 from typer.testing import CliRunner, Result
 
 from fusion import cli
+from fusion.results import results_schema
 
 
 def invoke(*arguments: str | Path) -> Result:
@@ -129,14 +131,38 @@ def test_plan_proposes_a_schedule_and_refuses_half_a_source() -> None:
         assert (refused.exit_code, refused.stderr) == (2, f"thermofuse: {message}\n")
 
 
-def test_a_record_is_refused_with_its_reason(tmp_path: Path) -> None:
-    (tmp_path / "record.csv").write_text("time [s],t1 [degC],ch1 [um]\n0,20,0\n")
+def test_a_record_of_hours_is_explained(tmp_path: Path) -> None:
+    recipe = tmp_path / "recipe.toml"
+    recipe.write_text(
+        '[campaign]\ntitle = "A machining centre"\nseed = 44\n[record]\nhours = 24\n'
+        '[[effect]]\nname = "unseen_heat_source"\namplitude_um = 1.5\n'
+    )
+    assert invoke("simulate", recipe, "--out", tmp_path / "day").exit_code == 0
+    result = invoke("run", tmp_path / "day" / "campaign.toml", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    written = json.loads((tmp_path / "out" / "results.json").read_text())
+    jsonschema.validate(written, results_schema())
+    assert [step["effect"] for step in written["loop"]["steps"]] == ["unseen_heat_source"]
+    assert written["loop"]["rmse_final_um"] < written["loop"]["rmse_declared_um"]
+    assert written["loop"]["verdict"] == "explained"
+    assert "verdict" in result.output
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "The declared model lacked an effect: unseen heat source." in page
+    with xr.open_dataset(tmp_path / "out" / "fusion.nc", engine="h5netcdf") as product:
+        assert {"displacement", "predicted_final", "contribution", "sealed"} <= set(product.data_vars)
+    again = invoke("run", tmp_path / "day" / "campaign.toml", "--out", tmp_path / "out", "--resume")
+    assert again.exit_code == 0
+    assert json.loads((tmp_path / "out" / "results.json").read_text())["loop"] == written["loop"]
+
+
+def test_a_record_too_short_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    (tmp_path / "record.csv").write_text("time [s],t1 [degC],ch1 [um]\n0,20,0\n1,20,0\n")
     (tmp_path / "record.toml").write_text(
         '[campaign]\ntitle = "R"\n[record]\nfile = "record.csv"\ntime = "time [s]"\ntemperatures = ["t*"]\ndisplacements = ["ch*"]\n'
     )
     result = invoke("run", tmp_path / "record.toml", "--out", tmp_path / "out")
     assert result.exit_code == 2
-    assert "a [record] is checked but not analysed by this version" in result.stderr
+    assert "record.csv: 2 samples are too few to hold a part out; a record needs at least 40" in result.stderr
     assert not (tmp_path / "out").exists()
 
 

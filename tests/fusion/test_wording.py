@@ -56,7 +56,7 @@ def loop(verdict: str, *effects: str, shape: str = "") -> dict[str, Any]:
         ),
         (
             loop("partial", "step_event", shape="a wave of 37 min"),
-            "The declared model lacked sudden step; after adding it, something without a name is left (a wave of 37 min).",
+            "The declared model lacked an effect: sudden step. With it, something without a name is left (a wave of 37 min).",
         ),
         (loop("unexplained"), "Something is left that no effect of the library explains (without a clear shape)."),
     ],
