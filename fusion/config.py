@@ -159,6 +159,9 @@ class InterferometryTable(_Table):
     expansion_coefficient_ppm_per_K: PartsPerMillion = Field(default=11.7, alias="expansion_coefficient")
     feed_mm_per_min: Feed | None = Field(default=None, alias="feed")
     dwell_s: PositiveSeconds | None = Field(default=None, alias="dwell")
+    compensation: Literal["as recorded", "redo"] = "as recorded"
+    material_temperature: Literal["logged", "camera"] = "logged"
+    environment_factor_mm: tuple[Millimetres, Millimetres] | None = Field(default=None, alias="environment_factor")
 
 
 class DriversTable(_Table):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,12 @@ from fusion.config import Campaign, InterferometryTable, PlanTable, Thermography
 from fusion.contracts import check
 from fusion.preflight import check_clocks
 from fusion.randomisation import DutyLaw, read_duty
+from fusion.recompensation import compensate_readings, see_material
 from fusion.regions import Region, read_regions
 from fusion.results import Notice
 from fusion.tables import read_drivers, split_heading
-from interferometry.compensation import air_index, dead_path_error_um
 from interferometry.contract import DEVIATIONS
+from interferometry.iso230 import Iso230Budget
 from interferometry.readers import read_deviations, read_environment
 from thermography.flir import FrameReference, index_frames
 from thermography.plan import Fiducial, PlanGrid, read_fiducials
@@ -48,6 +49,12 @@ class Source:
     regions: list[Region] = field(default_factory=list)
     duty: tuple[xr.DataArray, DutyLaw] | None = None
     notices: list[Notice] = field(default_factory=list)
+    iso_budget: Iso230Budget | None = None
+
+    @property
+    def needs_camera(self) -> bool:
+        """Whether the readings are compensated again with what the camera saw."""
+        return self.interferometry.material_temperature == "camera"
 
     @property
     def grid(self) -> PlanGrid:
@@ -82,7 +89,8 @@ def read_source(campaign: Campaign) -> Source:
     environment = None
     if interferometry.environment is not None:
         environment = read_environment(campaign.resolve(interferometry.environment))
-    deviations, corrected = correct_dead_path(deviations, environment, interferometry.dead_path_mm)
+    compensated = compensate_readings(deviations, environment, interferometry)
+    by_camera = interferometry.material_temperature == "camera"
     drivers = read_drivers(campaign.resolve(campaign.drivers.file)) if campaign.drivers is not None else None
     frames, rejected = index_frames(campaign.frame_paths())
     listed = [
@@ -100,12 +108,22 @@ def read_source(campaign: Campaign) -> Source:
         if np.isnat(frame.time)
     ]
     source = Source(
-        campaign, thermography, plan, interferometry, deviations, environment, drivers,
+        campaign, thermography, plan, interferometry, deviations if by_camera else compensated.deviations, environment, drivers,
         read_fiducials(campaign.resolve(plan.fiducials)), timed, listed,
         [] if plan.regions is None else read_regions(campaign.resolve(plan.regions)), _randomised(campaign, drivers),
+        [] if by_camera else compensated.notices, compensated.budget,
     )  # fmt: skip
-    source.notices.extend([*_notices(source), *corrected])
+    source.notices[:0] = _notices(source)
     return source
+
+
+def compensate_by_camera(source: Source, fields: xr.Dataset) -> tuple[Source, list[Notice]]:
+    """Compensate the readings again with the temperature that the camera saw along the axis, where the campaign asks for it."""
+    if not source.needs_camera:
+        return source, []
+    seen = see_material(fields, source.axis, source.deviations)
+    redone = compensate_readings(source.deviations, source.environment, source.interferometry, seen=seen)
+    return replace(source, deviations=redone.deviations, iso_budget=redone.budget), redone.notices
 
 
 def _randomised(campaign: Campaign, drivers: xr.Dataset | None) -> tuple[xr.DataArray, DutyLaw] | None:
@@ -116,37 +134,6 @@ def _randomised(campaign: Campaign, drivers: xr.Dataset | None) -> tuple[xr.Data
     law = DutyLaw(table.mean_dwell_s, table.least_dwell_s)
     names = [split_heading(campaign.resolve(table.file), heading)[0] for heading in table.randomised]
     return read_duty(drivers, names, law, source=table.file), law
-
-
-def correct_dead_path(
-    deviations: xr.Dataset, environment: xr.Dataset | None, dead_path_mm: float
-) -> tuple[xr.Dataset, list[Notice]]:
-    """Take out what the air of a known dead path adds to the readings, for a reflector that moves away from the laser.
-
-    The readings' own path is left as the instrument compensated it.
-    """
-    if dead_path_mm == 0.0:
-        return deviations, []
-    if environment is None:
-        remedy = "log air temperature, pressure and humidity, and name the file as [interferometry] environment"
-        message = f"The dead path of {dead_path_mm:g} mm is not corrected: the air was not logged."
-        return deviations, [Notice("dead_path_uncorrected", message, remedy)]
-    log = environment.dropna("time")
-    start = log["time"].values[0]
-    at, known = (
-        (times.astype("datetime64[ns]") - start) / np.timedelta64(1, "s")
-        for times in (deviations["time"].values, log["time"].values)
-    )
-    names = ("air_temperature", "air_pressure", "relative_humidity")
-    index = air_index(*(np.interp(at, known, log[name].values) for name in names))
-    first = float(index.ravel()[np.nanargmin(at)])
-    error = dead_path_error_um(index, first, dead_path_mm=dead_path_mm)
-    size = float(np.nanmax(error) - np.nanmin(error))
-    message = f"The dead path of {dead_path_mm:g} mm is corrected for the logged air: {size:.2f} um from least to most."
-    corrected = deviations.assign(deviation=deviations["deviation"] - error)
-    corrected["deviation"].attrs.update(deviations["deviation"].attrs)
-    remedy = "nothing, unless the reflector moves towards the laser: then give the dead path a minus sign"
-    return corrected, [Notice("dead_path_corrected", message, remedy, size)]
 
 
 def _notices(source: Source) -> list[Notice]:

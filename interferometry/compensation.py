@@ -210,7 +210,7 @@ def compensate(
     u = {
         "air_u": length_m * _air_ppm(air, sensors, wavelength_nm),
         "material_u": length_m * _material_ppm(np.asarray(material), expansion_coefficient_ppm_per_K, sensors),
-        "dead_path_u": sensors.dead_path_mm * 1e3 * np.abs(index - start_index) * (dead_path_mm > 0),
+        "dead_path_u": sensors.dead_path_mm * 1e3 * np.abs(index - start_index) * (dead_path_mm != 0),
     }
     u["compensation_u"] = np.sqrt(sum(np.square(one) for one in u.values()))
     dims = deviations["deviation"].dims
