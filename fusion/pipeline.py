@@ -12,7 +12,7 @@ from typing import Any
 
 import xarray as xr
 
-from fusion import stages, stages_correlation, stages_thermal
+from fusion import stages, stages_correlation, stages_record, stages_thermal
 from fusion.cf import annotate
 from fusion.config import Campaign, load_campaign
 from fusion.outcome import Outcome
@@ -21,7 +21,7 @@ from fusion.progress import Report, silent
 from fusion.provenance import describe_run, hash_inputs, versions
 from fusion.report import render_report
 from fusion.results import Notice, assemble
-from fusion.sources import SourceError, compensate_by_camera, read_source
+from fusion.sources import compensate_by_camera, read_source
 
 #: Where each stage keeps its Dataset; what ends up in fusion.nc is kept apart while it may have to be resumed.
 FILES = {
@@ -29,6 +29,7 @@ FILES = {
     "deviations": "deviations.nc",
     "correlation": ".stages/correlation.nc",
     "model": ".stages/model.nc",
+    "record": "fusion.nc",
 }
 
 
@@ -135,10 +136,7 @@ def run_campaign(
     campaign = load_campaign(path, effect_names=stages.effect_names())
     folder = Path(out)
     if campaign.record is not None:
-        raise SourceError(
-            f"{campaign.path}: a [record] is checked but not analysed by this version; its columns can be read with "
-            "fusion.tables.read_record"
-        )
+        return _run_record(campaign, folder, resume=resume, report=report)
     source = read_source(campaign)
     open_folder(folder, resume=resume)
     started = datetime.now(UTC)
@@ -179,6 +177,17 @@ def run_campaign(
     write_dataset(folder / "fusion.nc", fusion)
     stages_thermal.write_exr(folder / "maps", fields, report=report)
     return _finish(run, {"fields": fields, "deviations": deviations, "fusion": fusion})
+
+
+def _run_record(campaign: Campaign, folder: Path, *, resume: bool, report: Report) -> dict[str, Any]:
+    """Run the main job on a record: one table, one stage."""
+    source = stages_record.read_source(campaign)
+    open_folder(folder, resume=resume)
+    started = datetime.now(UTC)
+    inputs = hash_inputs(campaign.input_files(), report=report)
+    run = Run(campaign, folder, report, StageStamps(folder), inputs, started)
+    record = run.stage("record", ("record", "model"), (), lambda: stages_record.model_record(source, report=report))
+    return _finish(run, {"record": record})
 
 
 def _finish(run: Run, datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from fusion.model import ModelFit, fit_model
 from fusion.outcome import Outcome
 from fusion.progress import Report
 from fusion.readings import read_fused
+from fusion.record_effects import QUASI_STATIC
 from fusion.results import Notice
 from fusion.sources import Source, counted, listed
 from interferometry import iso230, neighbours
@@ -34,6 +35,7 @@ LABELS = {
     "deviations": "deviations",
     "correlation": "correlation",
     "model": "anomalies and closed loop",
+    "record": "closed loop on the record",
 }
 #: Largest family-wise p of an anomaly for which a cause is named.
 _CAUSE_LEVEL = 0.02
@@ -41,7 +43,7 @@ _CAUSE_LEVEL = 0.02
 
 def effect_names() -> tuple[str, ...]:
     """Return the names that a campaign may declare, a user's own effects included."""
-    return tuple(library())
+    return (*library(), QUASI_STATIC)
 
 
 def evaluate_interferometry(source: Source) -> Outcome:
