@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fusion.record import reduce_record
-from fusion.record_loop import declare, search, seal
+from fusion.record_loop import declare, seal, search
 from fusion.record_prediction import channel_rmse
 from fusion.twin.recipe import EffectRecipe
 from tests.fusion.record_tables import twin_table
