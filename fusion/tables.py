@@ -15,7 +15,7 @@ import xarray as xr
 
 from fusion.config import Campaign, CampaignError, RecordTable
 from fusion.quantities import QuantityError, conversion, unit_name
-from interferometry.delimited import BadReading, Rejected, join_zones, parse_time, read_table, refuse_hopeless
+from interferometry.delimited import BadReading, Rejected, parse_time, read_table, read_timed_rows, refuse_hopeless
 
 _HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
 
@@ -76,34 +76,12 @@ def read_drivers(path: Path) -> xr.Dataset:
     headings = {column: split_heading(path, column) for column in table.columns if column != "time"}
     if not headings:
         raise TableError(f'{path}: there is no column beside time; add one named "name [unit]", or leave [drivers] out')
-    rows: dict[np.datetime64, list[float]] = {}
-    left_out: list[Rejected] = []
-    zones: dict[str, int] = {}
-    for line, fields in table.records():
-        try:
-            if fields is None:
-                raise BadReading("", f"does not have {len(table.columns)} fields")
-            time, zone = parse_time(fields["time"])
-            if time in rows:
-                raise BadReading(fields["time"], "stands on an earlier line too, which is kept")
-            rows[time] = [table.number(fields[column]) for column in headings]
-        except BadReading as fault:
-            left_out.append(Rejected(path.name, line, fault.value, fault.reason))
-            continue
-        zones.setdefault(zone, line)
-    refuse_hopeless(path, len(rows), left_out)
-    times = sorted(rows)
-    values = np.array([rows[time] for time in times])
-    drivers = xr.Dataset(
-        {
-            name: (("time",), values[:, at], {"units": unit, "long_name": name})
-            for at, (name, unit) in enumerate(headings.values())
-        },
-        coords={"time": np.array(times, dtype="datetime64[ns]")},
-        attrs={"source": path.name, "left_out": json.dumps([asdict(one) for one in left_out])},
-    )
-    drivers["time"].attrs["reference"] = join_zones(path, zones)
-    return drivers
+    variables = {name: {"units": unit, "long_name": name} for name, unit in headings.values()}
+    if len(variables) < len(headings):
+        names = [name for name, _ in headings.values()]
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        raise TableError(f"{path}: more than one column is named {', '.join(repeated)}; give each its own name")
+    return read_timed_rows(table, variables, lambda fields: [table.number(fields[column]) for column in headings])
 
 
 def read_record(campaign: Campaign) -> xr.Dataset:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 
 #: Values that instruments write for "no reading"; Renishaw's is -1e20.
 SENTINEL_MAGNITUDE = 1e19
@@ -127,6 +129,56 @@ def read_table(path: Path, required: tuple[str, ...]) -> Table:
             f"{path}, line {head_line}: column {', '.join(repeated)} stands there more than once; keep one"
         )
     return Table(path, names, lines[1:], delimiter == ";")
+
+
+def read_timed_rows(
+    table: Table, variables: Mapping[str, Mapping[str, str]], parse: Callable[[dict[str, str]], list[float]]
+) -> xr.Dataset:
+    """Return the rows of a table that has a column ``time``.
+
+    Parameters
+    ----------
+    table : Table
+    variables : mapping
+        Attributes of the variables by name, in the order in which `parse` returns their values.
+    parse : callable
+        From the fields of a line by column to its values; raises `BadReading` where one cannot be used.
+
+    Returns
+    -------
+    xarray.Dataset
+        The variables along ``time`` (UTC, increasing); ``attrs["left_out"]`` lists the lines left out.
+
+    Raises
+    ------
+    LaserFormatError
+        More lines are bad than good, or only some times have a zone.
+    """
+    rows: dict[np.datetime64, list[float]] = {}
+    left_out: list[Rejected] = []
+    zones: dict[str, int] = {}
+    for line, fields in table.records():
+        try:
+            if fields is None:
+                raise BadReading("", f"does not have {len(table.columns)} fields")
+            time, zone = parse_time(fields["time"])
+            if time in rows:
+                raise BadReading(fields["time"], "stands on an earlier line too, which is kept")
+            rows[time] = parse(fields)
+        except BadReading as fault:
+            left_out.append(Rejected(table.path.name, line, fault.value, fault.reason))
+            continue
+        zones.setdefault(zone, line)
+    refuse_hopeless(table.path, len(rows), left_out)
+    times = sorted(rows)
+    values = np.array([rows[time] for time in times])
+    dataset = xr.Dataset(
+        {name: (("time",), values[:, at], dict(attrs)) for at, (name, attrs) in enumerate(variables.items())},
+        coords={"time": np.array(times, dtype="datetime64[ns]")},
+        attrs={"source": table.path.name, "left_out": json.dumps([asdict(one) for one in left_out])},
+    )
+    dataset["time"].attrs["reference"] = join_zones(table.path, zones)
+    return dataset
 
 
 def parse_time(text: str) -> tuple[np.datetime64, str]:

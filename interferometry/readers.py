@@ -21,6 +21,7 @@ from interferometry.delimited import (
     join_zones,
     parse_time,
     read_table,
+    read_timed_rows,
     refuse_hopeless,
 )
 from interferometry.deviations import DIRECTIONS, build_deviations, sort_readings
@@ -275,37 +276,15 @@ def read_environment(path: str | Path) -> xr.Dataset:
     """
     path = Path(path)
     table = read_table(path, ("time", *(column for column, *_ in ENVIRONMENT_COLUMNS)))
-    rows: dict[np.datetime64, list[float]] = {}
-    left_out: list[Rejected] = []
-    zones: dict[str, int] = {}
-    for line, fields in table.records():
-        try:
-            if fields is None:
-                raise BadReading("", f"does not have {len(table.columns)} fields")
-            time, zone = parse_time(fields["time"])
-            values = [_plausible(table, fields[column], low, high) for column, _, _, low, high in ENVIRONMENT_COLUMNS]
-            if time in rows:
-                raise BadReading(fields["time"], "stands on an earlier line too, which is kept")
-        except BadReading as fault:
-            left_out.append(Rejected(path.name, line, fault.value, fault.reason))
-            continue
-        zones.setdefault(zone, line)
-        rows[time] = values
-    refuse_hopeless(path, len(rows), left_out)
-    times = sorted(rows)
-    data = np.array([rows[time] for time in times])
-    environment = xr.Dataset(
-        {
-            name: (("time",), data[:, at], {"units": unit})
-            for at, (_, name, unit, _, _) in enumerate(ENVIRONMENT_COLUMNS)
-        },
-        coords={"time": np.array(times, dtype="datetime64[ns]")},
-        attrs={"source": path.name, "left_out": json.dumps([asdict(one) for one in left_out])},
-    )
-    for name in ("air_temperature", "material_temperature"):
-        environment[name].attrs["units_metadata"] = "temperature: on_scale"
-    environment["time"].attrs["reference"] = join_zones(path, zones)
-    return environment
+    on_scale = {"units_metadata": "temperature: on_scale"}
+    variables = {
+        name: {"units": unit, **(on_scale if unit == "degC" else {})} for _, name, unit, _, _ in ENVIRONMENT_COLUMNS
+    }
+
+    def parse(fields: dict[str, str]) -> list[float]:
+        return [_plausible(table, fields[column], low, high) for column, _, _, low, high in ENVIRONMENT_COLUMNS]
+
+    return read_timed_rows(table, variables, parse)
 
 
 def _plausible(table: Table, text: str, low: float, high: float) -> float:

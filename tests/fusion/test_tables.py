@@ -63,6 +63,9 @@ def test_drivers_are_sorted_and_bad_lines_listed(tmp_path: Path) -> None:
     path.write_text("time\n2026-03-09T06:31:00+00:00\n")
     with pytest.raises(TableError, match=r'there is no column beside time; add one named "name \[unit\]"'):
         read_drivers(path)
+    path.write_text("time,t [degC],t [K]\n2026-03-09T06:31:00+00:00,1,2\n")
+    with pytest.raises(TableError, match="more than one column is named t; give each its own name"):
+        read_drivers(path)
 
 
 def test_a_record_is_converted_to_the_units_of_the_calculation(tmp_path: Path) -> None:
