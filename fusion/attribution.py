@@ -34,6 +34,8 @@ from fusion.excitation import Excitation, warm_up_columns
 
 #: Time constants of the first-order lags, s.
 LAGS_S = (0.0, 600.0, 1200.0, 2400.0, 3600.0, 5400.0)
+#: Fresh nulls on which the rate of false alarms is measured.
+CHECKS = 199
 #: Family-wise level of the verdicts.
 LEVEL = 0.05
 #: Standard normal quantile of 0.8: an effect is found with 80 % power this many uncertainties above the threshold.
@@ -112,7 +114,7 @@ def evaluate_films(
     *,
     lags_s: Sequence[float] = LAGS_S,
     draws: int = 499,
-    checks: int = 199,
+    checks: int = CHECKS,
     favour: Mapping[str, float] = MappingProxyType({}),
     rng: np.random.Generator,
     progress: Callable[[float], None] | None = None,

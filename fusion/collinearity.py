@@ -10,8 +10,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from fusion.attribution import nuisance_columns
 from fusion.channels import Array
-from fusion.excitation import thermal_modes
+from fusion.excitation import describe_excitation, thermal_modes
 
 #: Courses that share at least this much of their variance count as one source.
 _SHARED_VARIANCE = 0.98
@@ -19,6 +20,8 @@ _SHARED_VARIANCE = 0.98
 
 def cluster_cells(field: xr.DataArray, *, shared_variance: float = _SHARED_VARIANCE, limit: int = 12) -> xr.Dataset:
     """Group cells whose temperature takes one course, and give the condition number of the field's thermal modes.
+
+    Courses are compared as the test of the drift sees them: without trend and, where a warm-up dominates, without its exponentials.
 
     Parameters
     ----------
@@ -37,6 +40,10 @@ def cluster_cells(field: xr.DataArray, *, shared_variance: float = _SHARED_VARIA
     values = field.values.reshape(field.sizes["time"], -1).astype(float)
     seen = np.isfinite(values).all(axis=0)
     centred = values[:, seen] - values[:, seen].mean(axis=0)
+    # What the test of the drift leaves of a course is what places can be told apart by: no trend, and no warm-up where one dominates.
+    seconds = (field["time"].values - field["time"].values[0]) / np.timedelta64(1, "s")
+    nuisance = nuisance_columns(seconds, describe_excitation(seconds, centred))
+    centred = centred - nuisance @ np.linalg.lstsq(nuisance, centred, rcond=None)[0]
     courses, patterns = thermal_modes(centred, limit=limit)
     # Courses are compared free of noise, in the space of the modes that stand above it.
     weights = np.sqrt((courses**2).sum(axis=0))

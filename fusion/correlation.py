@@ -22,7 +22,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from fusion.attribution import LAGS_S, LEVEL, Film, Findings, Tested, evaluate_films
+from fusion.attribution import CHECKS, LAGS_S, LEVEL, Film, Findings, Tested, evaluate_films
 from fusion.channels import Array, DriftSeries, read_clock, reduce_channels, target_table
 from fusion.excitation import Excitation, describe_excitation
 from fusion.groups import joined
@@ -52,7 +52,7 @@ def correlate(
     regions: Sequence[Region] = (),
     lags_s: Sequence[float] = LAGS_S,
     draws: int = 499,
-    checks: int = 199,
+    checks: int = CHECKS,
     per_target: bool = False,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from fusion.attribution import CHECKS
 from fusion.plots import ARROWS, COLOURS, INK, MARKERS, MUTED, STYLE, new_axes
 from fusion.wording import duration, number, p_value
 
@@ -145,7 +146,13 @@ def caption_of(maps: xr.Dataset, channel: str, name: str = "") -> str:
     smallest = float(detectable.where(np.isfinite(detectable)).median())
     drift = float(maps["unexplained_drift"].sel(channel=channel))
     return (
-        f"False alarms of this map, on nulls fitted to this session: {rate:.1%}. Drift that nothing explains: {number(drift, 2)} µm in one "
-        f"hour. Found with 80 % power: from {number(smallest, 2)} µm/K on (median over the map). The field shows "
+        f"False alarms of this map, on nulls fitted to this session: {rate_text(rate)}. Drift that nothing explains: "
+        f"{number(drift, 2)} µm in one hour. Found with 80 % power: from {number(smallest, 2)} µm/K on (median over the map). The field shows "
         f"{int(maps['clusters_cluster'].max())} courses of temperature; places that share one cannot be told apart."
     )
+
+
+def rate_text(rate: float, checks: int = CHECKS) -> str:
+    """Return a measured rate of false alarms in per cent with its expanded uncertainty (k = 2)."""
+    u = np.sqrt(max(rate, 1.0 / checks) * (1.0 - rate) / checks)
+    return f"{100 * rate:.1f} ± {200 * u:.1f} %"

@@ -10,7 +10,7 @@ import xarray as xr
 
 from fusion.attribution import LEVEL
 from fusion.groups import correlation_of, group, has
-from fusion.plots_correlation import CHANNELS, caption_of
+from fusion.plots_correlation import CHANNELS, caption_of, rate_text
 from fusion.report_findings import readable
 from fusion.verdict import Found, find_source, would_tell
 from fusion.wording import duration, join, measured, number, p_value
@@ -158,7 +158,10 @@ def _session(maps: xr.Dataset) -> list[tuple[str, str]]:
     """What holds for the whole test."""
     clusters = group(maps, "clusters")
     return [
-        ("Chance of any false find", f"{float(maps['false_alarm_rate']):.1%} over cells, modes and regions together"),
+        (
+            "Chance of any false find",
+            f"{rate_text(float(maps['false_alarm_rate']))} over cells, modes and regions together",
+        ),
         (
             "Excitation",
             f"{maps.attrs['excitation']}; one warm-up explains {float(maps['warm_up_share']):.1%} of the field's course",
@@ -205,10 +208,14 @@ def _sensors(sensors: xr.Dataset) -> dict[str, Any]:
             f"Undecided: on cycles that it was not fitted to, the camera itself is not shown to take anything out of the drift "
             f"(at most {number(most, 2)} µm), so a table of what sensors lose beside it says little."
         )
-    rows = []
+    rows: list[Row] = []
+    least = np.inf
     for at in range(sensors.sizes["sensor"]):
         one = sensors.isel(sensor=at)
         verdict = "loses" if bool(one["decided"]) else "as good as the camera, as far as these data show"
+        if float(one["loss"]) > least:
+            verdict += "; no better than fewer"
+        least = min(least, float(one["loss"]))
         rows.append(
             [
                 str(at + 1),
