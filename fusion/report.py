@@ -18,6 +18,7 @@ from fusion import plots, plots_correlation, plots_fusion, plots_plan, report_re
 from fusion.groups import correlation_of, group, has
 from fusion.report_correlation import leading_region
 from fusion.verdict import find_source
+from interferometry import figures
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,17 +104,19 @@ def draw_figures(results: Mapping[str, Any], datasets: Mapping[str, xr.Dataset])
 
 def _drift_charts(results: Mapping[str, Any], deviations: xr.Dataset) -> dict[str, Callable[[], Axes]]:
     """The charts that need the readings alone."""
-    drift, position = group(deviations, "drift"), deviations["position"]
+    drift, chart, position = group(deviations, "drift"), group(deviations, "chart"), deviations["position"]
     flagged = {item["target"] for item in results.get("anomalies", [])}
     shown = min(flagged, default=int(deviations["target"][min(3, deviations.sizes["target"] - 1)]))
     return {
-        "deviations_positive": lambda: plots.plot_deviations(deviations, "positive"),
-        "deviations_negative": lambda: plots.plot_deviations(deviations, "negative"),
-        "common_start": lambda: plots.plot_deviations(deviations, "positive", common_start=True),
-        "history": lambda: plots.plot_position_history(deviations, shown, drift=drift),
-        "scatter": lambda: plots.plot_scatter(group(deviations, "comparison")),
-        "mean_differences": lambda: plots.plot_mean_differences(group(deviations, "neighbours")),
-        "chart": lambda: plots.plot_chart(group(deviations, "chart"), position),
+        "deviations_positive": lambda: figures.plot_deviation_chart(deviations, direction="positive"),
+        "deviations_negative": lambda: figures.plot_deviation_chart(deviations, direction="negative"),
+        "common_start": lambda: figures.plot_deviation_chart(figures.evaluate_common_start(deviations)),
+        "history": lambda: figures.plot_position_history(
+            figures.evaluate_position_history(deviations, target=shown), drift=drift
+        ),
+        "scatter": lambda: figures.plot_comparison(group(deviations, "comparison")),
+        "mean_differences": lambda: figures.plot_mutual_deviations(group(deviations, "neighbours")),
+        "chart": lambda: figures.plot_reference_chart(chart.assign(position=position.sel(target=chart["target"]))),
         "windows": lambda: plots.plot_windows(group(deviations, "iso")),
         "drift": lambda: plots_fusion.plot_drift(drift, deviations),
         "profile": lambda: plots_fusion.plot_profile(drift, position),

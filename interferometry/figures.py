@@ -1,30 +1,20 @@
-"""L3 - The paper's figures 1, 2, 6, 7, 10 to 13: each returns its numbers, and draws them into an axes.
+"""L5 - The paper's figures 1, 2, 6, 7, 10 to 13: each returns its numbers, and draws them into an axes.
 
 Every ``evaluate_*`` returns a Dataset; every ``plot_*`` takes that Dataset and ``ax=None`` and returns the axes.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from interferometry.neighbours import build_chart, evaluate_neighbours, simulate_derived_sequence
+from interferometry.plotstyle import ARROWS, COLOURS, MARKERS, MUTED, TIME_MAP, hours_since_start, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-_COLOURS = {"positive": "#0072B2", "negative": "#D55E00"}
-_ARROWS = {"positive": "approach in positive direction", "negative": "approach in negative direction"}
-
-
-def _axes(ax: Axes | None) -> Axes:
-    if ax is not None:
-        return ax
-    import matplotlib.pyplot as plt
-
-    return plt.subplots(figsize=(7, 4), layout="constrained")[1]
 
 
 def evaluate_distributions(*, samples: int = 1000, bins: int = 30, seed: int = 0) -> xr.Dataset:
@@ -47,7 +37,7 @@ def evaluate_distributions(*, samples: int = 1000, bins: int = 30, seed: int = 0
 
 def plot_distributions(densities: xr.Dataset, ax: Axes | None = None) -> Axes:
     """Draw figure 1."""
-    ax = _axes(ax)
+    ax = new_axes(ax)
     for name, label in (("source", "source sequence a"), ("derived", "derived sequence b = a(n) - a(n+1)")):
         ax.step(densities["value"].values, densities[name].values, where="mid", label=label)
     ax.set(xlabel="value / standard deviation of a", ylabel="density")
@@ -92,12 +82,12 @@ def evaluate_best_estimate(deviations: xr.Dataset, *, link: int = 2) -> xr.Datas
 
 def plot_best_estimate(pair: xr.Dataset, ax: Axes | None = None, *, direction: str = "positive") -> Axes:
     """Draw figure 2 for one direction."""
-    ax = _axes(ax)
+    ax = new_axes(ax)
     one = pair.sel(direction=direction)
     ax.plot(one["cycle"], one["nearer"], ".-", label="nearer position")
     ax.plot(one["cycle"], one["further"], ".-", label="further position")
     ax.axhline(float(one["estimate"]), color="k", ls="--", label="best estimate for the first cycle")
-    ax.set(xlabel="cycle", ylabel="deviation [um]")
+    ax.set(xlabel="cycle", ylabel="deviation / µm", title=ARROWS[direction])
     ax.legend()
     return ax
 
@@ -107,16 +97,19 @@ def evaluate_deviation_chart(deviations: xr.Dataset) -> xr.Dataset:
     return deviations[["deviation", "position"]]
 
 
-def plot_deviation_chart(chart: xr.Dataset, ax: Axes | None = None) -> Axes:
-    """Draw figure 6 or figure 13: one line per cycle and direction."""
-    ax = _axes(ax)
+def plot_deviation_chart(chart: xr.Dataset, ax: Axes | None = None, *, direction: str = "positive") -> Axes:
+    """Draw figure 6 or figure 13 for one direction: one line per cycle, from the first (dark) to the last (light)."""
+    import matplotlib as mpl
+
+    ax = new_axes(ax)
     order = np.argsort(chart["position"].values)
-    for direction in chart["direction"].values:
-        lines = chart["deviation"].sel(direction=direction).values[:, order]
-        ax.plot(chart["position"].values[order], lines.T, color=_COLOURS[str(direction)], lw=0.5, alpha=0.6)
-        ax.plot([], [], color=_COLOURS[str(direction)], label=_ARROWS[str(direction)])
-    ax.set(xlabel="position [mm]", ylabel="deviation [um]")
-    ax.legend()
+    lines = chart["deviation"].sel(direction=direction).values[:, order]
+    colours = mpl.colormaps[TIME_MAP](np.linspace(0.0, 0.95, len(lines)))
+    for line, colour in zip(lines, colours, strict=True):
+        ax.plot(chart["position"].values[order], line, color=colour, linewidth=0.6)
+    scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(*chart["cycle"].values[[0, -1]]), TIME_MAP)
+    ax.figure.colorbar(scale, ax=ax, label="cycle", pad=0.02, aspect=30).outline.set_visible(False)
+    ax.set(xlabel="position / mm", ylabel="deviation / µm", title=ARROWS[direction])
     return ax
 
 
@@ -130,16 +123,37 @@ def evaluate_position_history(deviations: xr.Dataset, *, target: int = 4) -> xr.
     """
     if target not in deviations["target"].values:
         raise ValueError(f"target={target} is not one of {deviations['target'].values.tolist()}")
-    return deviations[["deviation", "time"]].sel(target=target)
+    return deviations[["deviation", "time", "position"]].sel(target=target)
 
 
-def plot_position_history(history: xr.Dataset, ax: Axes | None = None) -> Axes:
-    """Draw figure 7."""
-    ax = _axes(ax)
+def plot_position_history(history: xr.Dataset, ax: Axes | None = None, *, drift: xr.Dataset | None = None) -> Axes:
+    """Draw figure 7 over time (over cycles where no reading has one), with the estimated drift and its 95 % band where given.
+
+    Parameters
+    ----------
+    history : xarray.Dataset
+        What `evaluate_position_history` returns.
+    drift : xarray.Dataset, optional
+        What `drift.estimate_drift` returns for all targets.
+    """
+    ax = new_axes(ax)
+    timed = bool(history["time"].notnull().any())
+    along = hours_since_start(history) if timed else history["cycle"].broadcast_like(history["deviation"])
     for direction in history["direction"].values:
-        one = history["deviation"].sel(direction=direction)
-        ax.plot(one["cycle"], one, ".-", ms=3, color=_COLOURS[str(direction)], label=_ARROWS[str(direction)])
-    ax.set(xlabel="cycle", ylabel="deviation [um]", title=f"position {int(history['target'])}")
+        at = {"direction": direction}
+        style: dict[str, Any] = {"color": COLOURS[str(direction)]}
+        read = history["deviation"].sel(at)
+        ax.plot(along.sel(at), read, MARKERS[str(direction)], markersize=2.6, label=ARROWS[str(direction)], **style)
+        if drift is not None:
+            one = drift.sel(at | {"target": int(history["target"])})
+            value, band = read - one["noise"], 2 * one["drift_u"]
+            ax.plot(along.sel(at), value, linewidth=1.0, **style)
+            ax.fill_between(along.sel(at), value - band, value + band, alpha=0.18, linewidth=0, **style)
+    ax.set(
+        xlabel="time since first reading / h" if timed else "cycle",
+        ylabel="deviation / µm",
+        title=f"position {int(history['target'])} ({float(history['position']):g} mm)",
+    )
     ax.legend()
     return ax
 
@@ -151,12 +165,34 @@ def evaluate_pair_scatter(deviations: xr.Dataset) -> xr.Dataset:
 
 def plot_pair_scatter(scatter: xr.Dataset, ax: Axes | None = None, *, quantity: str = "mean_difference_u") -> Axes:
     """Draw figure 10; ``quantity`` says which of the two is shown, and the axis names it."""
-    ax = _axes(ax)
+    ax = new_axes(ax)
     label = {
-        "mean_difference_u": "u of the mean difference,\nequation (6) [um]",
-        "standard_deviation": "sample standard deviation\nof the difference [um]",
+        "mean_difference_u": "u of the mean difference,\nequation (6) / µm",
+        "standard_deviation": "sample standard deviation\nof the difference / µm",
     }[quantity]
-    return _bars(ax, scatter[quantity], label)
+    for direction in scatter["direction"].values:
+        row = scatter[quantity].sel(direction=direction)
+        ax.plot(row["link"], row, MARKERS[direction], ls="-", color=COLOURS[direction], label=ARROWS[direction])
+    ax.set(xlabel="position i (pair with the one before)", ylabel=label, ylim=(0, None))
+    ax.legend()
+    return ax
+
+
+def plot_comparison(comparison: xr.Dataset, ax: Axes | None = None) -> Axes:
+    """Draw figure 10 beside the conventional standard deviation of each position; takes what `neighbours.compare` returns."""
+    ax = new_axes(ax)
+    for direction in comparison["direction"].values:
+        row = comparison.sel(direction=direction)
+        style: dict[str, Any] = {"color": COLOURS[direction], "marker": MARKERS[direction]}
+        ax.plot(row["link"], row["differenced"], label=f"differences, {ARROWS[direction]}", **style)
+        label = f"conventional, {ARROWS[direction]}"
+        ax.plot(row["link"], row["conventional"], linestyle=":", alpha=0.7, label=label, **style)
+    ax.set(xlabel="position i", ylabel="standard deviation / µm", yscale="log")
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter("{x:g}")
+    ax.tick_params(axis="y", which="minor", labelsize=7.5)
+    ax.legend(fontsize=7.5)
+    return ax
 
 
 def evaluate_mutual_deviations(deviations: xr.Dataset) -> xr.Dataset:
@@ -165,17 +201,17 @@ def evaluate_mutual_deviations(deviations: xr.Dataset) -> xr.Dataset:
 
 
 def plot_mutual_deviations(mutual: xr.Dataset, ax: Axes | None = None) -> Axes:
-    """Draw figure 11."""
-    return _bars(_axes(ax), mutual["mean_difference"], "mean mutual deviation [um]")
-
-
-def _bars(ax: Axes, values: xr.DataArray, label: str) -> Axes:
-    for shift, direction in ((-0.2, "positive"), (0.2, "negative")):
-        one = values.sel(direction=direction)
-        ax.bar(one["link"].values + shift, one.values, 0.4, color=_COLOURS[direction], label=_ARROWS[direction])
-    ax.set(xlabel="position (pair with the one before)", ylabel=label)
-    ax.margins(y=0.25)
-    ax.legend(ncols=2)
+    """Draw figure 11 with 95 % intervals."""
+    ax = new_axes(ax)
+    for shift, direction in zip((-0.12, 0.12), mutual["direction"].values, strict=False):
+        row = mutual.sel(direction=direction)
+        ax.errorbar(
+            row["link"] + shift, row["mean_difference"], 2 * row["mean_difference_u"], fmt=MARKERS[direction],
+            color=COLOURS[direction], capsize=2, linewidth=1.0, label=ARROWS[direction],
+        )  # fmt: skip
+    ax.axhline(0.0, color=MUTED, linewidth=0.8)
+    ax.set(xlabel="position i", ylabel="mean difference to position i - 1 / µm")
+    ax.legend()
     return ax
 
 
@@ -185,18 +221,19 @@ def evaluate_reference_chart(deviations: xr.Dataset, *, reference: str = "time")
     return chart.assign(position=deviations["position"].sel(target=chart["target"]))
 
 
-def plot_reference_chart(chart: xr.Dataset, ax: Axes | None = None, *, border: str = "border_u") -> Axes:
+def plot_reference_chart(chart: xr.Dataset, ax: Axes | None = None, *, border: str = "border_s") -> Axes:
     """Draw figure 12; ``border`` is border_u (equation (6)) or border_s (sample standard deviation)."""
-    ax = _axes(ax)
+    ax = new_axes(ax)
+    what = {"border_u": "±2 u of the mean difference, equation (6)", "border_s": "±2 s of the differences"}[border]
     for direction in chart["direction"].values:
-        one = chart.sel(direction=direction)
-        colour = _COLOURS[str(direction)]
-        ax.plot(one["position"], one["chart"], "o-", ms=3, color=colour, label=_ARROWS[str(direction)])
+        row, colour = chart.sel(direction=direction), COLOURS[str(direction)]
+        ax.plot(
+            row["position"], row["chart"], MARKERS[str(direction)], ls="-", color=colour, label=ARROWS[str(direction)]
+        )
         for sign in (-1, 1):
-            ax.plot(one["position"], one["chart"] + sign * one[border], "--", lw=0.8, color=colour)
-    what = {"border_u": "2 u of the mean difference, equation (6)", "border_s": "2 s of the difference"}[border]
-    ax.set(xlabel="position [mm]", ylabel="deviation [um]", title=f"borders: {what}")
-    ax.legend()
+            ax.plot(row["position"], row["chart"] + sign * row[border], "--", color=colour, linewidth=0.8)
+    ax.set(xlabel="position / mm", ylabel="deviation / µm")
+    ax.legend(title=f"dashed: {what}", title_fontsize=8)
     return ax
 
 
@@ -207,8 +244,3 @@ def evaluate_common_start(deviations: xr.Dataset) -> xr.Dataset:
     start = x.isel(target=first, drop=True)
     shifted = (x - start + start.mean("cycle")).transpose(*x.dims)
     return xr.Dataset({"deviation": shifted.assign_attrs(units="um"), "position": deviations["position"]})
-
-
-def plot_common_start(chart: xr.Dataset, ax: Axes | None = None) -> Axes:
-    """Draw figure 13."""
-    return plot_deviation_chart(chart, ax)

@@ -95,8 +95,10 @@ def test_figures_6_and_13_differ_by_the_common_start(rng: np.random.Generator) -
     shifted = figures.evaluate_common_start(deviations)
     assert float(shifted["deviation"].isel(target=0).std("cycle").max()) < 1e-12
     assert float(measured["deviation"].isel(target=0).std("cycle").max()) > SIGMA_UM
-    assert figures.plot_deviation_chart(measured).get_ylabel() == "deviation [um]"
-    assert len(figures.plot_common_start(shifted).lines) == 26
+    assert figures.plot_deviation_chart(measured, direction="negative").get_title() == "negative approach"
+    lines = figures.plot_deviation_chart(shifted).lines
+    assert len(lines) == 12
+    assert np.asarray(lines[7].get_ydata()) == pytest.approx(shifted["deviation"].values[7, 0])
 
 
 def test_figure_7_is_one_position(rng: np.random.Generator) -> None:
@@ -104,6 +106,10 @@ def test_figure_7_is_one_position(rng: np.random.Generator) -> None:
     history = figures.evaluate_position_history(deviations, target=4)
     line = figures.plot_position_history(history).lines[0]
     assert np.asarray(line.get_ydata()) == pytest.approx(deviations["deviation"].values[:, 0, 3])
+    # Cycles start every 252 s.
+    assert np.diff(np.asarray(line.get_xdata())) == pytest.approx(252 / 3600)
+    timeless = history.assign(time=history["time"].copy(data=np.full((12, 2), np.datetime64("NaT", "ns"))))
+    assert figures.plot_position_history(timeless).get_xlabel() == "cycle"
     with pytest.raises(ValueError, match="target=17 is not one of"):
         figures.evaluate_position_history(deviations, target=17)
 
@@ -113,10 +119,12 @@ def test_figures_10_to_12_say_which_quantity_they_show(rng: np.random.Generator)
     scatter = figures.evaluate_pair_scatter(deviations)
     assert "equation (6)" in figures.plot_pair_scatter(scatter).get_ylabel()
     assert "sample standard deviation" in figures.plot_pair_scatter(scatter, quantity="standard_deviation").get_ylabel()
-    assert len(figures.plot_mutual_deviations(figures.evaluate_mutual_deviations(deviations)).patches) == 30
+    mutual = figures.evaluate_mutual_deviations(deviations)
+    assert len(figures.plot_mutual_deviations(mutual).containers) == 2
     chart = figures.evaluate_reference_chart(deviations)
-    assert "2 u" in figures.plot_reference_chart(chart).get_title()
-    assert "2 s" in figures.plot_reference_chart(chart, border="border_s").get_title()
+    for border, what in (("border_u", "±2 u of the mean"), ("border_s", "±2 s of the differences")):
+        legend = figures.plot_reference_chart(chart, border=border).get_legend()
+        assert what in legend.get_title().get_text()
 
 
 def test_figures_draw_into_given_axes(rng: np.random.Generator) -> None:
