@@ -147,8 +147,8 @@ def caption_of(maps: xr.Dataset, channel: str, name: str = "") -> str:
     drift = float(maps["unexplained_drift"].sel(channel=channel))
     return (
         f"False alarms of this map, on nulls fitted to this session: {rate_text(rate)}. Drift that nothing explains: "
-        f"{number(drift, 2)} µm in one hour. Found with 80 % power: from {number(smallest, 2)} µm/K on (median over the map). The field shows "
-        f"{int(maps['clusters_cluster'].max())} courses of temperature; places that share one cannot be told apart."
+        f"{number(drift, 2)} µm in one hour. Found with 80 % power: from {number(smallest, 2)} µm/K on (median over the map). "
+        f"The field shows {int(maps['clusters_cluster'].max())} courses of temperature; places that share one cannot be told apart."
     )
 
 
