@@ -279,7 +279,15 @@ def _mean_temperature(
     pixels = len(total)
     mean, variance, bound = np.zeros(pixels), np.zeros(pixels), np.zeros(pixels)
     n = np.uint64(frames)
-    steepest = abs(_third_derivative(float(lowest.min()), curve))
+    least, most = 65535, 0
+    for i in range(pixels):
+        if wanted[i]:
+            least, most = min(least, lowest[i]), max(most, highest[i])
+    # Temperature and its derivatives at whole counts: from the nearest one on, the third derivative adds less than a nanokelvin.
+    table = np.empty((max(most - least, 0) + 1, 3))
+    for k in range(len(table)):
+        table[k, 0], table[k, 1], table[k, 2] = _derivatives(float(least + k), curve)
+    steepest = abs(_third_derivative(float(least), curve))
     for i in range(pixels):
         if not wanted[i]:
             continue
@@ -287,7 +295,11 @@ def _mean_temperature(
         first_moment = float(total[i] - n * low) / frames
         counts = float(low) + first_moment
         spread = max(float(squares[i] + n * low * low - np.uint64(2) * low * total[i]) / frames - first_moment**2, 0.0)
-        temperature, first, second = _derivatives(counts, curve)
+        nearest = int(counts - least + 0.5)
+        step = counts - least - nearest
+        second = table[nearest, 2]
+        first = table[nearest, 1] + second * step
+        temperature = table[nearest, 0] + (table[nearest, 1] + 0.5 * second * step) * step
         reach = max(highest[i] - counts, counts - float(low))
         limit = steepest / 6 * spread * reach
         if not limit <= AVERAGING_LIMIT_K:

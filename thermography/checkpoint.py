@@ -110,11 +110,7 @@ class Checkpoint:
                 for g in finished.groups
             ],
         }
-        path = self.folder / f"frames_{finished.first_frame:08d}.npz"
-        temporary = path.with_suffix(".part")
-        with temporary.open("wb") as file:
-            np.savez(file, header=np.array(json.dumps(header)), **arrays)
-        temporary.replace(path)
+        _write(self.folder / f"frames_{finished.first_frame:08d}.sums", header, arrays)
 
     def note_knock(self, index: int, span: int, shift_px: list[float]) -> None:
         """Remember that the plan was registered anew from a frame on."""
@@ -129,7 +125,7 @@ class Checkpoint:
 
     def load(self) -> list[Finished]:
         """Finished cycles in the order of time, as far as they follow each other without a gap of files."""
-        return [_load(path) for path in sorted(self.folder.glob("frames_*.npz"))]
+        return [_load(path) for path in sorted(self.folder.glob("frames_*.sums"))]
 
 
 def describe(
@@ -199,30 +195,49 @@ def recalibrate(
         return part
 
     with ThreadPoolExecutor(THREADS) as executor:
-        parts = list(executor.map(calibrated, sorted(Path(folder).glob("frames_*.npz"))))
+        parts = list(executor.map(calibrated, sorted(Path(folder).glob("frames_*.sums"))))
     if not parts:
         raise CheckpointError(f"{folder}: holds no finished cycle; reduce the frames first")
     covariances = [position_covariance(span.registration, grid) for span in registrations]
     return assemble(parts, cycles, grid, covariances, [one.coverage for one in weights])
 
 
+def _write(path: Path, header: dict[str, Any], arrays: dict[str, Array]) -> None:
+    """Write a line of JSON, which names the arrays, their types and shapes, and then the arrays themselves, one after the other."""
+    layout = {name: [array.dtype.str, array.shape] for name, array in arrays.items()}
+    temporary = path.with_suffix(".part")
+    with temporary.open("wb") as file:
+        file.write(json.dumps({**header, "arrays": layout}).encode() + b"\n")
+        for array in arrays.values():
+            np.ascontiguousarray(array).tofile(file)
+    temporary.replace(path)
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
+    with path.open("rb") as file:
+        header = json.loads(file.readline())
+        arrays = {}
+        for name, (kind, shape) in header["arrays"].items():
+            arrays[name] = np.fromfile(file, kind, int(np.prod(shape))).reshape(shape)
+    return header, arrays
+
+
 def _load(path: Path) -> Finished:
-    with np.load(path) as file:
-        header = json.loads(str(file["header"]))
-        part = CyclePart(
-            header["cycle"], header["span"], header["frames"], np.datetime64(header["first_time"]), header["seconds"]
+    header, arrays = _read(path)
+    part = CyclePart(
+        header["cycle"], header["span"], header["frames"], np.datetime64(header["first_time"]), header["seconds"]
+    )
+    for name in _CELLS:
+        setattr(part, name, arrays[name])
+    groups = tuple(
+        Group(
+            CameraParameters(**group["parameters"]),
+            CountStatistics(group["frames"], *(arrays[f"{name}_{number}"] for name in _SUMS)),
+            group["correction_K"],
         )
-        for name in _CELLS:
-            setattr(part, name, file[name])
-        groups = tuple(
-            Group(
-                CameraParameters(**group["parameters"]),
-                CountStatistics(group["frames"], *(file[f"{name}_{number}"] for name in _SUMS)),
-                group["correction_K"],
-            )
-            for number, group in enumerate(header["groups"])
-        )
-        return Finished(
-            part, header["first_frame"], header["stop_frame"], file["blocks"], file["stack"], file["shift_px"], groups,
-            tuple(header["shaken"]), tuple(header["baseline_px"]),
-        )  # fmt: skip
+        for number, group in enumerate(header["groups"])
+    )
+    return Finished(
+        part, header["first_frame"], header["stop_frame"], arrays["blocks"], arrays["stack"], arrays["shift_px"], groups,
+        tuple(header["shaken"]), tuple(header["baseline_px"]),
+    )  # fmt: skip

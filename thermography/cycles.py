@@ -125,12 +125,12 @@ class CyclePart:
         """Turn pixels into cells."""
         assert self.pixels is not None
         pixels = self.pixels
-        used = weights.used
-        self.mean = weights.resample(np.where(used, pixels.mean, 0.0))
+        self.mean = weights.resample(pixels.mean)
         sample = pixels.frames / (pixels.frames - 1) if pixels.frames > 1 else np.nan
-        self.spread = np.sqrt(weights.average(np.where(used, pixels.variance, 0.0)) * sample)
+        self.spread = np.sqrt(weights.average(pixels.variance) * sample)
         self.noise_variance = weights.noise_factor * noise_of_differences(pixels.mean, weights.whole) ** 2
-        self.fell_back = weights.average((pixels.bound_K > AVERAGING_LIMIT_K).astype(float)) > 0
+        wild = pixels.bound_K > AVERAGING_LIMIT_K
+        self.fell_back = weights.average(wild.astype(float)) > 0 if wild.any() else np.zeros(self.mean.shape, bool)
         self.count = np.where(np.isfinite(self.mean), self.frames, 0)
         self.pixels = None
 
@@ -186,7 +186,8 @@ def assemble(
     frames, frame_coordinates
         What is known per frame or block of frames besides, as xarray takes it.
     """
-    fields = {name: np.full((cycles, *grid.shape), np.nan) for name in ("mean", "spread", "noise", "place")}
+    fields = {name: np.full((cycles, *grid.shape), np.nan) for name in ("mean", "spread", "noise")}
+    span_of = np.zeros(cycles, int)
     count = np.zeros((cycles, *grid.shape), np.int32)
     flags = np.full((cycles, *grid.shape), FLAGS["no_frame"], np.uint8)
     time = np.full(cycles, np.datetime64("NaT"), "datetime64[ns]")
@@ -194,16 +195,18 @@ def assemble(
         own = [part for part in parts if part.cycle == cycle]
         time[cycle] = own[0].first_time + np.timedelta64(_mean_nanoseconds(own), "ns")
         together = _together(own)
-        for name, values in zip(("mean", "spread", "noise"), together, strict=True):
+        for name, values in zip(fields, together, strict=True):
             fields[name][cycle] = values
-        fields["place"][cycle] = _gradient_variance(together[0], covariances[own[-1].span], grid)
+        span_of[cycle] = own[-1].span
         count[cycle] = sum(part.count for part in own)
         flags[cycle] = _flags(own, together[0], np.max([coverages[part.span] for part in own], axis=0))
     plan = ("cycle", "y", "x")
     first = min(parts, key=lambda part: part.cycle)
-    temperatures = _temperatures(
-        **fields, time=time, reference=first.cycle, covariance=covariances[first.span], grid=grid
-    )
+    place = np.full(count.shape, np.nan)
+    for span, covariance in enumerate(covariances):
+        place[span_of == span] = _gradient_variance(fields["mean"][span_of == span], covariance, grid)
+    rise_place = _gradient_variance(fields["mean"] - fields["mean"][first.cycle], covariances[first.span], grid)
+    temperatures = _temperatures(**fields, place=place, rise_place=rise_place, time=time, reference=first.cycle)
     dataset = xr.Dataset(
         {name: (plan, array.astype(np.float32)) for name, array in temperatures.items()}
         | {
@@ -239,25 +242,15 @@ def _flags(own: Sequence[CyclePart], mean: Array, coverage: Array) -> NDArray[np
 
 
 def _temperatures(
-    mean: Array,
-    spread: Array,
-    noise: Array,
-    place: Array,
-    *,
-    time: Array,
-    reference: int,
-    covariance: Array,
-    grid: PlanGrid,
+    mean: Array, spread: Array, noise: Array, place: Array, *, rise_place: Array, time: Array, reference: int
 ) -> dict[str, Array]:
-    """Temperature, rise since the reference cycle, rate, spread and uncertainties, (cycle, y, x); `covariance` of its registration."""
-    rise = mean - mean[reference]
-    rise_place = np.stack([_gradient_variance(field, covariance, grid) for field in rise])
+    """Temperature, rise since the reference cycle, rate, spread and uncertainties, (cycle, y, x)."""
     # The noise of the first cycle is in every rise but its own, which is zero by definition.
     rise_noise = np.where(np.arange(len(mean))[:, None, None] == reference, 0.0, noise + noise[reference])
     return {
         "temperature": mean,
         "temperature_u": np.sqrt(noise + place),
-        "temperature_rise": rise,
+        "temperature_rise": mean - mean[reference],
         "temperature_rise_u": np.sqrt(rise_noise + rise_place),
         "temperature_rate": _rate(mean, time),
         "temperature_spread": spread,
@@ -296,17 +289,21 @@ def _together(own: Sequence[CyclePart]) -> tuple[Array, Array, Array]:
     return tuple(np.where(nowhere, np.nan, field) for field in (mean, spread, noise))  # type: ignore[return-value]
 
 
-def _gradient_variance(field_K: Array, covariance: Array, grid: PlanGrid) -> Array:
-    """Variance that the registration's uncertainty puts on a field through its gradient, K2."""
-    known = np.isfinite(field_K)
-    if not known.any():
-        return np.full(field_K.shape, np.nan)
-    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+def _gradient_variance(fields_K: Array, covariance: Array, grid: PlanGrid) -> Array:
+    """Variance that the registration's uncertainty puts on fields, (cycle, y, x), through their gradients, K2."""
+    known = np.isfinite(fields_K)
+    filled = np.zeros(fields_K.shape)
+    nearest: Any = ()
+    for cycle, (field_K, seen) in enumerate(zip(fields_K, known, strict=True)):
+        if seen.any():
+            if cycle == 0 or not known[cycle - 1].any() or (seen != known[cycle - 1]).any():
+                nearest = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
+            filled[cycle] = field_K[tuple(nearest)]
     # Over 3 cells, so that the noise of single cells does not pass for a gradient.
-    smooth = ndimage.gaussian_filter(field_K[tuple(nearest)], 1.0, mode="nearest")
-    gradient = np.stack(np.gradient(smooth, grid.cell_size_mm)[::-1], axis=-1)
-    variance: Array = np.einsum("...i,...ij,...j->...", gradient, covariance, gradient)
-    return np.where(known, variance, np.nan)
+    smooth = ndimage.gaussian_filter(filled, (0, 1, 1), mode="nearest")
+    down, across = np.gradient(smooth, grid.cell_size_mm, axis=(1, 2))
+    xx, xy, yy = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
+    return np.where(known, across * (across * xx + 2 * down * xy) + down * down * yy, np.nan)
 
 
 def _rate(mean: Array, time: Array) -> Array:
