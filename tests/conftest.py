@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fusion.datasets import DatasetError, fetch
+
 
 @pytest.fixture
 def rng() -> np.random.Generator:
@@ -16,20 +18,32 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(20260309)
 
 
+_fetched: dict[str, Path | str] = {}
+
+
+def _fetch_once(name: str) -> Path | str:
+    """Return the path of a public measured file, or why it cannot be reached; one failed download stands for all others."""
+    if name not in _fetched:
+        offline = next(
+            (why for why in _fetched.values() if isinstance(why, str) and "could not be fetched" in why), None
+        )
+        try:
+            _fetched[name] = offline or fetch(name)
+        except DatasetError as fault:
+            _fetched[name] = str(fault)
+    return _fetched[name]
+
+
 @pytest.fixture
 def real_file() -> Callable[[str], Path]:
     """Return a function from a registry name to the local path of that public measured file, or skip saying why."""
 
     def find(name: str) -> Path:
-        folder = os.environ.get("THERMOFUSE_DATA")
-        reason = "set THERMOFUSE_DATA to a folder that holds the files of data/registry.csv"
-        if folder is not None:
-            path = Path(folder) / name
-            if path.exists():
-                return path
-            reason = f"{path} does not exist"
+        found = _fetch_once(name)
+        if isinstance(found, Path):
+            return found
         if os.environ.get("THERMOFUSE_REQUIRE_REAL_DATA"):
-            pytest.fail(f"real data required but not reachable: {reason}")
-        pytest.skip(f"real data not reachable: {reason}")
+            pytest.fail(f"real data required but not reachable: {found}")
+        pytest.skip(f"real data not reachable: {found}")
 
     return find
