@@ -15,7 +15,7 @@ Source: Harris (2020), bioRxiv 2020.11.29.402719 (nonsense correlations).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -116,27 +116,23 @@ def correlate(
         rng=np.random.default_rng(seed),
         progress=progress,
     )
+    quantities = {
+        name: describe(tested, series, films[name], lags_s, excitation) for name, tested in found.sets.items()
+    }
     dataset = describe_session(found, excitation).assign_coords(y=field["y"], x=field["x"])
-    dataset = dataset.assign(
-        _over_cells("channel", describe(found.sets["cells"], series, film, lags_s, excitation), seen, field)
-    )
-    if "modes" in films:
-        quantities = describe(found.sets["modes"], series, films["modes"], lags_s, excitation)
-        dataset = joined(dataset, modes=_over_modes(quantities, modes, seen, field))
-    if "regions" in films:
-        quantities = describe(found.sets["regions"], series, films["regions"], lags_s, excitation)
-        dataset = joined(dataset, regions=_over_regions("channel", quantities, regions))
+    dataset = dataset.assign(_over_cells("channel", quantities["cells"], seen, field))
+    if "modes" in quantities:
+        dataset = joined(dataset, modes=_over_modes(quantities["modes"], modes, seen, field))
+    if "regions" in quantities:
+        dataset = joined(dataset, regions=_over_regions("channel", quantities["regions"], regions))
     if per_target:
         table = target_table(readings)
-        single = {
-            name: _screen_targets(table, one, excitation, lags_s, draws, seed + 1)
-            for name, one in films.items()
-            if name != "modes"
+        single: dict[str, Quantities] = {
+            name: _screen_targets(table, films[name], excitation, lags_s, draws, seed + 1)
+            for name in ("cells", "regions")
+            if name in films
         }
-        dataset = dataset.assign_coords(series=table[0])
-        dataset = joined(dataset, targets=xr.Dataset(_over_cells("series", single["cells"], seen, field)))
-        if "regions" in single:
-            dataset = joined(dataset, target_regions=_over_regions("series", single["regions"], regions))
+        dataset = _add_targets(dataset.assign_coords(series=table[0]), single, seen, field, regions)
     dataset.attrs["readings_outside_film"] = readings.outside_film
     return dataset
 
@@ -291,6 +287,20 @@ def _over_modes(quantities: Quantities, modes: Modes, seen: NDArray[np.bool_], f
         )
         .assign_coords(mode=np.arange(1, modes.peaks.size + 1))
     )
+
+
+def _add_targets(
+    dataset: xr.Dataset,
+    single: Mapping[str, Quantities],
+    seen: NDArray[np.bool_],
+    field: xr.DataArray,
+    regions: Sequence[Region],
+) -> xr.Dataset:
+    """Add what every target and direction shows by itself: maps, and regions where there are any."""
+    dataset = joined(dataset, targets=xr.Dataset(_over_cells("series", single["cells"], seen, field)))
+    if "regions" in single:
+        dataset = joined(dataset, target_regions=_over_regions("series", single["regions"], regions))
+    return dataset
 
 
 def _over_columns(leading: str, trailing: str, quantities: Quantities) -> xr.Dataset:

@@ -101,8 +101,10 @@ def read_duty(drivers: xr.Dataset, names: Sequence[str], law: DutyLaw, *, source
     for name in names:
         values = log[name].values.astype(float)
         low, high = float(values.min()), float(values.max())
-        share = (values - low) / max(high - low, 1e-300)
-        if high > low and np.minimum(share, 1.0 - share).max() > _LEVEL_TOLERANCE:
+        if low == high:
+            raise RandomisationError(f"{source}: {name} was never switched; take it out of drivers.randomised")
+        share = (values - low) / (high - low)
+        if np.minimum(share, 1.0 - share).max() > _LEVEL_TOLERANCE:
             raise RandomisationError(
                 f"{source}: {name} takes levels between {low:g} and {high:g}; the randomisation test is for loads that are switched "
                 "between two levels: take it out of drivers.randomised"
@@ -180,26 +182,18 @@ def randomisation_test(
     RandomisationError
         if a source was never switched, or duty has no time in common with the readings.
     """
-    time = duty["time"].values.astype("datetime64[ns]")
-    span = (time[-1] - time[0]) / np.timedelta64(1, "s")
-    seconds = np.arange(0.0, span + GRID_S / 2, GRID_S)
-    grid_time = time[0] + (seconds * 1e9).astype("timedelta64[ns]")
-    held = np.searchsorted((time - time[0]) / np.timedelta64(1, "s"), seconds, side="right") - 1
-    courses = duty.transpose("time", "source").values.astype(float)[held]
+    seconds, grid_time, courses = _hold(duty)
     names = [str(name) for name in duty["source"].values]
-    constant = [name for name, course in zip(names, courses.T, strict=True) if np.ptp(course) == 0]
-    if constant:
-        raise RandomisationError(f"{', '.join(constant)}: never switched in this session; leave it out of the test")
     series = [one for one in reduce_channels(read_clock(fused_readings, grid_time)) if one.name != "reversal"]
     banks = [null_bank(one.values, one.seconds, one.variance, _level_and_trend(one.seconds)) for one in series]
-    measured = _statistics(series, banks, duty_responses(seconds, courses))
+    responses = duty_responses(seconds, courses)
+    measured = _statistics(series, banks, responses)
     rng = np.random.default_rng(seed)
     fresh = np.column_stack([law.course(seconds, rng) for _ in range(draws * len(names))])
     null = _statistics(series, banks, duty_responses(seconds, fresh)).max(axis=1).reshape(draws, -1)
     best = measured.max(axis=1)
     p_value = (1 + (null.max(axis=1)[:, None] >= best).sum(axis=0)) / (draws + 1)
     chosen = measured.argmax(axis=1)
-    responses = duty_responses(seconds, courses)
     picked = responses[:, np.arange(len(names)), chosen]
     effects = [
         estimate_effects(bank, np.ascontiguousarray(one.sampling @ picked, np.float32))
@@ -226,6 +220,19 @@ def randomisation_test(
         coords={"source": names},
         attrs={"source": found, "draws": draws},
     )
+
+
+def _hold(duty: xr.DataArray) -> tuple[Array, NDArray[np.datetime64], Array]:
+    """The duty on an even grid: seconds since its first time (n,), times (n,), courses (n, sources)."""
+    time = duty["time"].values.astype("datetime64[ns]")
+    logged = (time - time[0]) / np.timedelta64(1, "s")
+    seconds = np.arange(0.0, logged[-1] + GRID_S / 2, GRID_S)
+    held = np.searchsorted(logged, seconds, side="right") - 1
+    courses = duty.transpose("time", "source").values.astype(float)[held]
+    constant = [str(name) for name, course in zip(duty["source"].values, courses.T, strict=True) if np.ptp(course) == 0]
+    if constant:
+        raise RandomisationError(f"{', '.join(constant)}: never switched in this session; leave it out of the test")
+    return seconds, time[0] + (seconds * 1e9).astype("timedelta64[ns]"), courses
 
 
 def _level_and_trend(seconds: Array) -> Array:

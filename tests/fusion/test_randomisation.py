@@ -86,6 +86,15 @@ def test_a_logged_load_becomes_a_schedule_of_two_states(rng):
     assert set(np.unique(duty.values)) == {0.0, 1.0}
 
 
+def test_a_logged_load_that_was_never_switched_is_refused(rng):
+    still = logged(rng)
+    still["speed"] = still["speed"] * 0.0
+    with pytest.raises(
+        RandomisationError, match=r"drivers\.csv: speed was never switched; take it out of drivers\.randomised"
+    ):
+        read_duty(still, ["speed"], DutyLaw(1800.0), source="drivers.csv")
+
+
 @pytest.mark.parametrize(
     ("names", "law", "message"),
     [
