@@ -163,7 +163,7 @@ def test_rate_of_false_alarms(kind, bar):
     promised = []
     for seed in range(RUNS):
         made = simulator.null_session(kind, np.random.default_rng([seed, 77]))
-        maps = correlate(made.fused, thin(made.field), checks=50, seed=seed)
+        maps = correlate(made.fused, made.field[:, ::3, ::3], checks=20, seed=seed)
         cells += bool((maps["p_value"] <= 0.05).any())
         modes = bool((maps["modes_p_value"] <= 0.05).any()) if "modes_p_value" in maps else False
         anything += modes or bool((maps["p_value"] <= 0.05).any())
