@@ -81,7 +81,8 @@ def plot_contributions(record: xr.Dataset, channel: str, *, ax: Axes | None = No
         values = record["contribution"].sel(channel=channel).isel(effect=k)
         ax.plot(_hours(record), values, linewidth=1.1, label=name.replace("_", " "))
     ax.set(xlabel="time since start / h", ylabel="contribution / µm", title=channel)
-    ax.legend()
+    if record.sizes["effect"]:
+        ax.legend()
     return ax
 
 

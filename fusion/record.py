@@ -153,12 +153,16 @@ def reduce_record(table: xr.Dataset) -> Record:
     channels = tuple(str(name) for name in table["channel"].values)
     displacement = np.column_stack([blocks.mean(table["displacement"].values[:, k]) for k in range(len(channels))])
     for k, name in enumerate(channels):
-        if np.isfinite(displacement[:, k]).sum() < LEAST_BLOCKS:
-            raise RecordError(f'{blocks.source}: channel "{name}" holds too few values; leave it out of [record]')
+        known = displacement[np.isfinite(displacement[:, k]), k]
+        if known.size < LEAST_BLOCKS or np.ptp(known) == 0.0:
+            fault = "never moves" if known.size >= LEAST_BLOCKS else "holds too few values"
+            raise RecordError(f'{blocks.source}: channel "{name}" {fault}; leave it out of [record]')
     sensors = [str(name) for name in table["sensor"].values]
     samples = table["temperature"].values
     temperature = np.column_stack([blocks.filled(name, samples[:, k]) for k, name in enumerate(sensors)])
     kept = independent(temperature)
+    if not kept:
+        raise RecordError(f"{blocks.source}: no temperature changes; there is nothing that a displacement could follow")
     per_block = max(1.0, elapsed.size / blocks.seconds.size)
     drivers = _drivers(table, blocks)
     return Record(

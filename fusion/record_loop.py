@@ -102,7 +102,7 @@ class Search:
     def predictions(self) -> list[Prediction]:
         """Predictions of the declared model and after every added effect, from the training part."""
         return [
-            predict(self.record, columns_of(self.terms[: self.declared + k]), self.train)
+            predict(self.record, columns_of(self.record, self.terms[: self.declared + k]), self.train)
             for k in range(len(self.entries) + 1)
         ]
 
@@ -181,7 +181,7 @@ def _one_round(
     """Score every effect against the model and choose the strongest that also predicts better."""
     model = fit_record(record, terms, train)
     draws = simulate_channels(model, rng, draws=DRAWS)
-    start = predict(record, columns_of(terms), train).chained_rmse
+    start = predict(record, columns_of(record, terms), train).chained_rmse
     scores = []
     for name, effect in tried.items():
         try:
@@ -205,7 +205,9 @@ def _one_round(
             blocked[one.name] = reason
             continue
         refined = _refined(one, tried[one.name], model)
-        after = predict(record, np.column_stack([columns_of(terms), _member(refined).columns]), train).chained_rmse
+        after = predict(
+            record, np.column_stack([columns_of(record, terms), _member(refined).columns]), train
+        ).chained_rmse
         refined = scores[place] = replace(refined, chained_rmse=after)
         # A level shift is re-learnt by the coefficients of the next part, so an event must only not harm.
         event = _member(refined).event_s is not None

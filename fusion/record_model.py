@@ -25,6 +25,8 @@ from interferometry.statespace import Array, DriftFit, estimate
 _DRIFT_FACTORS = (1e-6, 10**-2.5, 0.1, 1.0, 10**0.5, 10.0)
 #: Readings per coefficient that a chained block needs before it, or its prediction says nothing.
 _LEAST_PER_COEFFICIENT = 2
+#: Blocks per column of one effect; what has more columns is reduced to its principal components for the test.
+_PER_COLUMN = 8
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,6 @@ class RecordFit:
     terms : the effects, declared ones first; each with columns for all blocks, shared by the channels
     channels : the generalised least-squares fit of every channel under its own drift
     rows : the blocks of each channel's fit, as indices
-    kept : columns of all terms that the used blocks determine, as indices
     """
 
     record: Record
@@ -45,37 +46,16 @@ class RecordFit:
     terms: tuple[Term, ...]
     channels: tuple[DriftFit, ...]
     rows: tuple[NDArray[np.intp], ...]
-    kept: tuple[int, ...]
 
     @property
     def sigma(self) -> Array:
         """Noise of one block mean in every channel, um."""
         return np.array([fit.sigma for fit in self.channels])
 
-    def coefficients(self, term: Term) -> tuple[Array, Array]:
-        """Coefficients of a term (channels, width) and their standard uncertainties; NaN where not determined."""
-        start = 0
-        for other in self.terms:
-            if other is term:
-                break
-            start += other.width
-        found = np.full((len(self.channels), term.width), np.nan)
-        spread = found.copy()
-        for k in range(term.width):
-            if start + k in self.kept:
-                place = 1 + self.kept.index(start + k)
-                found[:, k] = [fit.coefficients[place] for fit in self.channels]
-                spread[:, k] = [fit.coefficients_u[place] for fit in self.channels]
-        return found, spread
 
-    def drift_rms(self) -> Array:
-        """Size of the drift that nobody explains, rms about its mean in every channel, um."""
-        return np.array([float(np.std(fit.drift()[0][:, 0])) for fit in self.channels])
-
-
-def columns_of(terms: Sequence[Term]) -> Array:
+def columns_of(record: Record, terms: Sequence[Term]) -> Array:
     """Columns of all terms side by side, (blocks, p)."""
-    return np.concatenate([term.member.columns for term in terms], axis=1)
+    return np.concatenate([np.empty((record.seconds.size, 0)), *(term.member.columns for term in terms)], axis=1)
 
 
 def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -> RecordFit:
@@ -86,24 +66,38 @@ def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -
     RecordError
         if a channel has too few blocks for the columns.
     """
-    columns = columns_of(terms)
-    kept = tuple(independent(columns[used]))
-    design = np.column_stack([np.ones(record.seconds.size), columns[:, kept]])
+    most = int(used.sum()) // _PER_COLUMN
+    parts = [_leading(term.member.columns, used, most) for term in terms]
+    columns = np.concatenate([columns_of(record, []), *parts], axis=1)
+    design = np.column_stack([np.ones(record.seconds.size), columns[:, independent(columns[used])]])
+    rng = np.random.default_rng(0)
     fits, rows = [], []
     for k, name in enumerate(record.channels):
-        here = np.flatnonzero(used & np.isfinite(record.displacement[:, k]))
+        response = record.displacement[:, k]
+        here = np.flatnonzero(used & np.isfinite(response))
         if here.size < _LEAST_PER_COEFFICIENT * design.shape[1]:
             raise RecordError(
-                f'channel "{name}" has {here.size} blocks for a model of {design.shape[1]} coefficients; name fewer temperatures '
-                "in [record], or record for longer"
+                f'channel "{name}" has {here.size} blocks for a model of {design.shape[1]} coefficients; record for longer, or leave it '
+                "out of [record]"
             )
-        fits.append(
-            estimate(
-                record.seconds[here], np.ones((here.size, 1)), record.displacement[here, k], design[here], robust=True
-            )
-        )
+        # A displacement that follows the columns exactly leaves no noise to weigh with: it is given a millionth of its range.
+        shaken = response[here] + 1e-6 * np.ptp(response[here]) * rng.standard_normal(here.size)
+        fits.append(estimate(record.seconds[here], np.ones((here.size, 1)), shaken, design[here], robust=True))
         rows.append(here)
-    return RecordFit(record, used, tuple(terms), tuple(fits), tuple(rows), kept)
+    return RecordFit(record, used, tuple(terms), tuple(fits), tuple(rows))
+
+
+def _leading(columns: Array, used: NDArray[np.bool_], most: int) -> Array:
+    """The columns, or where there are more than `most` their leading principal components over the used blocks (blocks, most).
+
+    Dozens of alike sensors hold few courses; a drift cannot be estimated beside as many coefficients as blocks.
+    """
+    if columns.shape[1] <= most:
+        return columns
+    centre, scale = columns[used].mean(axis=0), columns[used].std(axis=0)
+    standard = (columns - centre) / np.where(scale > 0.0, scale, np.inf)
+    _, _, directions = np.linalg.svd(standard[used], full_matrices=False)
+    return np.asarray(standard @ directions[:most].T)
 
 
 def simulate_channels(model: RecordFit, rng: np.random.Generator, *, draws: int) -> list[Array]:

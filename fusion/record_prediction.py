@@ -72,14 +72,15 @@ def chained_parts(record: Record, train: NDArray[np.bool_]) -> list[int]:
 
 
 def rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> float:
-    """Root mean square error over some blocks, mean over the channels, um."""
-    return float(np.mean(channel_rmse(record, predicted, where)))
+    """Root mean square error over some blocks, mean over the channels that were measured there, um."""
+    return float(np.nanmean(channel_rmse(record, predicted, where)))
 
 
 def channel_rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> Array:
-    """Root mean square error of every channel over some blocks, um (channels,)."""
-    missed = (record.displacement - predicted)[where]
-    return np.asarray(np.sqrt(np.nanmean(missed**2, axis=0)))
+    """Root mean square error of every channel over some blocks, um (channels,); NaN for one that was not measured there."""
+    squares = (record.displacement - predicted)[where] ** 2
+    number = np.isfinite(squares).sum(axis=0)
+    return np.asarray(np.sqrt(np.where(number > 0, np.nansum(squares, axis=0) / np.maximum(number, 1), np.nan)))
 
 
 def _paths(record: Record, columns: Array, train: NDArray[np.bool_]) -> list[tuple[Array, Array, Array]]:

@@ -82,12 +82,12 @@ def examine(model: RecordFit, sealed_rmse: Array, rng: np.random.Generator) -> R
                 "switching": "quick responses where a driver is switched",
             }[names[int(np.argmax(values))]]
         )
-    if np.mean(sealed_rmse**2) > _VARIANCE_SHARE * np.mean(np.nanvar(record.displacement, axis=0)):
+    if np.nanmean(sealed_rmse**2) > _VARIANCE_SHARE * np.mean(np.nanvar(record.displacement, axis=0)):
         words.append(
             f"a slow drift that neither temperatures nor drivers follow, largest in {_largest(record, sealed_rmse)}"
         )
     shape = " and ".join(words)
-    return RecordRemainder(p_value, p_values, shape, float(np.mean(sealed_rmse)) if words else 0.0, share)
+    return RecordRemainder(p_value, p_values, shape, float(np.nanmean(sealed_rmse)) if words else 0.0, share)
 
 
 def _statistics(innovations: Array, switched: NDArray[np.bool_]) -> tuple[Array, int]:
@@ -106,5 +106,5 @@ def _statistics(innovations: Array, switched: NDArray[np.bool_]) -> tuple[Array,
 
 def _largest(record: Record, rmse: Array) -> str:
     """Channels with the larger errors, in words."""
-    strong = [name for name, error in zip(record.channels, rmse, strict=True) if error >= 0.7 * rmse.max()]
+    strong = [name for name, error in zip(record.channels, rmse, strict=True) if error >= 0.7 * np.nanmax(rmse)]
     return "all channels alike" if 1 < len(strong) == len(record.channels) else ", ".join(strong)

@@ -71,13 +71,13 @@ class RecordResult:
     def as_json(self) -> dict[str, Any]:
         """The ``loop`` part of results.json; errors are means over the channels."""
         record = self.found.record
-        mean = self.errors.mean(axis=1)
+        mean = np.nanmean(self.errors, axis=1)
         last = self.found.rounds[-1].scores
         return {
             "declared": [term.effect for term in self.found.terms[: self.found.declared]],
             "held_out": self.held_out,
             "noise_floor_um": float(np.mean(self.whole.sigma)),
-            "rmse_persistence_um": float(self.persistence_um.mean()),
+            "rmse_persistence_um": float(np.nanmean(self.persistence_um)),
             "rmse_declared_um": float(mean[0]),
             "rmse_final_um": float(mean[-1]),
             "steps": [self._step(k) for k in range(len(self.found.entries))],
@@ -87,7 +87,7 @@ class RecordResult:
                 "rms_um": self.remainder.rms_um,
                 "p_value": self.remainder.p_value,
                 "p_values": self.remainder.p_values,
-                "variance_share": float(self.remainder.variance_share.mean()),
+                "variance_share": float(np.nanmean(self.remainder.variance_share)),
                 "nearest": last[0].name if self.remainder.shape and last else "",
             },
             "channels": {
@@ -105,9 +105,9 @@ class RecordResult:
                     "first_h": one.first_h,
                     "last_h": one.last_h,
                     "effects": list(one.effects),
-                    "rmse_persistence_um": float(one.rmse_persistence_um.mean()),
-                    "rmse_declared_um": float(one.rmse_declared_um.mean()),
-                    "rmse_final_um": float(one.rmse_final_um.mean()),
+                    "rmse_persistence_um": float(np.nanmean(one.rmse_persistence_um)),
+                    "rmse_declared_um": float(np.nanmean(one.rmse_declared_um)),
+                    "rmse_final_um": float(np.nanmean(one.rmse_final_um)),
                 }
                 for one in self.chained
             ],
@@ -125,7 +125,7 @@ class RecordResult:
         if others:
             behind = score.excess - others[0].excess
             runner_up = {"effect": others[0].name, "behind_by": behind, "p_value": others[0].family_wise_p}
-        before, after = self.errors[k].mean(), self.errors[k + 1].mean()
+        before, after = np.nanmean(self.errors[k]), np.nanmean(self.errors[k + 1])
         return {
             "effect": term.effect,
             "parameters": dict(term.member.parameters),
@@ -216,7 +216,7 @@ def _open_seal(found: Search) -> tuple[Search, list[Prediction], Array]:
     """Errors on the sealed part of every model in turn; an effect that makes them larger is withdrawn."""
     predictions = found.predictions()
     errors = np.array([channel_rmse(found.record, one.predicted, ~found.train) for one in predictions])
-    mean = errors.mean(axis=1)
+    mean = np.nanmean(errors, axis=1)
     for k, (score, _) in enumerate(found.entries):
         if mean[k + 1] > WORSE * mean[k]:
             reason = (

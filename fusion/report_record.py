@@ -128,7 +128,7 @@ def readable_reason(text: str) -> str:
 
 
 def _mean(loop: Mapping[str, Any], name: str) -> float | None:
-    values = [one[name] for one in loop["chained"]]
+    values = [one[name] for one in loop["chained"] if one[name] is not None]
     return float(np.mean(values)) if values else None
 
 

@@ -134,10 +134,8 @@ def record_variables(record: Record, found: RecordResult) -> xr.Dataset:
     dims = ("time", "channel")
     final = found.predictions[-1]
     # What forward chaining has shown the model to miss by, where it can be known: not smaller than on the sealed part.
-    spread = np.maximum(
-        found.errors[-1],
-        np.sqrt(np.mean([one.rmse_final_um**2 for one in found.chained], axis=0)) if found.chained else 0.0,
-    )
+    chained = np.array([one.rmse_final_um for one in found.chained]).reshape(-1, len(record.channels))
+    spread = np.fmax(found.errors[-1], np.sqrt(np.nanmean(chained**2, axis=0)) if len(chained) else 0.0)
     return xr.Dataset(
         {
             "displacement": (dims, record.displacement, {**um, "long_name": "mean displacement over the block"}),
