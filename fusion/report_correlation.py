@@ -171,7 +171,6 @@ def _session(maps: xr.Dataset) -> list[tuple[str, str]]:
             f"{int(clusters['cluster'].values.max())} groups of cells that warm alike; condition of the thermal modes "
             f"{number(float(clusters['condition']), 2)}",
         ),
-        ("Readings outside the frames", str(maps.attrs.get("readings_outside_film", 0))),
     ]
 
 
