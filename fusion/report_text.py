@@ -14,6 +14,7 @@ from fusion.plots import time_span
 from fusion.report_correlation import describe_correlation
 from fusion.report_findings import (
     describe_candidates,
+    describe_identifiability,
     describe_model,
     evidence,
     parameters,
@@ -72,7 +73,7 @@ def describe(
     return {
         "subtitle": _subtitle(provenance, deviations),
         "headline": wording.verdict_headline(loop) if loop else "Evaluated without a model of the drift.",
-        "sentences": _sentences(results, deviations),
+        "sentences": [*_sentences(results, deviations), *([correlation["headline"]] if correlation else [])],
         "numbers": _numbers(results, deviations, fields),
         "next": wording.next_steps(results)[:6],
         "contents": [
@@ -96,6 +97,7 @@ def describe(
         "parameters": [parameters(step["parameters"]) for step in loop["steps"]] if loop else [],
         "runners_up": [runner_up(step["runner_up"]) for step in loop["steps"]] if loop else [],
         "candidates": describe_candidates(loop) if loop else None,
+        "identifiability": describe_identifiability(loop) if loop else [],
         "uncertainty": _uncertainty(results, fields),
         "glossary": GLOSSARY,
     }
