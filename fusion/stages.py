@@ -21,7 +21,7 @@ from fusion.model import ModelFit, fit_model
 from fusion.outcome import Outcome
 from fusion.progress import Report
 from fusion.readings import read_fused
-from fusion.record_effects import QUASI_STATIC
+from fusion.record.effects import QUASI_STATIC
 from fusion.results import Notice
 from fusion.sources import Source, counted, listed
 from interferometry import iso230, neighbours

@@ -11,10 +11,10 @@ import xarray as xr
 from fusion.config import Campaign
 from fusion.outcome import Outcome
 from fusion.progress import Report
-from fusion.record import Record, reduce_record
-from fusion.record_effects import QUASI_STATIC
-from fusion.record_loop import declare
-from fusion.record_story import RecordResult, close_record
+from fusion.record.blocks import Record, reduce_record
+from fusion.record.effects import QUASI_STATIC
+from fusion.record.loop import RecordResult, close_record
+from fusion.record.search import declare
 from fusion.results import Notice
 from fusion.sources import counted, left_out_notices, listed
 from fusion.tables import read_record

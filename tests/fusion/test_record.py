@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusion.record import RecordError, chained_blocks, independent, reduce_record
-from fusion.record_prediction import predict, rmse
+from fusion.record.blocks import RecordError, chained_blocks, independent, reduce_record
+from fusion.record.prediction import predict, rmse
 from tests.fusion.record_tables import table_of
 
 

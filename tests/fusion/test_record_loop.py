@@ -12,13 +12,13 @@ import pytest
 from fusion.config import load_campaign
 from fusion.effects import LIBRARY, Effect, library
 from fusion.members import Member
-from fusion.record import RecordError, reduce_record
-from fusion.record_effects import thermal_lag_members, unseen_heat_source_members
-from fusion.record_gates import blocked_reason, one_switching_share
-from fusion.record_loop import chain_forward, declare, seal, search
-from fusion.record_model import fit_record, simulate_channels
-from fusion.record_prediction import channel_rmse
-from fusion.record_story import close_record
+from fusion.record.blocks import RecordError, reduce_record
+from fusion.record.effects import thermal_lag_members, unseen_heat_source_members
+from fusion.record.gates import blocked_reason, one_switching_share
+from fusion.record.loop import close_record
+from fusion.record.model import fit_record, simulate_channels
+from fusion.record.prediction import channel_rmse
+from fusion.record.search import chain_forward, declare, seal, search
 from fusion.tables import read_record
 from fusion.twin.recipe import EffectRecipe
 from tests.fusion.record_tables import table_of, twin_table
@@ -143,14 +143,14 @@ def test_what_a_record_cannot_declare_is_refused():
 
 
 def test_an_effect_that_fails_the_seal_is_withdrawn(monkeypatch):
-    from fusion import record_story
+    from fusion.record import loop as record_loop
 
     record, _, found = searched(EffectRecipe("periodic_disturbance", 0.6, parameters={"period_min": 37.0}), seed=44)
     sealed = record.displacement.copy()
     rows = ~found.train
     sealed[rows] -= 4.0 * np.cos(2 * np.pi * record.seconds[rows] / 2220.0)[:, None]  # the wave turns against itself
     turned = replace(found, record=replace(record, displacement=sealed))
-    kept, predictions, errors = record_story._open_seal(turned)
+    kept, predictions, errors = record_loop._open_seal(turned)
     if errors.shape[0] == 2:
         pytest.fail("the wave was kept although the sealed part contradicts it")
     assert (kept.entries, len(predictions)) == ((), 1)

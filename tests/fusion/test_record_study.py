@@ -8,9 +8,9 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from fusion.record import reduce_record
-from fusion.record_loop import declare, seal, search
-from fusion.record_prediction import channel_rmse
+from fusion.record.blocks import reduce_record
+from fusion.record.prediction import channel_rmse
+from fusion.record.search import declare, seal, search
 from fusion.twin.recipe import EffectRecipe
 from tests.fusion.record_tables import twin_table
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.adequacy import LEVEL
-from fusion.record import Record
-from fusion.record_model import RecordFit
+from fusion.record.blocks import Record
+from fusion.record.model import RecordFit
 from interferometry.statespace import Array
 
 _PERMUTATIONS = 400

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 
 from fusion.members import Member
-from fusion.record import Record
-from fusion.record_effects import RecordEffect
-from fusion.record_model import RecordFit, gains
+from fusion.record.blocks import Record
+from fusion.record.effects import RecordEffect
+from fusion.record.model import RecordFit, gains
 from interferometry.statespace import Array, fit_fixed_effects
 
 #: Temperature noise over range beyond which a lag is not believed (statistics study, section 3.4).

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.record import Record
+from fusion.record.blocks import Record
 from interferometry.statespace import Array
 
 #: Shares of a column's variance that are added to it: from ordinary least squares to hardly any coefficient at all.

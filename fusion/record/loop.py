@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 
 from fusion.effects import Effect
 from fusion.model import Term
-from fusion.record import Record
-from fusion.record_loop import (
+from fusion.record.blocks import Record
+from fusion.record.model import RecordFit, fit_record
+from fusion.record.prediction import Prediction, channel_rmse
+from fusion.record.remainder import RecordRemainder, examine
+from fusion.record.search import (
     MOST_EFFECTS,
     WORSE,
     Chained,
@@ -24,9 +27,6 @@ from fusion.record_loop import (
     seal,
     search,
 )
-from fusion.record_model import RecordFit, fit_record
-from fusion.record_prediction import Prediction, channel_rmse
-from fusion.record_remainder import RecordRemainder, examine
 from fusion.search import TIE_GAIN
 from interferometry.statespace import Array
 

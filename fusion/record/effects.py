@@ -11,7 +11,7 @@ from fusion.effects import LIBRARY, Effect, library
 from fusion.episodes import jumps
 from fusion.members import LAGS_MIN, Member, periods_min
 from fusion.readings import Series
-from fusion.record import EXPONENTS, Record
+from fusion.record.blocks import EXPONENTS, Record
 
 #: What a record is modelled with where nothing else is declared: every displacement a linear function of the temperatures.
 QUASI_STATIC = "quasi_static"

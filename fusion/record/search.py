@@ -18,11 +18,11 @@ from fusion.effects import Effect
 from fusion.members import Member
 from fusion.model import Term
 from fusion.nulls import DRAWS, tail_probability
-from fusion.record import Record, RecordError
-from fusion.record_effects import QUASI_STATIC, RecordEffect, quasi_static_columns, record_library
-from fusion.record_gates import blocked_reason
-from fusion.record_model import RecordFit, columns_of, fit_record, gains, simulate_channels
-from fusion.record_prediction import Prediction, channel_rmse, predict
+from fusion.record.blocks import Record, RecordError
+from fusion.record.effects import QUASI_STATIC, RecordEffect, quasi_static_columns, record_library
+from fusion.record.gates import blocked_reason
+from fusion.record.model import RecordFit, columns_of, fit_record, gains, simulate_channels
+from fusion.record.prediction import Prediction, channel_rmse, predict
 from interferometry.statespace import Array
 
 SEALED_SHARE = 0.2

@@ -18,7 +18,7 @@ from fusion.members import Member
 from fusion.model import Term
 from fusion.nulls import least_ratio, plausible_ratios
 from fusion.projections import Group, by_width, reductions
-from fusion.record import Record, RecordError, independent
+from fusion.record.blocks import Record, RecordError, independent
 from interferometry.statespace import Array, DriftFit, estimate
 
 #: Drift variances that are tried for every member, as factors of the estimated one: from none to ten times as much.
