@@ -43,7 +43,7 @@ def describe_correlation(
         "region_targets": _region_targets(maps) if has(maps, "target_regions") else "",
         "session": _session(maps),
         "duty": [] if duty is None else _duty_rows(duty),
-        "sensors": _sensors(group(maps, "sensors")),
+        "sensors": _sensors(group(maps, "sensors"), found.verdict),
     }
 
 
@@ -191,7 +191,7 @@ def _duty_rows(duty: xr.Dataset) -> list[Row]:
     return rows
 
 
-def _sensors(sensors: xr.Dataset) -> dict[str, Any]:
+def _sensors(sensors: xr.Dataset, session: str) -> dict[str, Any]:
     """Contact sensors in place of the camera: how far the camera itself goes, and one row per number of sensors."""
     if "sensor" not in sensors.sizes or sensors.sizes["sensor"] == 0:
         return {"text": "The field did not change enough to place sensors.", "rows": []}
@@ -207,6 +207,8 @@ def _sensors(sensors: xr.Dataset) -> dict[str, Any]:
             f"Undecided: on cycles that it was not fitted to, the camera itself is not shown to take anything out of the drift "
             f"(at most {number(most, 2)} µm), so a table of what sensors lose beside it says little."
         )
+    if session == "not separable":
+        text += " In a single warm-up many places do alike; which of them would do in another session these data cannot tell."
     rows: list[Row] = []
     least = np.inf
     for at in range(sensors.sizes["sensor"]):

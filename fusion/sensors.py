@@ -182,12 +182,16 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Fit:
-    """The model of highest marginal likelihood: place in the drift grid, lag, and prior variance of a sensitivity over noise variance."""
+    """The model of highest marginal likelihood: place in the drift grid, lag, prior variance of a sensitivity over noise variance.
+
+    `score` is the negative logarithm of that likelihood per degree of freedom, doubled.
+    """
 
     drift: int
     lag: int
     prior: float
     coefficients: Array
+    score: float
 
 
 def _fit(part: _Part, members: Array) -> _Fit:
@@ -195,7 +199,7 @@ def _fit(part: _Part, members: Array) -> _Fit:
     columns = part.columns(members)
     size = float(np.sqrt((columns[0] ** 2).mean())) + 1e-30
     freedom = part.grid.freedom
-    best, found = np.inf, _Fit(0, 0, 0.0, np.zeros(members.shape[1]))
+    found = _Fit(0, 0, 0.0, np.zeros(members.shape[1]), np.inf)
     for drift, (project, white) in enumerate(zip(part.projects, part.white, strict=True)):
         moved = project @ columns
         power, vectors = np.linalg.eigh(moved.transpose(0, 2, 1) @ moved)
@@ -208,9 +212,8 @@ def _fit(part: _Part, members: Array) -> _Fit:
             rss = np.maximum(whole - (along**2 * shrunk).sum(axis=1), 1e-30)
             score = np.log(rss) + (np.log1p(prior * power).sum(axis=1)) / freedom + part.penalty[drift]
             lag = int(np.argmin(score))
-            if score[lag] < best:
-                best = float(score[lag])
-                found = _Fit(drift, lag, prior, vectors[lag] @ (shrunk[lag] * along[lag]))
+            if score[lag] < found.score:
+                found = _Fit(drift, lag, prior, vectors[lag] @ (shrunk[lag] * along[lag]), float(score[lag]))
     return found
 
 
@@ -250,10 +253,15 @@ def _predict_left_out(tasks: Sequence[_Task], modes: Array, contact: Array, most
         chosen = _place(parts, camera, contact, most)
         for task, part, seen, out in zip(tasks, parts, camera, predictions, strict=True):
             out[0, run] = (task.responses[seen.lag][run] @ modes) @ seen.coefficients
+            least = np.inf
             for k in range(1, most + 1):
                 few = contact[:, chosen[:k]]
                 fit = _fit(part, few)
-                out[1 + k, run] = (task.responses[fit.lag][run] @ few) @ fit.coefficients
+                # A sensor that the other runs cannot make use of is there, but not used.
+                out[1 + k, run] = out[k, run] if k > 1 else 0.0
+                if fit.score < least:
+                    least = fit.score
+                    out[1 + k, run] = (task.responses[fit.lag][run] @ few) @ fit.coefficients
     return predictions
 
 
