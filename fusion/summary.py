@@ -108,12 +108,14 @@ def iso230_tables(path: Path, cycles: str | None) -> list[Table]:
     axis.add_column("quantity")
     axis.add_column("value / µm", justify="right")
     axis.add_column("U (k = 2) / µm", justify="right")
-    for name in iso230.QUANTITIES:
-        axis.add_row(name, f"{float(result[name]):.2f}", f"{2 * float(result[f'{name}_u']):.2f}")
-    axis.add_row("mean reversal", f"{float(result['mean_reversal']):.2f}")
+    rows: list[tuple[str, str, dict[str, str]]]
+    rows = [(name.replace("_", " "), name, {}) for name in (*iso230.QUANTITIES, "mean_reversal")]
     for direction, sign in (("positive", "+"), ("negative", "-")):
-        for name in ("E", "R", "A"):
-            axis.add_row(f"{name}{sign}", f"{float(result[f'{name}_unidirectional'].sel(direction=direction)):.2f}")
+        rows += [(f"{name}{sign}", f"{name}_unidirectional", {"direction": direction}) for name in ("E", "R", "A")]
+    for label, name, at in rows:
+        axis.add_row(
+            label, *(f"{float(value):.2f}" for value in (result[name].sel(at), 2 * result[f"{name}_u"].sel(at)))
+        )
     return [axis, _position_table(deviations, result)]
 
 

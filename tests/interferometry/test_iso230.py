@@ -135,7 +135,9 @@ def test_windows_that_cannot_be_evaluated_are_refused(rng: np.random.Generator) 
     test = test_made(rng.normal(0, 1, (5, 2, 4)))
     with pytest.raises(ValueError, match=r"cycles \[6, 7\] of the window were not measured"):
         evaluate(test, cycles=[5, 6, 7])
-    with pytest.raises(ValueError, match="no target has two readings in the window; widen it"):
+    with pytest.raises(
+        ValueError, match="no target has two readings from one side in a window of one cycle; ISO 230-2"
+    ):
         evaluate(test, cycles=[5])
 
 
@@ -167,6 +169,32 @@ def test_uncertainty_agrees_with_repeated_tests() -> None:
         spread = np.std([one[name] for one in repeated], ddof=1)
         # One test knows its own s to 1/sqrt(2 * 19) = 16 %; the extremes over positions add a little.
         assert float(stated[f"{name}_u"]) == pytest.approx(spread, rel=0.45)
+
+
+def test_every_quantity_has_an_uncertainty_in_both_directions_that_repeated_tests_confirm() -> None:
+    rng = np.random.default_rng(11)
+    profile = np.array([[0.0, 3.0, 9.0, 20.0], [4.0, 8.0, 12.0, 26.0]])
+    zero = Iso230Budget(device_ppm=0.0)
+    tests = [evaluate(test_made(profile + rng.normal(0, 0.5, (20, 2, 4))), budget=zero) for _ in range(60)]
+    values = [name for name in tests[0].data_vars if not str(name).endswith("_u") and name != "count"]
+    assert len(values) == 15
+    for name in values:
+        spread = np.std([one[name].values for one in tests], axis=0, ddof=1)
+        stated = np.mean([one[f"{name}_u"].values for one in tests], axis=0)
+        assert tests[0][f"{name}_u"].dims == tests[0][name].dims
+        # 60 tests know a spread to 9 %. R and A take the largest of positions that scatter alike: that spreads less than each.
+        assert (stated > 0.65 * spread).all(), name
+        assert (stated < (1.9 if name[0] in "RA" else 1.35) * spread).all(), name
+
+
+def test_one_direction_has_its_own_uncertainties(rng: np.random.Generator) -> None:
+    x = rng.normal(0, 1, (5, 2, 4))
+    x[:, 1] = np.nan
+    result = evaluate(test_made(x))
+    for name in ("R_unidirectional_u", "E_unidirectional_u", "A_unidirectional_u"):
+        assert np.isfinite(result[name].values).tolist() == [True, False]
+    assert np.isfinite(result["mean_unidirectional_u"].values).tolist() == [[True] * 4, [False] * 4]
+    assert np.isnan([float(result[f"{name}_u"]) for name in ("B", "mean_reversal", "R", "E", "M", "A")]).all()
 
 
 def test_errors_that_grow_with_position_act_over_the_distance_between_the_deciding_targets() -> None:
