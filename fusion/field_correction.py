@@ -15,6 +15,7 @@ import xarray as xr
 from fusion.alignment import cycle_bounds
 from fusion.loop import LoopResult
 from fusion.patches import find_switching_patch
+from fusion.refitting import CAMERA_ERRORS
 from interferometry.statespace import Array
 
 #: Standard uncertainties within which the sizes from the drift and from the field agree.
@@ -66,7 +67,7 @@ def find_field_errors(found: LoopResult, fields: xr.Dataset, fused: xr.Dataset) 
     start = _start(fused)
     frame_cycle = _cycle_of(time, fused)
     for step in found.steps:
-        if step.effect not in {"camera_offset", "reflected_source"}:
+        if step.effect not in CAMERA_ERRORS:
             continue
         size, u = float(step.coefficients[0]["value"]), float(step.coefficients[0]["u"])
         if step.effect == "camera_offset":

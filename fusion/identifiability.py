@@ -75,7 +75,9 @@ def identify(
     critical = {score.name: score.critical for score in scores}
     wanted = np.array([0.5 * (np.sqrt(2.0 * critical[name]) + _POWER_QUANTILE) ** 2 for name in names])
     own, left = _beside(model, first)
-    sizes = own * _smallest(judge, first, wanted)
+    smallest = _smallest(judge, first, wanted)
+    # A column that never moves has no size.
+    sizes = np.where(own > 0.0, own, np.inf) * smallest
     share = left / np.maximum(own, 1e-300)
     typical = {name: _typical(sizes, names == name) for name in families}
     alike = _alike(judge, first, [member for _, member in named], names, list(typical.values()))

@@ -20,6 +20,7 @@ from fusion.effects import Effect, library
 from fusion.episodes import cycle_starts
 from fusion.model import ModelFit, Term, fit_model, refit_fixed
 from fusion.readings import Readings
+from fusion.refitting import again, settled
 from fusion.scoring import FamilyScore
 from fusion.search import SECOND_LEVEL, Search, member_of
 from fusion.shape import wrong_patterns
@@ -77,7 +78,7 @@ def close_loop(
     models, chosen, rounds = _search_before_seal(search, terms, report)
     report(MOST_EFFECTS, MOST_EFFECTS + 2, "opening the sealed cycles")
     models, chosen, errors = _open_seal(search, models, chosen)
-    whole = fit_model(readings, models[-1].terms)
+    whole = settled(fit_model(readings, models[-1].terms), effects)
     steps = [
         make_step(whole, whole.terms[len(terms) + k], score, scores, errors[k], errors[k + 1])
         for k, (score, scores) in enumerate(chosen)
@@ -159,7 +160,11 @@ def on_corrected_fields(
     errors : names of the effects that the correction has made superfluous
     """
     effects = library() if effects is None else effects
-    terms = [_again(term, readings, found, effects) for term in found.after.terms if term.effect not in errors]
+    terms = [
+        again(term, readings, found.after.coefficients(), effects)
+        for term in found.after.terms
+        if term.effect not in errors
+    ]
     used, _ = seal(readings)
     whole = fit_model(readings, terms)
     remainder = _remainder(whole, seed, ())
@@ -172,22 +177,6 @@ def on_corrected_fields(
         remainder=remainder,
         nuisance=nuisance_size(whole),
         after=whole,
-    )
-
-
-def _again(term: Term, readings: Readings, found: LoopResult, effects: Mapping[str, Effect]) -> Term:
-    """A term with the columns that the same parameters give on other fields; one that does not offer them again stays."""
-    near = term.member if term.member.parameters else None
-    offered = effects[term.effect].members(readings, found.after.coefficients(), near)
-    same = (member for member in offered if _same_parameters(member.parameters, term.member.parameters))
-    member = next(same, term.member)
-    return Term(term.effect, replace(member, prior=term.member.prior))
-
-
-def _same_parameters(one: Mapping[str, float | str], other: Mapping[str, float | str]) -> bool:
-    return one.keys() == other.keys() and all(
-        one[name] == value if isinstance(value, str) else np.isclose(float(one[name]), float(value), rtol=1e-9)
-        for name, value in other.items()
     )
 
 
@@ -299,7 +288,8 @@ def _second_look(
             return whole, steps
         term = Term(best.name, member_of(best))
         before = whole
-        whole = fit_model(search.readings, [*whole.terms, term])
+        whole = settled(fit_model(search.readings, [*whole.terms, term]), search.effects)
+        term = whole.terms[-1]
         sealed_from = search.readings.seconds[~search.used].min()
         if term.member.event_s is not None and term.member.event_s >= sealed_from - _cycle_length(search.readings):
             after = _late_event_error(search, whole)

@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 #: Names of the air and material quantities that a laser's environment unit logs.
 ENVIRONMENT = ("air_temperature", "air_pressure", "relative_humidity", "material_temperature")
 
+#: A stretch without samples counts as a gap from this many usual intervals on.
+_GAP_INTERVALS = 5.0
+
 
 class ReadingsError(ValueError):
     """A campaign that holds too little to be modelled; the message says what is missing."""
@@ -64,6 +67,21 @@ class Series:
         start = values[0] if at_rest is None else np.full(values.shape[1], at_rest)
         response = _first_order(self.seconds, np.ascontiguousarray(values), time_constant_s, start)
         return Series(self.seconds, response.reshape(self.values.shape), self.units)
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A stretch in which a series has no sample and is taken as a straight line.
+
+    Attributes
+    ----------
+    series : its name
+    start_s, end_s : the samples beside the gap, s since the first reading
+    """
+
+    series: str
+    start_s: float
+    end_s: float
 
 
 @dataclass(frozen=True)
@@ -130,6 +148,19 @@ class Readings:
             here = self.target_index == k
             column[here] = np.interp(self.seconds[here], series.seconds, series.values[:, k])
         return column
+
+    def gaps(self) -> list[Gap]:
+        """Stretches without a sample, five times the usual interval and more, in what was logged while readings were taken."""
+        found = []
+        for name, series in self.series.items():
+            steps = np.diff(series.seconds)
+            if steps.size < 3:
+                continue
+            for k in np.flatnonzero(steps > _GAP_INTERVALS * np.median(steps)):
+                start, end = float(series.seconds[k]), float(series.seconds[k + 1])
+                if end > self.seconds[0] and start < self.seconds[-1]:
+                    found.append(Gap(name, start, end))
+        return found
 
     def subset(self, keep: NDArray[np.bool_]) -> Readings:
         """Only the readings that are kept; series stay whole."""

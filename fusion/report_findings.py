@@ -15,7 +15,10 @@ def describe_model(loop: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the coefficients of the declared effects, the size of the unexplained drift, and what was not tried."""
     rows = []
     for one in loop.get("declared_coefficients", []):
-        rows.append((wording.effect_name(one["effect"]), measured(one["value"], one["u"], print_unit(one["unit"]))))
+        text = measured(one["value"], one["u"], print_unit(one["unit"]))
+        if "prior" in one:
+            text += f" (expected beforehand {measured(one['prior'], one['prior_u'], print_unit(one['unit']))})"
+        rows.append((wording.effect_name(one["effect"]), text))
     for step in loop["steps"]:
         for one in step.get("coefficients", []):
             rows.append(
@@ -30,9 +33,39 @@ def describe_model(loop: Mapping[str, Any]) -> list[tuple[str, str]]:
         rows.append(("drift that nobody explains", text))
     if "rmse_persistence_um" in loop:
         rows.append(("error of repeating the last value", f"{number(loop['rmse_persistence_um'], 3)} µm"))
+    if loop.get("sealed_question"):
+        rows.append(("asked of the sealed cycles", _question(loop["sealed_question"])))
     for title, reasons in (("not tried", loop.get("not_tried", {})), ("blocked", loop.get("blocked", {}))):
         for name, reason in reasons.items():
             rows.append((f"{title}: {wording.effect_name(name)}", reason))
+    return rows
+
+
+def _question(asked: Mapping[str, Any]) -> str:
+    """The one question to the sealed cycles and its answer."""
+    answer = "it entered" if asked["entered"] else "it did not enter"
+    return (
+        f"{wording.effect_name(asked['effect'])}: error {number(asked['rmse_before_um'], 3)} µm without it and "
+        f"{number(asked['rmse_after_um'], 3)} µm with it, predicted from before the seal; p {wording.p_value(asked['p_value'])}; {answer}"
+    )
+
+
+def describe_identifiability(loop: Mapping[str, Any]) -> list[list[str]]:
+    """Return one row per effect: how large it must be to be found, how much of it is visible, what it looks like."""
+    rows = []
+    for one in loop.get("identifiability", []):
+        found = one["detectable_um"] is not None
+        alike = join([wording.effect_name(name) for name in one["looks_like"]]) or "–"
+        rows.append(
+            [
+                wording.effect_name(one["effect"]),
+                number(one["detectable_um"], 2) if found else "never",
+                f"{number(one['best_um'], 2)} to {number(one['worst_um'], 2)}" if found else "–",
+                f"{100 * one['visible_share']:.0f} %",
+                alike,
+                one["note"],
+            ]
+        )
     return rows
 
 

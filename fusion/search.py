@@ -89,10 +89,12 @@ class Search:
                 continue
             try:
                 families[name] = list(effect.members(self.readings, model.coefficients(), None))
+                _check_columns(families[name], self.readings)
             except Exception as fault:
                 # A user's effect must not end the search for the others; a fault of our own must be seen.
                 if name in _BUILT_IN:
                     raise
+                families.pop(name, None)
                 self.not_tried[name] = f"its columns cannot be computed: {type(fault).__name__}: {fault}"
         return families
 
@@ -104,9 +106,17 @@ class Search:
         judge = self._judge(model)
         families = {name: self._inside(members, model) for name, members in self._families(model).items()}
         families = {name: members for name, members in families.items() if members}
+        if not families:
+            return []
         scores = judge.score(families, level=SEARCH_LEVEL)
         if not self.identifiable:
             self.identifiable = identify(judge, model, families, scores, self.effects)
+        for score in scores:
+            if score.member is None:
+                self.blocked[score.name] = (
+                    "nothing of it is left beside the model: its columns are constant or collinear with the static profile, the declared "
+                    "effects and what was added"
+                )
         worth = [k for k, score in enumerate(scores) if score.member is not None and score.p_value < _WORTH_CONFIRMING]
         closer = judge.confirm([self._refined(scores[k], judge, model) for k in worth], families)
         for k, score in zip(worth, closer, strict=True):
@@ -186,6 +196,20 @@ class Search:
                 f"effect {score.name!r} offers no member near one it offered before: {dict(found.parameters)}"
             )
         return judge.refine(score, near)
+
+
+def _check_columns(members: Sequence[Member], readings: Readings) -> None:
+    """Refuse columns that are not one finite number per reading, which a user's effect may offer."""
+    for member in members:
+        columns = np.asarray(member.columns)
+        if columns.ndim != 2 or columns.shape[0] != readings.seconds.size:
+            raise SearchError(f"columns have shape {columns.shape}; expected ({readings.seconds.size}, columns)")
+        if not np.isfinite(columns).all():
+            raise SearchError(
+                f"{int((~np.isfinite(columns)).sum())} values are not finite at {dict(member.parameters)}"
+            )
+        if len(member.units) != columns.shape[1]:
+            raise SearchError(f"{columns.shape[1]} columns but {len(member.units)} units at {dict(member.parameters)}")
 
 
 def _same_kind(member: Member, found: Member) -> bool:

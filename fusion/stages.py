@@ -20,7 +20,7 @@ from fusion.members import Prior
 from fusion.model import ModelFit, fit_model
 from fusion.outcome import Outcome
 from fusion.progress import Report
-from fusion.readings import read_fused
+from fusion.readings import Readings, read_fused
 from fusion.record.effects import QUASI_STATIC
 from fusion.results import Notice
 from fusion.sources import Source, counted, listed
@@ -179,7 +179,26 @@ def model_drift(
         "anomalies": [anomaly_part(*pair) for pair in zip(anomalies, diagnoses, strict=True)],
         "loop": {**found.as_json(), "field_corrections": [one.as_json() for one in errors]},
     }
-    return Outcome(variables, parts, tuple(field_notices(errors)))
+    return Outcome(variables, parts, (*gap_notices(readings), *field_notices(errors)))
+
+
+def gap_notices(readings: Readings) -> list[Notice]:
+    """Return a notice for every logged series that has gaps: what follows it is a straight line there."""
+    notices = []
+    gaps = readings.gaps()
+    for name in dict.fromkeys(gap.series for gap in gaps):
+        own = [gap for gap in gaps if gap.series == name]
+        minutes = sum(gap.end_s - gap.start_s for gap in own) / 60.0
+        first = own[0].start_s / 60.0
+        notices.append(
+            Notice(
+                "series_gap",
+                f"{name} has {counted(len(own), 'gap')}, {minutes:.0f} min together, the first {first:.0f} min after the first reading; "
+                "taken as a straight line there, so that an effect that follows it is seen too weak.",
+                f"Log {name} without a break, at least once a minute.",
+            )
+        )
+    return notices
 
 
 def library_for(source: Source) -> dict[str, Effect]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +11,8 @@ import pytest
 from fusion.alignment import AxisGeometry, align
 from fusion.effects import Effect, library
 from fusion.loop import LoopError, close_loop, set_aside_sites
-from fusion.members import Member
-from fusion.readings import Readings, ReadingsError, read_fused
+from fusion.members import Member, Prior
+from fusion.readings import Readings, ReadingsError, Series, read_fused
 from fusion.twin import Recipe, deviations_of, driver_log, environment_log, fields_of, simulate
 from fusion.twin.recipe import EffectRecipe
 
@@ -171,3 +172,85 @@ def test_too_few_cycles_are_refused():
         close_loop(readings_of(test={"cycles": 9}), DECLARED)
     with pytest.raises(ReadingsError, match="at least 3 of each"):
         readings_of(test={"cycles": 3})
+
+
+@pytest.mark.parametrize(
+    ("column", "words"),
+    [
+        (lambda readings: np.full((readings.seconds.size, 1), np.nan), "values are not finite"),
+        (lambda readings: np.ones((7, 1)), r"columns have shape \(7, 1\); expected \("),
+        (lambda readings: np.ones((readings.seconds.size, 2)), "2 columns but 1 units"),
+    ],
+)
+def test_a_users_effect_with_unusable_columns_is_named_and_the_rest_goes_on(column, words):
+    def members(readings, coefficients, near):
+        yield Member(column(readings), {}, ("um",))
+
+    own = Effect("own", "None.", "none", members)
+    found = close_loop(readings_of(test={"cycles": 20}), DECLARED, effects={"own": own, **_few("reversal_drift")})
+    assert re.search(words, found.not_tried["own"])
+    assert {score.name for score in found.rounds[0]} == {"reversal_drift"}
+
+
+def test_an_effect_that_the_model_contains_is_named_as_such():
+    def members(readings, coefficients, near):
+        yield Member(np.ones((readings.seconds.size, 1)), {}, ("um",))
+
+    own = Effect("constant", "None.", "none", members)
+    found = close_loop(readings_of(test={"cycles": 20}), DECLARED, effects={"constant": own, **_few("reversal_drift")})
+    assert "constant or collinear" in found.blocked["constant"]
+    told = {one.effect: one for one in found.identifiable}
+    assert told["constant"].detectable_um is None
+    assert told["constant"].note == "the declared model contains it, or nothing excites it"
+
+
+def test_gaps_in_a_log_are_found():
+    readings = readings_of(test={"cycles": 20})
+    duty = readings.series["duty"]
+    kept = (duty.seconds < 1200.0) | (duty.seconds > 2400.0)
+    holed = Series(duty.seconds[kept], duty.values[kept], duty.units)
+    (gap,) = replace(readings, series={**readings.series, "duty": holed}).gaps()
+    assert gap.series == "duty"
+    assert (gap.start_s, gap.end_s) == (pytest.approx(1200.0, abs=60.0), pytest.approx(2400.0, abs=61.0))
+    assert readings.gaps() == []
+
+
+def test_the_sealed_cycles_are_asked_once_and_the_answer_is_logged():
+    """A reversal of an eighth of the noise is too small for the search, and too large to be left unasked."""
+    readings = readings_of(EffectRecipe("reversal_drift", amplitude_um=0.05), seed=15, test={"cycles": 20})
+    found = close_loop(readings, DECLARED, effects=_few("reversal_drift", "dead_path", "air_index"))
+    assert found.question is not None
+    logged = found.as_json()["sealed_question"]
+    assert logged["effect"] == "reversal_drift" and logged["entered"] is bool(found.steps)
+    assert 0.0 < logged["p_value"] <= 1.0
+    assert 0.3 < logged["rmse_after_um"] < 0.6 and 0.3 < logged["rmse_before_um"] < 0.6
+
+
+def test_a_prior_is_one_more_observation_of_its_coefficient():
+    readings = readings_of(test={"cycles": 20})
+    free = {**library(), "axis_expansion": replace(library()["axis_expansion"], prior=None)}
+    sharp = {**library(), "axis_expansion": replace(library()["axis_expansion"], prior=Prior(13.0, 0.05))}
+    data, told = (
+        close_loop(readings, DECLARED, effects={name: effects[name] for name in DECLARED}).declared_coefficients[0]
+        for effects in (free, sharp)
+    )
+    weight = 1.0 / float(data["u"]) ** 2, 1.0 / 0.05**2
+    assert told["value"] == pytest.approx((weight[0] * data["value"] + weight[1] * 13.0) / sum(weight), rel=1e-6)
+    assert told["u"] == pytest.approx(sum(weight) ** -0.5, rel=1e-6)
+    assert (told["prior"], told["prior_u"]) == (13.0, 0.05) and "prior" not in data
+
+
+def test_what_could_be_found_is_found_at_that_size():
+    """An effect at twice the size that is found in 80 % of campaigns is found; the size of a reversal is set by the noise alone."""
+    few = _few("reversal_drift", "pitch_error", "dead_path")
+    told = {one.effect: one for one in close_loop(readings_of(), DECLARED, effects=few).identifiable}
+    size = 2.0 * told["reversal_drift"].detectable_um
+    # 1,500 readings of 0.4 um: 0.4 / sqrt(1500) = 0.01 um is one standard deviation of the size, and about four are asked for.
+    assert 0.04 < size < 0.2
+    found = close_loop(readings_of(EffectRecipe("reversal_drift", amplitude_um=size), seed=15), DECLARED, effects=few)
+    assert "reversal_drift" in [step.effect for step in found.steps]
+    assert "leads of 20, 10" in told["pitch_error"].note
+
+
+def _few(*names: str) -> dict[str, Effect]:
+    return {name: library()[name] for name in (*DECLARED, *names)}
