@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.model import unexplained_drift
+from fusion.nulls import family_wise
 from fusion.readings import Readings
 from interferometry.statespace import Array, DriftFit
 
@@ -83,14 +84,8 @@ def examine(
     observed = _statistics(tested, signs, place)
     null = np.array([_statistics(_permuted(tested, rng), signs, place) for _ in range(_PERMUTATIONS)])
     names = ("pattern", "slow pattern", "one place", "direction", "direction along the axis", "curvature")
-    # Every statistic is referred to a normal tail of its null, so that few permutations still tell 0.01 from 0.0001.
-    centre, spread = null.mean(axis=0), np.maximum(null.std(axis=0), 1e-12)
-    largest = ((null - centre) / spread).max(axis=1)
-    values = (observed - centre) / spread
-    p_values = {
-        name: float((1 + (null[:, k] >= observed[k]).sum()) / (1 + _PERMUTATIONS)) for k, name in enumerate(names)
-    }
-    p_value = float((1 + (largest >= values.max()).sum()) / (1 + _PERMUTATIONS))
+    each, p_value, _ = family_wise(observed, null)
+    p_values = dict(zip(names, each.tolist(), strict=True))
     unwhitened = _freed(readings, fit.residual()[:, None])[:, 0]
     _, _, residual = _matrix(readings, unwhitened)
     along_time, along_sites, rms = _leading(residual[:, kept])

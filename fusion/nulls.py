@@ -32,6 +32,19 @@ def critical_gain(p_value: float, null: Array) -> float:
     return threshold + excess * float(np.log(0.1 / min(p_value, 0.1)))
 
 
+def family_wise(observed: Array, null: Array) -> tuple[Array, float, int]:
+    """Chance of each statistic alone (k,), of the most unusual of all, and which one that is.
+
+    ``observed`` (k,) are statistics that grow with structure, ``null`` (draws, k) the same where there is none; each is referred to the
+    mean and spread of its null, so that no statistic outweighs the others by its scale.
+    """
+    centre, spread = null.mean(axis=0), np.maximum(null.std(axis=0), 1e-12)
+    values = (observed - centre) / spread
+    largest = ((null - centre) / spread).max(axis=1)
+    each = (1 + (null >= observed).sum(axis=0)) / (1 + null.shape[0])
+    return each, float((1 + (largest >= values.max()).sum()) / (1 + null.shape[0])), int(np.argmax(values))
+
+
 def plausible_ratios(fit: DriftFit, rng: np.random.Generator, *, draws: int) -> Array:
     """Drift variance ratios (draws, components) that the readings leave possible, drawn by their restricted likelihood.
 

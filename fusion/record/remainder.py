@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.adequacy import LEVEL
+from fusion.nulls import family_wise
 from fusion.record.blocks import Record
 from fusion.record.model import RecordFit
 from interferometry.statespace import Array
@@ -64,13 +65,8 @@ def examine(model: RecordFit, sealed_rmse: Array, rng: np.random.Generator) -> R
     observed, line = _statistics(innovations, switched)
     null = np.array([_statistics(rng.permutation(innovations), switched)[0] for _ in range(_PERMUTATIONS)])
     names = ("course in time", "rhythm", "switching")
-    centre, spread = null.mean(axis=0), np.maximum(null.std(axis=0), 1e-12)
-    largest = ((null - centre) / spread).max(axis=1)
-    values = (observed - centre) / spread
-    p_values = {
-        name: float((1 + (null[:, k] >= observed[k]).sum()) / (1 + _PERMUTATIONS)) for k, name in enumerate(names)
-    }
-    p_value = float((1 + (largest >= values.max()).sum()) / (1 + _PERMUTATIONS))
+    each, p_value, strongest = family_wise(observed, null)
+    p_values = dict(zip(names, each.tolist(), strict=True))
     share = sealed_rmse**2 / np.nanvar(record.displacement, axis=0)
     words = []
     if p_value < LEVEL:
@@ -80,7 +76,7 @@ def examine(model: RecordFit, sealed_rmse: Array, rng: np.random.Generator) -> R
                 "course in time": "changes that come and go within a few blocks, too quick for the drift",
                 "rhythm": f"a rhythm of about {period_min:.0f} min",
                 "switching": "quick responses where a driver is switched",
-            }[names[int(np.argmax(values))]]
+            }[names[strongest]]
         )
     if np.nanmean(sealed_rmse**2) > _VARIANCE_SHARE * np.mean(np.nanvar(record.displacement, axis=0)):
         words.append(
