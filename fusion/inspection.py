@@ -10,6 +10,7 @@ import xarray as xr
 from fusion.products import write_atomically
 from fusion.sources import counted, left_out_notices
 from fusion.wording import moment
+from interferometry.inspection import describe_test
 from interferometry.readers import read_deviations, read_environment
 from thermography.inspection import inspect_file, is_flir_file, thumbnail
 
@@ -54,7 +55,7 @@ def _describe_deviations(path: Path, deviations: xr.Dataset) -> list[str]:
         lines.append(f"  {moment(known.min())} to {moment(known.max())}, times {deviations['time'].attrs['origin']}")
     else:
         lines.append("  no times: thermofuse run needs one per reading")
-    return lines + _warnings(deviations)
+    return [*lines, *(f"  {line}" for line in describe_test(deviations)), *_warnings(deviations)]
 
 
 def _describe_log(path: Path, log: xr.Dataset) -> list[str]:

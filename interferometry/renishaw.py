@@ -71,31 +71,21 @@ def read_rtl(
         )
     targets = _parse_targets(path, sections)
     runs, left_out = _parse_runs(path, sections, len(targets))
-    directions = [_direction(run, targets) for run in runs]
-    number = [directions[: at + 1].count(direction) for at, direction in enumerate(directions)]
-    cycles = max(number, default=1)
-    deviation = np.full((cycles, 2, len(targets)), np.nan)
-    seconds = np.full(deviation.shape, np.nan)
     start, end, start_u = _parse_test_times(sections)
     schedule, schedule_u = _rebuild_schedule(runs, targets, start, end, feed_mm_per_min, dwell_s)
-    for run, direction, cycle, instants in zip(runs, directions, number, schedule, strict=True):
-        for target, value, instant in zip(run.targets, run.deviations, instants, strict=True):
-            at = cycle - 1, DIRECTIONS.index(direction), target - 1
-            deviation[at], seconds[at] = value, instant if math.isfinite(value) else math.nan
+    deviation, seconds = _lay_out(runs, targets, schedule)
     time = np.full(deviation.shape, np.datetime64("NaT", "ns"))
     if start is not None:
         known = np.isfinite(seconds)
         time[known] = start + (seconds[known] * 1e9).astype("timedelta64[ns]")
+    cycles = deviation.shape[0]
     dataset = build_deviations(range(1, cycles + 1), range(1, len(targets) + 1), targets, deviation, time)
     if start is None:
         dataset["time"].attrs.update(origin="none", reference="the file holds no start and end that can be read")
     else:
         dataset["time"].attrs.update(origin="reconstructed", reference="no zone in the file: taken as UTC")
-        dataset["time_u"] = (
-            (),
-            math.hypot(start_u, schedule_u),
-            {"units": "s", "long_name": "standard uncertainty of time"},
-        )
+        named = {"units": "s", "long_name": "standard uncertainty of time"}
+        dataset["time_u"] = ((), math.hypot(start_u, schedule_u), named)
     dataset = dataset.assign(_parse_environment(sections))
     dataset.attrs.update(
         source=path.name,
@@ -105,6 +95,19 @@ def read_rtl(
         user_text=json.dumps(_parse_user_text(sections)),
     )
     return dataset
+
+
+def _lay_out(runs: list[_Run], targets: np.ndarray, schedule: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return deviations in um and seconds since the start, (cycle, direction, target), from the runs in measuring order."""
+    directions = [_direction(run, targets) for run in runs]
+    number = [directions[: at + 1].count(direction) for at, direction in enumerate(directions)]
+    deviation = np.full((max(number, default=1), 2, len(targets)), np.nan)
+    seconds = np.full(deviation.shape, np.nan)
+    for run, direction, cycle, instants in zip(runs, directions, number, schedule, strict=True):
+        for target, value, instant in zip(run.targets, run.deviations, instants, strict=True):
+            at = cycle - 1, DIRECTIONS.index(direction), target - 1
+            deviation[at], seconds[at] = value, instant if math.isfinite(value) else math.nan
+    return deviation, seconds
 
 
 def _split_sections(path: Path, text: str) -> dict[str, list[tuple[int, str]]]:

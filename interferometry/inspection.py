@@ -1,0 +1,82 @@
+"""L0 - What a positioning test holds beside its deviations, in lines: what is missing, and what the instrument did with the air."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import xarray as xr
+
+from interferometry.compensation import VACUUM_WAVELENGTH_NM, air_index, implied_wavelength_nm
+
+#: The laser's own wavelength and rounding of the file stay within this; beyond, a sensor or a setting is wrong.
+_WAVELENGTH_PPM = 0.3
+
+
+def describe_test(deviations: xr.Dataset) -> list[str]:
+    """Return lines on a test that `readers.read_deviations` has read; those that start with "warning" ask for a look."""
+    return [*_missing(deviations), *_times(deviations), *_environment(deviations), *_wavelength(deviations)]
+
+
+def _missing(deviations: xr.Dataset) -> list[str]:
+    held = np.isfinite(deviations["deviation"].values)
+    lines = []
+    for at, direction in enumerate(deviations["direction"].values):
+        absent = int((~held[:, at]).sum())
+        if not held[:, at].any():
+            lines.append(f"warning: no reading in the {direction} direction")
+        elif absent:
+            lines.append(f"warning: {absent} of {held[:, at].size} readings missing in the {direction} direction")
+    empty = json.loads(deviations.attrs.get("runs_empty", "[]"))
+    if empty:
+        lines.append(f"runs without a reading: {', '.join(str(run) for run in empty)}")
+    return lines
+
+
+def _times(deviations: xr.Dataset) -> list[str]:
+    if "time_u" not in deviations:
+        return []
+    return [f"standard uncertainty of a rebuilt time {float(deviations['time_u']):.1f} s; feed and dwell lower it"]
+
+
+def _environment(deviations: xr.Dataset) -> list[str]:
+    parts = []
+    for name, label in (
+        ("air_temperature", "air"),
+        ("air_pressure", "pressure"),
+        ("relative_humidity", "humidity"),
+        ("material_temperature", "material"),
+        ("expansion_coefficient", "expansion"),
+    ):
+        if name in deviations and np.isfinite(deviations[name]).any():
+            values, unit = deviations[name].values, deviations[name].attrs["units"].replace("percent", "%")
+            low, high = float(np.nanmin(values)), float(np.nanmax(values))
+            parts.append(f"{label} {low:g} {unit}" if low == high else f"{label} {low:g} to {high:g} {unit}")
+    return ["start and end: " + ", ".join(parts)] if parts else []
+
+
+def _wavelength(deviations: xr.Dataset) -> list[str]:
+    """Return the vacuum wavelength that factor, air and material imply: they were measured apart, so that one checks the other."""
+    needed = ("environment_factor", "air_temperature", "air_pressure", "relative_humidity", "material_temperature")
+    if not all(name in deviations for name in needed) or "expansion_coefficient" not in deviations:
+        return []
+    connected = np.isfinite(deviations["material_temperature"].values).all(axis=1)
+    if not connected.any():
+        return []
+    index = air_index(*(deviations[name].values for name in needed[1:4]))
+    material = deviations["material_temperature"].values[connected].mean(axis=0)
+    implied = implied_wavelength_nm(
+        deviations["environment_factor"].values,
+        index,
+        material_temperature_degC=material,
+        expansion_coefficient_ppm_per_K=float(deviations["expansion_coefficient"].values[0]),
+    )
+    factor = deviations["environment_factor"].values
+    away = (float(np.mean(implied)) / VACUUM_WAVELENGTH_NM - 1.0) * 1e6
+    line = (
+        f"environment factor {factor[0]:.9g} to {factor[1]:.9g} um: with this air and material a vacuum wavelength of "
+        f"{float(np.mean(implied)):.5f} nm, {away:+.3f} ppm from a stabilised HeNe laser's"
+    )
+    if np.isfinite(away) and abs(away) <= _WAVELENGTH_PPM:
+        return [line]
+    return [f"warning: {line}; the instrument used other air, another material temperature or another coefficient"]
