@@ -31,7 +31,7 @@ from thermography.registration import Registration, register
 _REGISTRATION_FRAMES = 5
 #: Of a video, so many frames at most are looked at for steps of the camera's zero: a step stays.
 _CHECKED_FRAMES = 1000
-#: Longer recordings keep their finished cycles on disk while they are reduced; for shorter ones that would cost more than it saves.
+#: Longer recordings keep what is finished on disk while they are reduced; for shorter ones that would cost more than it saves.
 _CHECKPOINT_FRAMES = 2000
 _KELVIN = 273.15
 
@@ -39,7 +39,7 @@ _KELVIN = 273.15
 def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | None, report: Report) -> Outcome:
     """Check the camera, register the plan on the first frames, and reduce all frames to one field per cycle.
 
-    A long recording keeps its finished cycles in the folder `checkpoint`, so that a run that is stopped goes on from there.
+    A long recording keeps what is finished of it in the folder `checkpoint`, so that a run that is stopped goes on from there.
     """
     override = Overrides(campaign_constants(source))
     notices = camera_notices(source, override, report=report)
@@ -82,12 +82,14 @@ def _reduce_on_clock(
 ) -> tuple[xr.Dataset, dict[str, Any], list[Notice]]:
     """Reduce the frames with the clock offset that the campaign gives, that the moving table shows, or that is assumed."""
     given = source.thermography.clock_offset_s
-    how: dict[str, Any] = {"checkpoint": checkpoint, "scheduler": scheduler, "report": report}
-    fields = _reduce(source, registration, override, given or 0.0, **how)
+    how: dict[str, Any] = {"scheduler": scheduler, "report": report}
     if given is not None:
+        fields = _reduce(source, registration, override, given, checkpoint=checkpoint, **how)
         return fields, {"value": given, "u": 0.0}, []
     if source.thermography.table == "still":
+        fields = _reduce(source, registration, override, 0.0, checkpoint=checkpoint, **how)
         return fields, {"value": 0.0, "u": None}, [_ASSUMED_CLOCK]
+    fields = _reduce(source, registration, override, 0.0, checkpoint=checkpoint / "before_alignment", **how)
     report("clock offset", 0, 1)
     clock = estimate_clock_offset(
         fields["frame_time"].values,
@@ -99,7 +101,7 @@ def _reduce_on_clock(
     )
     report("clock offset", 1, 1)
     # Frames belong to cycles by the laser's clock, so they are sorted into them again.
-    fields = _reduce(source, registration, override, clock.offset_s, **how)
+    fields = _reduce(source, registration, override, clock.offset_s, checkpoint=checkpoint, **how)
     return fields, {"value": clock.offset_s, "u": clock.offset_u_s}, []
 
 
@@ -130,12 +132,12 @@ def _reduce(
         report("frames", done, total)
 
     report("frames", 0, total)
-    common: dict[str, Any] = {"override": override, "scheduler": scheduler, "progress": count}
+    kept = checkpoint if total > _CHECKPOINT_FRAMES else None
+    common: dict[str, Any] = {"override": override, "scheduler": scheduler, "checkpoint": kept, "progress": count}
     if source.thermography.table == "moving":
         direction = source.plan.axis.direction
         return reduce_moving_frames(source.frames, registration, source.grid, bounds, direction=direction, **common)
-    kept = checkpoint if total > _CHECKPOINT_FRAMES else None
-    return reduce_frames(source.frames, registration, source.grid, bounds, checkpoint=kept, **common)
+    return reduce_frames(source.frames, registration, source.grid, bounds, **common)
 
 
 def campaign_constants(source: Source) -> dict[str, float]:

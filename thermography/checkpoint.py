@@ -1,4 +1,4 @@
-"""L3 - What a reduction has finished, cycle by cycle on disk: to go on after a break, and to calibrate anew without the frames."""
+"""L3 - What a reduction has finished, on disk: to go on after a break, and to calibrate anew without the frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from thermography.averaging import CountStatistics, mean_temperature
+from thermography.averaging import CountStatistics, MeanTemperature, mean_temperature
 from thermography.cycles import CyclePart, assemble, position_covariance
 from thermography.flir import CameraParameters
 from thermography.knocks import RegisteredFrom
@@ -26,6 +26,8 @@ Array = NDArray[Any]
 
 _DESCRIPTION = "reduction.json"
 _KNOCKS = "knocks.json"
+_OPEN = "open.sums"
+_PIXELS = ("mean", "variance", "bound_K")
 _CELLS = ("mean", "spread", "noise_variance", "fell_back", "count")
 _SUMS = ("total", "squares", "lowest", "highest")
 
@@ -45,7 +47,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Finished:
-    """One cycle under one registration, finished: its cells, its frames' fields and shifts, and the sums of its counts."""
+    """One cycle under one registration, so far or finished: its pixels or cells, its frames' fields and shifts, and its sums of counts."""
 
     part: CyclePart
     first_frame: int
@@ -89,9 +91,10 @@ class Checkpoint:
         path.write_text(text, encoding="utf-8")
 
     def save(self, finished: Finished) -> None:
-        """Write one finished cycle."""
+        """Write one finished cycle, or the one that is still open in the place of what was kept of it before."""
         part = finished.part
-        arrays = {name: getattr(part, name) for name in _CELLS}
+        source, names = (part, _CELLS) if part.pixels is None else (part.pixels, _PIXELS)
+        arrays = {name: getattr(source, name) for name in names}
         arrays |= {"blocks": finished.blocks, "stack": finished.stack, "shift_px": finished.shift_px}
         for number, group in enumerate(finished.groups):
             arrays |= {f"{name}_{number}": getattr(group.statistics, name) for name in _SUMS}
@@ -110,7 +113,16 @@ class Checkpoint:
                 for g in finished.groups
             ],
         }
-        _write(self.folder / f"frames_{finished.first_frame:08d}.sums", header, arrays)
+        name = f"frames_{finished.first_frame:08d}.sums" if part.pixels is None else _OPEN
+        _write(self.folder / name, header, arrays)
+
+    def save_arrays(self, first: int, header: dict[str, Any], arrays: dict[str, Array]) -> None:
+        """Write arrays that belong to the blocks from `first` on."""
+        _write(self.folder / f"blocks_{first:08d}.sums", header, arrays)
+
+    def load_arrays(self) -> list[tuple[dict[str, Any], dict[str, Array]]]:
+        """Everything that `save_arrays` has written, in the order of the blocks."""
+        return [_read(path) for path in sorted(self.folder.glob("blocks_*.sums"))]
 
     def note_knock(self, index: int, span: int, shift_px: list[float]) -> None:
         """Remember that the plan was registered anew from a frame on."""
@@ -126,6 +138,11 @@ class Checkpoint:
     def load(self) -> list[Finished]:
         """Finished cycles in the order of time, as far as they follow each other without a gap of files."""
         return [_load(path) for path in sorted(self.folder.glob("frames_*.sums"))]
+
+    def load_open(self) -> Finished | None:
+        """What was kept of the cycle that was open last, if there is any."""
+        path = self.folder / _OPEN
+        return _load(path) if path.exists() else None
 
 
 def describe(
@@ -227,8 +244,11 @@ def _load(path: Path) -> Finished:
     part = CyclePart(
         header["cycle"], header["span"], header["frames"], np.datetime64(header["first_time"]), header["seconds"]
     )
-    for name in _CELLS:
-        setattr(part, name, arrays[name])
+    if all(name in arrays for name in _CELLS):
+        for name in _CELLS:
+            setattr(part, name, arrays[name])
+    else:
+        part.pixels = MeanTemperature(part.frames, *(arrays[name] for name in _PIXELS))
     groups = tuple(
         Group(
             CameraParameters(**group["parameters"]),

@@ -5,37 +5,32 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from thermography.averaging import CHUNK_FRAMES
-from thermography.blocks import Block, Override, cut_blocks
+from thermography.blocks import BLOCK_FRAMES, Block, Override, cut_blocks
+from thermography.checkpoint import Checkpoint, describe
 from thermography.cycles import NOT_NUMBERED, CyclePart, assemble, pixel_noise, position_covariance
 from thermography.fields import BLOCK_S, FieldError, check_bounds, check_correction, check_frames, cycle_of
 from thermography.flir import CameraParameters, FrameReference
 from thermography.knocks import RegisteredFrom
-from thermography.lens_kernel import projected
-from thermography.plan import PlanGrid, mask_discs
+from thermography.plan import PlanGrid
 from thermography.radiometry import temperature_from_counts
 from thermography.reading import WindowReader
 from thermography.registration import Registration
-from thermography.resampling import LEAST_COVERAGE, centring
+from thermography.sampling import Samples, add_frame, on_plan, sample_points
 from thermography.scheduling import in_order, open_pool
 from thermography.tracking import Tracker, locate_table, make_tracker
 
 Array = NDArray[Any]
 
-#: Samples per cell and side, each interpolated between four pixels.
-SAMPLES = 4
 #: Frames whose table is known no better than this take no part in the fields, mm.
 LARGEST_U_MM = 1.0
-
-#: Counts within a cell up to which they are averaged before they are calibrated.
-NARROW = 600.0
 
 MOVING_ATTRIBUTES: dict[str, dict[str, Any]] = {
     "temperature_spread": {"long_name": "standard deviation of the cell's temperature over the frames of the cycle"},
@@ -58,16 +53,6 @@ MOVING_ATTRIBUTES: dict[str, dict[str, Any]] = {
 
 
 @dataclass(frozen=True)
-class Samples:
-    """Points of every cell at which a frame is sampled: (cells, samples, 2) mm, which of them are masked, and the seen coverage."""
-
-    points_mm: Array
-    valid: NDArray[np.bool_]
-    coverage: Array
-    centring: Any
-
-
-@dataclass(frozen=True)
 class MovingResult:
     """What a block of frames adds to every cell: frames, mean and squared deviation; and where the table was in each frame."""
 
@@ -77,6 +62,10 @@ class MovingResult:
     shift_mm: Array
     u_mm: Array
     discs: Array
+
+
+_PER_CELL = ("count", "mean", "squares")
+_PER_FRAME = ("shift_mm", "u_mm", "discs")
 
 
 def reduce_moving_frames(
@@ -91,6 +80,7 @@ def reduce_moving_frames(
     correction_K: Array | None = None,
     block_s: float = BLOCK_S,
     scheduler: str | None = None,
+    checkpoint: str | Path | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> xr.Dataset:
     """Reduce frames of a moving table to one field per cycle on the plan, which stays attached to the table.
@@ -99,6 +89,8 @@ def reduce_moving_frames(
     ----------
     references, grid, cycle_bounds, override, correction_K, block_s, scheduler, progress
         As for `thermography.fields.reduce_frames`.
+    checkpoint
+        Folder to which the blocks are written as they are done. A run that finds the folder goes on at the first block that is not.
     registration
         Of one frame; the plan lies in that frame as registered, in all others displaced in its own plane.
     direction
@@ -118,6 +110,8 @@ def reduce_moving_frames(
     ------
     FieldError
         As `reduce_frames`, and where the table is found in no frame.
+    CheckpointError
+        The checkpoint belongs to another reduction.
     """
     axis = np.asarray(direction, float) / np.hypot(*np.asarray(direction, float))
     bounds = check_bounds(np.asarray(cycle_bounds))
@@ -128,15 +122,24 @@ def reduce_moving_frames(
     blocks = cut_blocks(references, times, cycles, spans, correction, override=override, block_s=block_s)
     tracker = make_tracker(registration, grid, -axis, reach_mm=reach_mm)
     samples = sample_points(registration, grid)
-    results: list[MovingResult] = []
+    kept = None
+    if checkpoint is not None:
+        parameters = [override(frame) for frame in references]
+        described = describe(references, parameters, correction, bounds, grid, spans, block_s)
+        kept = _Kept(Checkpoint(checkpoint, {**described, "axis": axis.tolist(), "reach_mm": reach_mm}))
+    results = kept.load(blocks) if kept is not None else []
+    if progress is not None and results:
+        progress(blocks[len(results) - 1].stop)
     with open_pool(scheduler) as pool:
         shared = pool.share((tracker, samples))
         tasks = (
             (b, (_reduce_shared, references[b.first : b.stop], b.parameters, shared, correction[b.first : b.stop]))
-            for b in blocks
+            for b in blocks[len(results) :]
         )
         for block, result in in_order(pool, tasks):
             results.append(result)
+            if kept is not None:
+                kept.save(blocks, results)
             if progress is not None:
                 progress(block.stop - block.first)
     discs = np.concatenate([result.discs for result in results])
@@ -170,26 +173,39 @@ def reduce_moving_frames(
     return fields.assign_attrs(frames_outside_cycles=named(cycles == NOT_NUMBERED), frames_unplaced=named(discs == 0))
 
 
-def sample_points(registration: Registration, grid: PlanGrid, *, margin_px: float = 2.0) -> Samples:
-    """Lay the sample points of every cell, without those nearer than `margin_px` to a disc or to the plan's edge."""
-    steps = ((np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5) * grid.cell_size_mm
-    across, down = (side.ravel() for side in np.meshgrid(steps, steps))
-    x, y = (side.reshape(-1, 1) for side in np.meshgrid(grid.x_mm, grid.y_mm))
-    points = np.stack([x + across, y + down], axis=-1)
-    to_mm = np.linalg.inv(registration.projection.jacobian(points.reshape(-1, 2)))
-    pixel_mm = np.linalg.norm(to_mm, axis=1).max(axis=1).reshape(points.shape[:2])
-    edge = np.minimum.reduce(
-        [points[..., 0], grid.width_mm - points[..., 0], points[..., 1], grid.height_mm - points[..., 1]]
-    )
-    # Interpolation between pixels reaches one pixel farther than the lens's blur.
-    margin = (margin_px + 0.5) * pixel_mm
-    valid = (edge >= margin) & ~mask_discs(points, registration.masked, margin_mm=margin)
-    coverage = valid.mean(axis=1)
-    with np.errstate(invalid="ignore"):
-        offset = np.where(valid[..., None], points, 0.0).sum(axis=1) / valid.sum(axis=1)[:, None]
-    offset -= np.concatenate([x, y], axis=1)
-    plane = coverage.reshape(grid.shape)
-    return Samples(points, valid, plane, centring(offset, plane, grid))
+class _Kept:
+    """Blocks that are done, on disk: some hundreds of frames per file."""
+
+    def __init__(self, checkpoint: Checkpoint) -> None:
+        self.checkpoint = checkpoint
+        self.saved = 0
+
+    def load(self, blocks: Sequence[Block]) -> list[MovingResult]:
+        """Return what an earlier run has done, from the first block on."""
+        results: list[MovingResult] = []
+        for header, arrays in self.checkpoint.load_arrays():
+            if header["first_block"] != len(results):
+                break
+            ends = np.cumsum(
+                [blocks[len(results) + i].stop - blocks[len(results) + i].first for i in range(header["blocks"])]
+            )
+            frames = [np.split(arrays[name], ends[:-1]) for name in _PER_FRAME]
+            results += [
+                MovingResult(*values) for values in zip(*(arrays[name] for name in _PER_CELL), *frames, strict=True)
+            ]
+        self.saved = len(results)
+        return results
+
+    def save(self, blocks: Sequence[Block], results: Sequence[MovingResult]) -> None:
+        """Write the blocks that are done and not written yet, if they are enough for a file or the last."""
+        first, stop = blocks[self.saved].first, blocks[len(results) - 1].stop
+        if stop - first < BLOCK_FRAMES and len(results) < len(blocks):
+            return
+        new = results[self.saved :]
+        arrays = {name: np.stack([getattr(one, name) for one in new]) for name in _PER_CELL}
+        arrays |= {name: np.concatenate([getattr(one, name) for one in new]) for name in _PER_FRAME}
+        self.checkpoint.save_arrays(self.saved, {"first_block": self.saved, "blocks": len(new)}, arrays)
+        self.saved = len(results)
 
 
 def _reduce_shared(
@@ -226,75 +242,11 @@ def reduce_moving_block(
                     continue
                 result.shift_mm[i], result.u_mm[i], result.discs[i] = place.shift_mm, place.u_mm, place.discs
                 if place.u_mm <= LARGEST_U_MM:
-                    _add_frame(
+                    add_frame(
                         frame, table, samples.points_mm, samples.valid, place.shift_mm, tracker.lens, float(correction_K[i]),
                         result.count, result.mean, result.squares,
                     )  # fmt: skip
     return result
-
-
-@numba.njit(cache=True, nogil=True)
-def _between(counts: Array, column: float, row: float) -> float:
-    """Counts between four pixels, bilinear."""
-    j, i = int(column), int(row)
-    u, v = column - j, row - i
-    upper = (1 - u) * counts[i, j] + u * counts[i, j + 1]
-    lower = (1 - u) * counts[i + 1, j] + u * counts[i + 1, j + 1]
-    return (1 - v) * upper + v * lower
-
-
-@numba.njit(cache=True, nogil=True)
-def _temperature(table: Array, counts: float) -> float:
-    """Temperature of counts that need not be whole numbers."""
-    low = min(int(counts), 65534)
-    part = counts - low
-    return (1 - part) * table[low] + part * table[low + 1]
-
-
-@numba.njit(cache=True, nogil=True)
-def _add_frame(
-    counts: Array, table: Array, points: Array, valid: Array, shift: Array, lens: Array, offset: float,
-    count: Array, mean: Array, squares: Array,
-) -> None:  # fmt: skip
-    """Sample one frame and add it to every cell whose unmasked samples are all in view (Welford's update)."""
-    rows, columns = counts.shape
-    middle = points.shape[1] // 2
-    for cell in range(len(points)):
-        total, used, lost, low, high = 0.0, 0, False, 1e9, -1e9
-        # Within a cell the projection is as good as affine: to a thousandth of a pixel for cells of 5 mm.
-        x0, y0 = points[cell, middle, 0], points[cell, middle, 1]
-        c0, r0 = projected(x0 + shift[0], y0 + shift[1], lens)
-        c1, r1 = projected(x0 + shift[0] + 1.0, y0 + shift[1], lens)
-        c2, r2 = projected(x0 + shift[0], y0 + shift[1] + 1.0, lens)
-        for k in range(points.shape[1]):
-            if not valid[cell, k]:
-                continue
-            x, y = points[cell, k, 0] - x0, points[cell, k, 1] - y0
-            c, r = c0 + x * (c1 - c0) + y * (c2 - c0), r0 + x * (r1 - r0) + y * (r2 - r0)
-            if c < 0 or r < 0 or c >= columns - 1 or r >= rows - 1:
-                lost = True
-                break
-            value = _between(counts, c, r)
-            total += value
-            low, high = min(low, value), max(high, value)
-            used += 1
-        if lost or used == 0:
-            continue
-        # A few hundred counts apart, the temperature of the mean count is the mean temperature to a few hundredths of a millikelvin.
-        value = _temperature(table, total / used)
-        if high - low > NARROW:
-            total = 0.0
-            for k in range(points.shape[1]):
-                if valid[cell, k]:
-                    x, y = points[cell, k, 0] - x0, points[cell, k, 1] - y0
-                    c, r = c0 + x * (c1 - c0) + y * (c2 - c0), r0 + x * (r1 - r0) + y * (r2 - r0)
-                    total += _temperature(table, _between(counts, c, r))
-            value = total / used
-        value += offset
-        count[cell] += 1
-        step = value - mean[cell]
-        mean[cell] += step / count[cell]
-        squares[cell] += step * (value - mean[cell])
 
 
 def _merge(results: Sequence[MovingResult]) -> tuple[Array, Array, Array]:
@@ -312,15 +264,6 @@ def _merge(results: Sequence[MovingResult]) -> tuple[Array, Array, Array]:
     return count, mean, squares
 
 
-def _field(count: Array, mean: Array, samples: Samples, grid: PlanGrid) -> Array:
-    """Cells moved to their own centre, (y, x); NaN where a cell was in view in no frame or is masked."""
-    known = (count > 0).reshape(grid.shape) & (samples.coverage >= LEAST_COVERAGE)
-    centred = mean + samples.centring @ mean
-    # Next to cells that were never in view there is no gradient to move along.
-    complete = np.asarray((abs(samples.centring) @ (count == 0).astype(float)) == 0)
-    return np.where(known, np.where(complete, centred, mean).reshape(grid.shape), np.nan)
-
-
 def _cycle_parts(
     blocks: Sequence[Block], results: Sequence[MovingResult], times: Array, samples: Samples, grid: PlanGrid
 ) -> list[CyclePart]:
@@ -333,7 +276,7 @@ def _cycle_parts(
         count, mean, squares = _merge([result for _, result in own])
         part = CyclePart(cycle, 0, frames=int(placed.size), first_time=times[placed[0]])
         part.seconds = float(((times[placed] - times[placed[0]]) / np.timedelta64(1, "ns")).sum()) / 1e9
-        part.mean = _field(count, mean, samples, grid)
+        part.mean = on_plan(count, mean, samples, grid)
         with np.errstate(invalid="ignore", divide="ignore"):
             spread = np.sqrt(np.where(count > 1, squares / (count - 1), np.nan))
         part.spread = np.where(np.isfinite(part.mean), spread.reshape(grid.shape), np.nan)
@@ -350,7 +293,7 @@ def _frame_variables(
 ) -> dict[str, Any]:
     """Return the frame stack and the places of the table."""
     shift = np.concatenate([result.shift_mm for result in results])
-    stack = np.stack([_field(result.count, result.mean, samples, grid) for result in results]).astype(np.float32)
+    stack = np.stack([on_plan(result.count, result.mean, samples, grid) for result in results]).astype(np.float32)
     return {
         "frame_temperature": (("time", "y", "x"), stack),
         "frame_cycle": ("time", np.array([b.cycle + 1 for b in blocks], np.int32)),

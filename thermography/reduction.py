@@ -24,6 +24,8 @@ from thermography.resampling import plan_weights
 
 Array = NDArray[Any]
 
+#: A cycle that is open is kept on disk whenever it has grown by so many frames: what a broken run has to do again at most.
+KEPT_FRAMES = 4096
 #: Frames whose mean the plan is registered on anew after a knock.
 RENEWAL_FRAMES = 8
 
@@ -48,6 +50,7 @@ class Reduction:
     baseline_px: Array = field(default_factory=lambda: np.zeros(2))
     groups: list[Group] = field(default_factory=list)
     saved_blocks: int = 0
+    kept_frames: int = 0
 
     def __post_init__(self) -> None:
         self.shift_px = np.full(len(self.references), np.nan)
@@ -68,16 +71,24 @@ class Reduction:
         for finished in self.checkpoint.load():
             if finished.first_frame != done:
                 break
-            for first, stop, cycle, span in finished.blocks.tolist():
-                self.blocks.append(Block(first, stop, cycle, span, override(self.references[first])))
-            self.stack.extend(finished.stack)
-            self.parts.append(finished.part)
-            self.shift_px[done : finished.stop_frame] = finished.shift_px
-            self.baseline_px = np.array(finished.baseline_px)
-            self.shaken.update(finished.shaken)
-            done = finished.stop_frame
+            done = self._take_over(finished, override)
         self.saved_blocks = len(self.blocks)
+        unfinished = self.checkpoint.load_open()
+        if unfinished is not None and unfinished.first_frame == done:
+            done = self._take_over(unfinished, override)
+            self.groups = list(unfinished.groups)
+        self.kept_frames = done
         return done
+
+    def _take_over(self, found: Finished, override: Override) -> int:
+        for first, stop, cycle, span in found.blocks.tolist():
+            self.blocks.append(Block(first, stop, cycle, span, override(self.references[first])))
+        self.stack.extend(found.stack)
+        self.parts.append(found.part)
+        self.shift_px[found.first_frame : found.stop_frame] = found.shift_px
+        self.baseline_px = np.array(found.baseline_px)
+        self.shaken.update(found.shaken)
+        return found.stop_frame
 
     def _camera(self, registration: Registration) -> Camera:
         weights = plan_weights(registration, self.grid)
@@ -150,6 +161,8 @@ class Reduction:
         self.parts[-1].add(temperature, self.times[block.first : block.stop])
         if result.statistics is not None:
             self._add_sums(Group(block.parameters, result.statistics, offset))
+        if self.checkpoint is not None and block.stop - self.kept_frames >= KEPT_FRAMES:
+            self._save(self.checkpoint)
 
     def _add_sums(self, new: Group) -> None:
         for number, group in enumerate(self.groups):
@@ -165,17 +178,20 @@ class Reduction:
             return
         part.finish(self.cameras[part.span].weights)
         if self.checkpoint is not None:
-            blocks = self.blocks[self.saved_blocks :]
-            first, stop = blocks[0].first, blocks[-1].stop
-            places = np.array([(b.first, b.stop, b.cycle, b.span) for b in blocks])
-            stack = np.stack(self.stack[self.saved_blocks :])
-            shaken = tuple(sorted(i for i in self.shaken if first <= i < stop))
-            shift, baseline = self.shift_px[first:stop], (float(self.baseline_px[0]), float(self.baseline_px[1]))
-            self.checkpoint.save(
-                Finished(part, first, stop, places, stack, shift, tuple(self.groups), shaken, baseline)
-            )
+            self._save(self.checkpoint)
             self.saved_blocks = len(self.blocks)
         self.groups = []
+
+    def _save(self, checkpoint: Checkpoint) -> None:
+        blocks = self.blocks[self.saved_blocks :]
+        first, stop = blocks[0].first, blocks[-1].stop
+        places = np.array([(b.first, b.stop, b.cycle, b.span) for b in blocks])
+        stack = np.stack(self.stack[self.saved_blocks :])
+        shaken = tuple(sorted(i for i in self.shaken if first <= i < stop))
+        shift, baseline = self.shift_px[first:stop], (float(self.baseline_px[0]), float(self.baseline_px[1]))
+        groups = tuple(self.groups)
+        checkpoint.save(Finished(self.parts[-1], first, stop, places, stack, shift, groups, shaken, baseline))
+        self.kept_frames = stop
 
     def dataset(self, bounds: Array, cycles: Array) -> xr.Dataset:
         """Put everything together."""

@@ -7,6 +7,7 @@ import pytest
 
 from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene, record
 from thermography import fields as fields_module
+from thermography import reduction as reduction_module
 from thermography.checkpoint import CheckpointError, recalibrate
 from thermography.fields import RegisteredFrom, reduce_frames
 from thermography.radiometry import override
@@ -54,6 +55,37 @@ def test_a_broken_run_goes_on_and_ends_the_same(film, tmp_path, monkeypatch):
     monkeypatch.setattr(fields_module, "reduce_block", None)
     third = reduce_frames(frames, registration, GRID, BOUNDS, block_s=2, checkpoint=tmp_path / "cp")
     assert whole["temperature"].values.tobytes() == third["temperature"].values.tobytes()
+
+
+def test_a_long_cycle_goes_on_within_it(film, tmp_path, monkeypatch):
+    """One cycle over all frames: what was done of it is kept whenever it has grown by some frames."""
+    frames, registration = film
+    monkeypatch.setattr(reduction_module, "KEPT_FRAMES", 4)
+    whole = reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], block_s=2)
+    done, seen = [], []
+
+    def break_off(count):
+        done.append(count)
+        if sum(done) >= 6:
+            raise BrokenOffError
+
+    options = {"block_s": 2, "checkpoint": tmp_path / "cp"}
+    with pytest.raises(BrokenOffError):
+        reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], progress=break_off, **options)
+    again = reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], progress=seen.append, **options)
+    assert seen[0] == 4
+    for name in whole.variables:
+        assert whole[name].values.tobytes() == again[name].values.tobytes(), name
+    assert whole.attrs == again.attrs
+    # The sums of the whole cycle are there, though two runs added them up.
+    third = recalibrate(
+        tmp_path / "cp",
+        [RegisteredFrom(0, registration)] * 2,
+        GRID,
+        1,
+        lambda parameters: parameters,
+    )
+    assert third["count"].values.max() == len(frames)
 
 
 def test_a_checkpoint_of_another_reduction_is_refused(film, tmp_path):

@@ -1,12 +1,17 @@
 """A table that travels through the view: its place in every frame, and the field that stays attached to it."""
 
 import json
+import pickle
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.thermography.plan_scene import DISCS, GRID, START, Scene, cell_truth, record
+from thermography import moving
+from thermography.checkpoint import CheckpointError
 from thermography.fields import FieldError
 from thermography.moving import reduce_moving_frames
 from thermography.registration import register
@@ -76,3 +81,65 @@ def test_frames_without_the_table_are_named(travel, tmp_path):
         reduce_moving_frames(frames[1:], registration, GRID, edges(0, 2), direction=DIRECTION)
     with pytest.raises(FieldError, match="no frame in which the table is found lies within a cycle"):
         reduce_moving_frames(frames[:1], registration, GRID, edges(5, 7), direction=DIRECTION)
+
+
+RUN = """
+import sys
+from pathlib import Path
+import numpy as np
+from tests.thermography.plan_scene import GRID, START
+from tests.thermography.test_moving import DIRECTION, load
+from thermography import moving
+from thermography.flir import index_frames
+
+moving.BLOCK_FRAMES = 2
+frames, _ = index_frames([sys.argv[1]])
+bounds = START + np.array([0, 3, 6]) * np.timedelta64(1, "s")
+registration = load(Path(sys.argv[2]))
+
+
+def progress(count):
+    print(count, flush=True)
+    # Whoever started this run kills it here.
+    sys.stdin.readline()
+
+
+moving.reduce_moving_frames(
+    frames, registration, GRID, bounds, direction=DIRECTION, block_s=1, checkpoint=sys.argv[3], progress=progress
+)
+"""
+
+
+def load(path):
+    return pickle.loads(path.read_bytes())
+
+
+def test_a_killed_run_goes_on_at_the_first_block_that_is_not_done(travel, tmp_path, monkeypatch):
+    _, registration, frames, _ = travel
+    (tmp_path / "registration").write_bytes(pickle.dumps(registration))
+    command = [sys.executable, "-c", RUN, frames[0].path, tmp_path / "registration", tmp_path / "cp"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as run:
+        for _ in range(5):
+            assert run.stdout.readline() == "1\n"
+            run.stdin.write("\n")
+            run.stdin.flush()
+        run.kill()
+    assert run.returncode != 0
+    monkeypatch.setattr(moving, "BLOCK_FRAMES", 2)
+    seen = []
+    how = {"direction": DIRECTION, "block_s": 1}
+    again = reduce_moving_frames(
+        frames, registration, GRID, edges(0, 3, 6), checkpoint=tmp_path / "cp", progress=seen.append, **how
+    )
+    # Five frames were done, of which a file holds two.
+    assert seen == [4, 1, 1]
+    whole = reduce_moving_frames(frames, registration, GRID, edges(0, 3, 6), **how)
+    for name in whole.variables:
+        assert whole[name].values.tobytes() == again[name].values.tobytes(), name
+    assert whole.attrs == again.attrs
+    with pytest.raises(
+        CheckpointError, match=r"holds cycles of another reduction \(other reach_mm\); remove the folder"
+    ):
+        reduce_moving_frames(
+            frames, registration, GRID, edges(0, 3, 6), checkpoint=tmp_path / "cp", reach_mm=400.0, **how
+        )
