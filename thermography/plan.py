@@ -15,6 +15,9 @@ Array = NDArray[Any]
 
 REQUIRED_COLUMNS = ("name", "x_mm", "y_mm", "diameter_mm")
 HINT_COLUMNS = ("column_px", "row_px")
+MARKER_COLUMN = "marker"
+#: Markers in the dictionary.
+MARKERS = 50
 
 
 class FiducialError(ValueError):
@@ -71,7 +74,10 @@ class PlanGrid:
 
 @dataclass(frozen=True)
 class Fiducial:
-    """A disc on the table plan; the pixel position, where given, is only a hint of where to look for it."""
+    """A disc on the table plan; the pixel position, where given, is only a hint of where to look for it.
+
+    With a `marker` number it is an ArUco marker (4 x 4, one of 50) within a circle of that diameter, which tells only which plan this is.
+    """
 
     name: str
     x_mm: float
@@ -79,6 +85,7 @@ class Fiducial:
     diameter_mm: float
     column_px: float | None = None
     row_px: float | None = None
+    marker: int | None = None
 
     @property
     def hint_px(self) -> tuple[float, float] | None:
@@ -89,12 +96,12 @@ class Fiducial:
 
 
 def read_fiducials(path: str | Path) -> list[Fiducial]:
-    """Read a fiducial table with the columns name, x_mm, y_mm, diameter_mm and, optionally, column_px, row_px.
+    """Read a fiducial table with the columns name, x_mm, y_mm, diameter_mm and, optionally, column_px, row_px, marker.
 
     Parameters
     ----------
     path
-        CSV file; an empty pixel position means that there is no hint for that disc.
+        CSV file; an empty pixel position means that there is no hint for that disc. A number in `marker` makes the row an ArUco marker.
 
     Returns
     -------
@@ -118,8 +125,9 @@ def read_fiducials(path: str | Path) -> list[Fiducial]:
             )
         reader.fieldnames = header
         fiducials = [_parse(path, reader.line_num, row) for row in reader if any(row.values())]
-    if len(fiducials) < 4:
-        raise FiducialError(f"{path}: lists {len(fiducials)} fiducials; a plan is located by at least 4")
+    discs = sum(one.marker is None for one in fiducials)
+    if discs < 4:
+        raise FiducialError(f"{path}: lists {discs} fiducials; a plan is located by at least 4")
     return fiducials
 
 
@@ -139,6 +147,13 @@ def _parse(path: Path, line: int, row: dict[str, str]) -> Fiducial:
     x_mm, y_mm, diameter_mm = (_number(path, line, column, row[column]) for column in REQUIRED_COLUMNS[1:])
     if diameter_mm <= 0:
         raise FiducialError(f"{path}:{line}: diameter_mm = {row['diameter_mm']}; a disc has a positive diameter")
+    marker = (row.get(MARKER_COLUMN) or "").strip()
+    if marker:
+        if not marker.isdecimal() or int(marker) >= MARKERS:
+            raise FiducialError(
+                f"{path}:{line}: marker = {marker!r}; give the number of an ArUco marker, 0 to {MARKERS - 1}"
+            )
+        return Fiducial(name, x_mm, y_mm, diameter_mm, marker=int(marker))
     hints = [(row.get(column) or "").strip() for column in HINT_COLUMNS]
     if all(hints):
         column_px, row_px = (

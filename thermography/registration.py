@@ -21,6 +21,7 @@ from thermography.lens import (
     parameter_covariance,
     parameter_jacobian,
 )
+from thermography.markers import identify
 from thermography.matching import MatchError, match_by_arrangement, match_by_hints
 from thermography.plan import Fiducial, FiducialError, PlanGrid, mask_discs, read_fiducials
 
@@ -147,7 +148,7 @@ def register(
     temperature
         One frame (row, column) in degC, or a stack (time, row, column), whose mean is used: averaging lifts discs whose contrast is low.
     fiducials
-        As listed in the plan; pixel hints may be wrong by 20 px, or missing.
+        As listed in the plan; pixel hints may be wrong by 20 px, or missing. Markers among them serve as hints and are masked.
     grid
         The plan, whose edge bounds the table; without it the discs are taken to lie far from any edge.
     lens
@@ -164,10 +165,12 @@ def register(
     ------
     RegistrationError
         Fewer than four fiducials are found, they lie on a line, or their arrangement is ambiguous.
+    MarkerError
+        The markers in view are those of another plan.
     """
     frame = np.asarray(temperature, float)
     frame = frame.mean(axis=0) if frame.ndim == 3 else frame
-    listed, left_out = _without_duplicates(fiducials)
+    listed, left_out = _without_duplicates(identify(frame, fiducials))
     if not use_hints:
         listed = [replace(disc, column_px=None, row_px=None) for disc in listed]
     spots = detect_discs(frame)
@@ -192,7 +195,8 @@ def register(
             )
         known = [disc for disc in listed if disc.name in located]
         projection, _ = _fit(_sightings(located, known), _shape(frame), lens)
-    return _registration(located, listed, left_out | missed | _wrong_hints(located, known), _shape(frame), lens)
+    registration = _registration(located, listed, left_out | missed | _wrong_hints(located, known), _shape(frame), lens)
+    return replace(registration, masked=(*registration.masked, *(one for one in fiducials if one.marker is not None)))
 
 
 def register_points(
