@@ -90,10 +90,14 @@ def environment_factor(
     wavelength_nm: float = VACUUM_WAVELENGTH_NM,
 ) -> Array:
     """Return the micrometres that one count stands for."""
-    stretch = 1.0 + expansion_coefficient_ppm_per_K * 1e-6 * (
-        np.asarray(material_temperature_degC) - REFERENCE_TEMPERATURE_DEGC
-    )
+    stretch = _stretch(material_temperature_degC, expansion_coefficient_ppm_per_K)
     return wavelength_nm * 1e-3 / (2.0 * np.asarray(index) * stretch)
+
+
+def _stretch(material_temperature_degC: Array | float, expansion_coefficient_ppm_per_K: float) -> Array:
+    """Return the length of the material over its length at 20 degC."""
+    warmer = np.asarray(material_temperature_degC) - REFERENCE_TEMPERATURE_DEGC
+    return np.asarray(1.0 + expansion_coefficient_ppm_per_K * 1e-6 * warmer)
 
 
 def implied_wavelength_nm(
@@ -164,10 +168,8 @@ def compensate(
     material_temperature_degC : xarray.DataArray, optional
         (cycle, direction, target): temperature of the measured length at each reading, for instance seen by a camera.
         Left out: the logged probe.
-    dead_path_mm : float
-        Distance from the interferometer to the reflector where the display was zeroed.
-    zero_mm : float
-        Axis position at which the display was zeroed.
+    dead_path_mm, zero_mm : float
+        Distance from the interferometer to the reflector where the display was zeroed, and the axis position of that place.
     away : bool
         Whether the reflector moves away from the interferometer as the position grows.
     wavelength_nm : float
@@ -177,50 +179,46 @@ def compensate(
     -------
     xarray.Dataset
         The deviations compensated, and beside them, in um at every reading: correction_scale and correction_dead_path
-        (both already added); air_u, material_u and dead_path_u, and compensation_u, their root sum of squares;
-        air_index (1). ``attrs["outside_environment"]`` counts readings before
-        the first or after the last logged condition, which take that condition.
+        (both already added); air_u, material_u and dead_path_u, and compensation_u, their root sum of squares; air_index (1).
+        ``attrs["outside_environment"]`` counts readings beyond the log, which take its first or last condition.
 
     Raises
     ------
     CompensationError
-        Readings have no time, or lie more than 15 minutes from any logged condition; or the applied factor is none of a
-        HeNe laser in air.
+        Readings have no time, or lie more than 15 minutes from any logged condition; or the factor is none of a laser in air.
     """
-    sensors = uncertainty or SensorUncertainty()
     air, outside = _conditions_at(deviations, environment)
-    index = _index_of(air, wavelength_nm)
-    material = air["material_temperature"] if material_temperature_degC is None else material_temperature_degC.values
-    travel_mm = deviations["position"].values - zero_mm
-    wanted = environment_factor(
-        index,
-        material_temperature_degC=material,
-        expansion_coefficient_ppm_per_K=expansion_coefficient_ppm_per_K,
-        wavelength_nm=wavelength_nm,
-    )
-    scale = _scale(deviations, wanted, applied_factor_um)
-    seconds = _seconds(deviations)
-    start_index = float(index.ravel()[int(np.nanargmin(seconds))])
-    correction = {
-        "correction_scale": (travel_mm * 1e3 + deviations["deviation"].values) * scale,
-        "correction_dead_path": dead_path_error_um(index, start_index, dead_path_mm=dead_path_mm)
-        * (-1.0 if away else 1.0),
+    if material_temperature_degC is not None:
+        air["material_temperature"] = material_temperature_degC.values
+    index, travel_mm = _index_of(air, wavelength_nm), deviations["position"].values - zero_mm
+    stretch = _stretch(air["material_temperature"], expansion_coefficient_ppm_per_K)
+    change = index - float(index.ravel()[int(np.nanargmin(_seconds(deviations)))])
+    lengthened = dead_path_mm * 1e3 * change / index
+    added = {
+        "correction_scale": (travel_mm * 1e3 + deviations["deviation"].values)
+        * _scale(deviations, wavelength_nm * 1e-3 / (2.0 * index * stretch), applied_factor_um),
+        "correction_dead_path": -lengthened if away else lengthened,
     }
-    length_m = np.abs(travel_mm) * 1e-3
+    sensors, length_m = uncertainty or SensorUncertainty(), np.abs(travel_mm) * 1e-3
     u = {
         "air_u": length_m * _air_ppm(air, sensors, wavelength_nm),
-        "material_u": length_m * _material_ppm(np.asarray(material), expansion_coefficient_ppm_per_K, sensors),
-        "dead_path_u": sensors.dead_path_mm * 1e3 * np.abs(index - start_index) * (dead_path_mm != 0),
+        "material_u": length_m * _material_ppm(air["material_temperature"], expansion_coefficient_ppm_per_K, sensors),
+        "dead_path_u": sensors.dead_path_mm * 1e3 * np.abs(change) * (dead_path_mm != 0),
     }
-    u["compensation_u"] = np.sqrt(sum(np.square(one) for one in u.values()))
-    dims = deviations["deviation"].dims
-    corrected = deviations["deviation"].values + sum(correction.values())
-    compensated = deviations.assign(deviation=(dims, corrected, deviations["deviation"].attrs))
-    for name, values in {**correction, **u}.items():
-        compensated[name] = (dims, np.broadcast_to(values, index.shape), {"units": "um"})
-    compensated["air_index"] = (dims, index, {"units": "1"})
-    compensated.attrs["outside_environment"] = outside
-    return compensated
+    return _corrected(deviations, added, u, index).assign_attrs(outside_environment=outside)
+
+
+def _corrected(deviations: xr.Dataset, added: dict[str, Array], u: dict[str, Array], index: Array) -> xr.Dataset:
+    """Return the deviations with what is added to them, and beside them its parts and their uncertainties."""
+    dims, total = deviations["deviation"].dims, sum(added.values())
+    corrected = deviations.assign(
+        deviation=(dims, deviations["deviation"].values + total, deviations["deviation"].attrs),
+        air_index=(dims, index, {"units": "1"}),
+    )
+    together = np.sqrt(sum(np.square(one) for one in u.values()))
+    for name, values in {**added, **u, "compensation_u": together}.items():
+        corrected[name] = (dims, np.broadcast_to(values, index.shape), {"units": "um"})
+    return corrected
 
 
 def _index_of(air: dict[str, Array], wavelength_nm: float) -> Array:
