@@ -116,6 +116,7 @@ def evaluate_films(
     draws: int = 499,
     checks: int = CHECKS,
     favour: Mapping[str, float] = MappingProxyType({}),
+    beside: Sequence[Array] = (),
     rng: np.random.Generator,
     progress: Callable[[float], None] | None = None,
 ) -> Findings:
@@ -130,11 +131,16 @@ def evaluate_films(
     films : sets of temperatures by name, all at the same instants
     favour : sets that get a larger share of the error probability, by how much sooner they pass: in units of the distance from the
         median of a set's null maxima to their 95 % point
+    beside : for every series, columns (n, k) that every hypothesis contains as well: sources that are taken as given
     """
     seconds = next(iter(films.values())).seconds
     operators = lag_operators(seconds, lags_s)
+    given = beside or [np.empty((one.values.size, 0)) for one in series]
     banks = tuple(
-        null_bank(one.values, one.seconds, one.variance, nuisance_columns(one.seconds, excitation)) for one in series
+        null_bank(
+            one.values, one.seconds, one.variance, np.column_stack([nuisance_columns(one.seconds, excitation), columns])
+        )
+        for one, columns in zip(series, given, strict=True)
     )
     sources = [
         _Source(bank, whiten_series(bank, stack), _seen_through(one, operators))

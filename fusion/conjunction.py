@@ -66,7 +66,8 @@ class Agreement:
     x_mm, y_mm : place in the session that shows it
     shown_by : 0 first session, 1 second, or both
     p_value, sensitivity_um_per_K, sensitivity_u_um_per_K, lag_s : of the first and the second session near that place
-    agrees : both sessions pass there, with one sign and one size: a cause
+    agrees : both sessions pass there, with one sign and one size
+    separate : it leads its session, or adds to what leads there; otherwise it may only warm with the leading source
     """
 
     channel: str
@@ -78,6 +79,12 @@ class Agreement:
     sensitivity_u_um_per_K: tuple[float, float]
     lag_s: tuple[float, float]
     agrees: bool
+    separate: bool
+
+    @property
+    def cause(self) -> bool:
+        """Whether both sessions agree on it, and it is told from the other sources."""
+        return self.agrees and self.separate
 
 
 def compare_sources(first: xr.Dataset, second: xr.Dataset) -> list[Agreement]:
@@ -99,7 +106,7 @@ def compare_sources(first: xr.Dataset, second: xr.Dataset) -> list[Agreement]:
     }
     found: list[Agreement] = []
     for at, session in enumerate((first, second)):
-        for channel, x_mm, y_mm in _passing(session):
+        for channel, x_mm, y_mm, separate in _passing(session):
             if channel not in near or _already(found, channel, x_mm, y_mm):
                 continue
             row = int(np.argmin(np.abs(first["y"].values - y_mm)))
@@ -118,6 +125,7 @@ def compare_sources(first: xr.Dataset, second: xr.Dataset) -> list[Agreement]:
                     sensitivity_u_um_per_K=_at(places, "sensitivity_u", row, column),
                     lag_s=_at(places, "lag", row, column),
                     agrees=agrees,
+                    separate=separate,
                 )
             )
     return found
@@ -128,19 +136,22 @@ def _at(places: Places, name: str, row: int, column: int) -> tuple[float, float]
     return float(places[0][name][row, column]), float(places[1][name][row, column])
 
 
-def _passing(session: xr.Dataset) -> list[tuple[str, float, float]]:
-    """Part of the drift and place (x, y in mm) of every source that a session shows."""
+def _passing(session: xr.Dataset) -> list[tuple[str, float, float, bool]]:
+    """Part of the drift, place (x, y in mm), and whether it is told from the leading one, of every source that a session shows."""
     if session.attrs["verdict"] != "attributable":
         return []
     leading = find_source(session)
     if leading.kind != "mode":
-        return [(leading.channel, leading.x_mm, leading.y_mm)]
-    ratio = (session["modes_statistic"] / session["modes_threshold"]).fillna(0.0).transpose("channel", "mode").values
-    passed = session["modes_p_value"].transpose("channel", "mode").values <= LEVEL
+        return [(leading.channel, leading.x_mm, leading.y_mm, True)]
+    order = ("channel", "mode")
+    ratio = (session["modes_statistic"] / session["modes_threshold"]).fillna(0.0).transpose(*order).values
+    passed = session["modes_p_value"].transpose(*order).values <= LEVEL
+    adds = session["modes_p_beside"].transpose(*order).fillna(0.0).values <= LEVEL
     sources = []
     for k in np.flatnonzero(passed.any(axis=0)):
-        channel = str(session["channel"].values[int(np.where(passed[:, k], ratio[:, k], -1.0).argmax())])
-        sources.append((channel, float(session["modes_at_x"][k]), float(session["modes_at_y"][k])))
+        best = int(np.where(passed[:, k], ratio[:, k], -1.0).argmax())
+        place = float(session["modes_at_x"][k]), float(session["modes_at_y"][k])
+        sources.append((str(session["channel"].values[best]), *place, bool(adds[best, k])))
     return sources
 
 

@@ -23,7 +23,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.attribution import CHECKS, LAGS_S, LEVEL, Film, Findings, Tested, evaluate_films
-from fusion.channels import Array, DriftSeries, read_clock, reduce_channels, target_table
+from fusion.channels import Array, DriftSeries, read_clock, reduce_channels, respond, target_table
 from fusion.excitation import Excitation, describe_excitation
 from fusion.groups import joined
 from fusion.regions import Modes, Region, localise_modes, region_courses
@@ -86,7 +86,8 @@ def correlate(
         Maps over channel, y, x: ``statistic``, ``p_value`` (family-wise), ``q_value`` (false discovery), ``sensitivity`` and
         ``sensitivity_u`` (um/K), ``lag`` (s), ``detectable_sensitivity`` (um/K found with 80 % power), ``verdict``, and
         ``naive_correlation`` for contrast only. The same over channel and mode as ``modes_*``, with ``modes_pattern`` (1 at the
-        strongest cell, at ``modes_at_x``, ``modes_at_y``); over channel and region as ``regions_*``. Per channel ``threshold``, ``noise``
+        strongest cell, at ``modes_at_x``, ``modes_at_y``) and ``modes_p_beside``, the p value of what a mode adds to the leading one
+        (NaN for that one itself, and where none passes); over channel and region as ``regions_*``. Per channel ``threshold``, ``noise``
         (um), ``unexplained_drift`` (um over one hour), ``drift_order``; scalars ``false_alarm_rate`` (of everything tested),
         ``cells_false_alarm_rate``, ``modes_false_alarm_rate``, ``regions_false_alarm_rate``, ``warm_up_share``; attribute
         ``verdict``. With `per_target`, maps over series, y, x as ``targets_*`` and, over series and region, ``target_regions_*``.
@@ -123,6 +124,9 @@ def correlate(
     dataset = dataset.assign(_over_cells("channel", quantities["cells"], seen, field))
     if "modes" in quantities:
         dataset = joined(dataset, modes=_over_modes(quantities["modes"], modes, seen, field))
+        dataset["modes_p_beside"] = _beside_leader(
+            found.sets["modes"], series, films["modes"], excitation, lags_s, draws, seed
+        )
     if "regions" in quantities:
         dataset = joined(dataset, regions=_over_regions("channel", quantities["regions"], regions))
     if per_target:
@@ -151,6 +155,42 @@ def read_film(field: xr.DataArray, frame_seconds: Array) -> tuple[Film, NDArray[
         known = ~gaps[:, column]
         values[~known, column] = np.interp(frame_seconds[~known], frame_seconds[known], values[known, column])
     return Film(frame_seconds, values - values.mean(axis=0)), seen
+
+
+def _beside_leader(
+    tested: Tested,
+    series: Sequence[DriftSeries],
+    modes: Film,
+    excitation: Excitation,
+    lags_s: Sequence[float],
+    draws: int,
+    seed: int,
+) -> xr.DataArray:
+    """Family-wise p (channel, mode) of what each mode adds to the leading one, which is taken as given at its lag.
+
+    Modes that warm with the leading one go with the drift as it does, but add nothing to it.
+    """
+    count = modes.values.shape[1]
+    p_value = np.full((len(tested.names), count), np.nan)
+    ratio = tested.statistic / tested.threshold[:, None]
+    channel, leader = np.unravel_index(int(np.where(tested.p_value <= LEVEL, ratio, -1.0).argmax()), ratio.shape)
+    others = np.flatnonzero(np.arange(count) != leader)
+    if tested.p_value[channel, leader] <= LEVEL and others.size and not excitation.warm_up_only:
+        lag_s = lags_s[int(tested.lag_index[channel, leader])]
+        given = respond(modes.seconds, lag_s, modes.values[:, [leader]])
+        again = evaluate_films(
+            series,
+            {"modes": Film(modes.seconds, modes.values[:, others])},
+            excitation,
+            lags_s=lags_s,
+            draws=draws,
+            checks=0,
+            beside=[one.sampling @ given for one in series],
+            rng=np.random.default_rng(seed + 2),
+        )
+        p_value[:, others] = again.sets["modes"].p_value
+    attrs = {"units": "1", "long_name": "family-wise p value of what this mode adds to the leading one"}
+    return xr.DataArray(p_value, dims=("channel", "mode"), attrs=attrs)
 
 
 def _session_verdict(found: Findings, excitation: Excitation) -> int:

@@ -49,11 +49,11 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
         {
             "campaigns": [_title(folder) for folder in folders],
             "sources": [asdict(one) for one in found],
-            "agreement": [asdict(one) for one in sources],
+            "agreement": [{**asdict(one), "cause": one.cause} for one in sources],
         },
     )
     rows = [(CHANNELS.get(one.channel, one.channel), in_words(one)) for one in found]
-    causes = [f"x {one.x_mm:.0f} mm, y {one.y_mm:.0f} mm" for one in sources if one.agrees]
+    causes = [f"x {one.x_mm:.0f} mm, y {one.y_mm:.0f} mm" for one in sources if one.cause]
     table = [source_row(one, [_title(folder) for folder in folders]) for one in sources]
     for at, folder in enumerate(folders):
         joint = {"other": _title(folders[1 - at]), "rows": rows, "causes": causes, "sources": table}
@@ -72,7 +72,12 @@ def source_row(one: Agreement, titles: Sequence[str]) -> list[str]:
             one.p_value, one.sensitivity_um_per_K, one.sensitivity_u_um_per_K, one.lag_s, strict=True
         )
     ]
-    verdict = "a cause: both agree" if one.agrees else f"shown by {titles[one.shown_by[0]]} alone"
+    if one.cause:
+        verdict = "a cause: both agree"
+    elif one.agrees:
+        verdict = "both agree, but it may only warm with the leading source"
+    else:
+        verdict = f"shown by {titles[one.shown_by[0]]} alone"
     return [f"{one.x_mm:.0f}, {one.y_mm:.0f}", CHANNELS.get(one.channel, one.channel), *shown, verdict]
 
 

@@ -33,7 +33,7 @@ def describe_correlation(
         captions["modes"] = caption_of(maps, found.channel, "modes")
     return {
         "headline": _headline(found),
-        "sentences": [*_sentences(found), _worth(found, joint, duty)],
+        "sentences": [*_sentences(found), *_beside(maps, found), _worth(found, joint, duty)],
         "tell": readable(would_tell(maps, found)),
         "captions": captions,
         "channels": [_channel_row(maps, str(channel)) for channel in maps["channel"].values],
@@ -73,6 +73,31 @@ def _sentences(found: Found) -> list[str]:
         places = [f"x {x:.0f} mm, y {y:.0f} mm" for x, y in found.others_mm[:4]]
         more = f" and {len(found.others_mm) - 4} more" if len(found.others_mm) > 4 else ""
         sentences.append(f"These data cannot tell it from {join(places)}{more}, which explain the drift as well.")
+    return sentences
+
+
+def _beside(maps: xr.Dataset, found: Found) -> list[str]:
+    """Which other modes add to the leading one, and which pass but may only warm with it."""
+    if found.verdict != "attributable" or found.kind != "mode":
+        return []
+    beside = maps["modes_p_beside"].min("channel").fillna(1.0).values
+    alone = maps["modes_p_value"].min("channel").values
+    named = [
+        f"mode {mode} (x {float(x):.0f} mm, y {float(y):.0f} mm)"
+        for mode, x, y in zip(maps["mode"].values, maps["modes_at_x"].values, maps["modes_at_y"].values, strict=True)
+    ]
+    others = maps["mode"].values.astype(str) != found.name
+    adds, alike = others & (beside <= LEVEL), others & (beside > LEVEL) & (alone <= LEVEL)
+    sentences = []
+    if adds.any():
+        sentences.append(
+            f"With it taken as given, {join([named[k] for k in np.flatnonzero(adds)])} goes with what is left."
+        )
+    if alike.any():
+        verb = "passes" if alike.sum() == 1 else "pass"
+        sentences.append(
+            f"By itself {join([named[k] for k in np.flatnonzero(alike)])} {verb} too, but adds nothing: it may only warm with it."
+        )
     return sentences
 
 
@@ -129,6 +154,8 @@ def _candidate_rows(maps: xr.Dataset, name: str, kind: str) -> dict[str, list[di
                 duration(float(part["lag"])),
                 number(float(part["detectable_sensitivity"]), 2),
             ]
+            if kind == "mode":
+                cells.append(p_value(float(part["p_beside"])))
             rows.append({"cells": cells, "passed": bool(part["p_value"] <= LEVEL)})
         strongest.append(rows[int(ratio.isel({kind: at}).values.argmax())])
         everything += rows

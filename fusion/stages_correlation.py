@@ -146,7 +146,7 @@ def _candidates(maps: xr.Dataset, name: str, kind: str) -> list[dict[str, Any]]:
     listed = []
     for at in range(few.sizes[kind]):
         one = few.isel({kind: at})
-        parts = {
+        parts: dict[str, dict[str, Any]] = {
             str(channel): {
                 "p_value": float(one["p_value"].sel(channel=channel)),
                 "sensitivity_um_per_K": {
@@ -159,6 +159,9 @@ def _candidates(maps: xr.Dataset, name: str, kind: str) -> list[dict[str, Any]]:
             for channel in few["channel"].values
         }
         named = f"mode {one[kind].item()}" if kind == "mode" else str(one[kind].item())
+        if kind == "mode":
+            for channel, part in parts.items():
+                part["p_beside_leader"] = float(one["p_beside"].sel(channel=channel))
         listed.append({"name": named, "x_mm": float(one["at_x"]), "y_mm": float(one["at_y"]), "parts": parts})
     return listed
 

@@ -34,7 +34,7 @@ def test_a_source_that_both_sessions_show_is_a_cause(first):
 def test_each_source_is_listed_once_with_what_both_sessions_show(first):
     second = maps_of(simulator.driven_session(np.random.default_rng(9), source=0))
     sources = compare_sources(first, second)
-    (cause,) = [one for one in sources if one.agrees]
+    (cause,) = [one for one in sources if one.cause]
     assert cause.shown_by == (0, 1)
     assert simulator.distance_cells(cause.y_mm / 10 - 0.5, cause.x_mm / 10 - 0.5, 0) <= 5
     assert max(cause.p_value) <= 0.05

@@ -75,6 +75,30 @@ def test_places_that_warm_alike_are_named_as_equal(rng):
         assert min(np.hypot(x - (10 * c + 5), y - (10 * r + 5)) for x, y in places) <= 50.0
 
 
+def modes_of(film, driver, rng):
+    made = simulator.session(film, driver, driver, rng)
+    maps = correlate(made.fused, made.field[:, ::2, ::2], draws=199, checks=1).sel(channel="joint")
+    place = np.stack([maps["modes_at_y"].values / 10 - 0.5, maps["modes_at_x"].values / 10 - 0.5], axis=1)
+    nearest = [int(np.argmin(np.hypot(*(place - np.array(source)).T))) for source in simulator.SOURCES[:2]]
+    return maps["modes_p_value"].values[nearest], maps["modes_p_beside"].values[nearest]
+
+
+def test_a_second_source_adds_to_the_leading_one(rng):
+    responses = simulator.source_responses("duty", rng)[1]
+    p, beside = modes_of(simulator.film("duty", rng, responses), 3.0 * (responses[:, 0] - responses[:, 1]), rng)
+    # The second one is hidden by the first until that is taken as given; NaN marks the leading one.
+    assert p.min() <= 0.05
+    assert np.isnan(beside).sum() == 1 and np.nanmax(beside) <= 0.05
+
+
+def test_a_place_that_warms_with_the_source_adds_nothing(rng):
+    responses = simulator.source_responses("duty", rng)[1]
+    responses[:, 1] = 0.9 * responses[:, 0] + 0.1 * responses[:, 1]
+    p, beside = modes_of(simulator.film("duty", rng, responses), 3.0 * responses[:, 0], rng)
+    assert (p <= 0.05).all()
+    assert np.isnan(beside).sum() == 1 and np.nanmax(beside) > 0.05
+
+
 def test_a_region_outside_the_plan_is_refused(driven):
     with pytest.raises(RegionError, match=r"region 'far' around x = 5000 mm, y = -?0 mm holds no seen cell"):
         correlate(driven.fused, driven.field, regions=[disc("far", 5000, 0, 20)])
