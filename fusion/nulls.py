@@ -21,15 +21,19 @@ def tail_probability(value: float, null: Array) -> float:
     threshold = float(np.quantile(null, 0.9))
     if value <= threshold:
         return float((1 + (null >= value).sum()) / (1 + null.size))
-    excess = max(1.0, float((null[null > threshold] - threshold).mean()))
-    return float(0.1 * np.exp(-(value - threshold) / excess))
+    return float(0.1 * np.exp(-(value - threshold) / _mean_excess(null, threshold)))
 
 
 def critical_gain(p_value: float, null: Array) -> float:
     """The gain whose chance is ``p_value`` (at most 0.1): the inverse of :func:`tail_probability`."""
     threshold = float(np.quantile(null, 0.9))
-    excess = max(1.0, float((null[null > threshold] - threshold).mean()))
-    return threshold + excess * float(np.log(0.1 / min(p_value, 0.1)))
+    return threshold + _mean_excess(null, threshold) * float(np.log(0.1 / min(p_value, 0.1)))
+
+
+def _mean_excess(null: Array, threshold: float) -> float:
+    """Mean excess of the upper draws over a threshold, at least 1; draws that are all alike have none."""
+    upper = null[null > threshold]
+    return max(1.0, float((upper - threshold).mean())) if upper.size else 1.0
 
 
 def family_wise(observed: Array, null: Array) -> tuple[Array, float, int]:
