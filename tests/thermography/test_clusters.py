@@ -18,7 +18,9 @@ def test_a_cluster_of_two_workers_gives_the_same_fields_bit_for_bit(rng, tmp_pat
     frames = record(tmp_path / "a.seq", (image + rng.normal(0, 0.05, image.shape) for _ in range(24)))
     bounds = START + np.array([0, 9, 17, 24]) * np.timedelta64(1, "s")
     alone = reduce_frames(frames, registration, GRID, bounds, block_s=4)
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+    ) as cluster:
         together = reduce_frames(frames, registration, GRID, bounds, block_s=4, scheduler=cluster.scheduler_address)
     for name in alone.variables:
         assert alone[name].values.tobytes() == together[name].values.tobytes(), name
@@ -28,7 +30,9 @@ def test_a_cluster_of_two_workers_gives_the_same_fields_bit_for_bit(rng, tmp_pat
 def test_a_scheduler_that_does_not_answer_is_named():
     pytest.importorskip("distributed")
     with (
-        pytest.raises(SchedulerError, match=r"scheduler nowhere does not answer \(.*\); check the address, or leave it out"),
+        pytest.raises(
+            SchedulerError, match=r"scheduler nowhere does not answer \(.*\); check the address, or leave it out"
+        ),
         open_pool("nowhere"),
     ):
         pass
