@@ -248,4 +248,11 @@ def chained_blocks(seconds: Array, drivers: list[Array]) -> NDArray[np.int64]:
             bounds.append(start)
     if len(bounds) + 1 < _LEAST_CHAINED:
         bounds = list(np.linspace(seconds[0], seconds[-1], _MOST_CHAINED + 1)[1:-1])
-    return np.searchsorted(np.array(bounds), seconds, side="right").astype(np.int64)
+    # A load that hardly ever rests leaves parts too long to tell anything from their few predictions.
+    edges = [float(seconds[0]), *bounds, float(seconds[-1])]
+    longest = (seconds[-1] - seconds[0]) / _LEAST_CHAINED
+    cuts = [
+        np.linspace(first, last, int(np.ceil((last - first) / longest)) + 1)[1:]
+        for first, last in zip(edges[:-1], edges[1:], strict=True)
+    ]
+    return np.searchsorted(np.concatenate(cuts)[:-1], seconds, side="right").astype(np.int64)

@@ -59,9 +59,13 @@ def test_a_sensor_that_tells_nothing_of_its_own_is_left_out(rng):
 
 def test_parts_begin_where_the_load_starts():
     seconds = np.arange(600) * 300.0
-    speed = np.where(np.arange(600) % 100 < 50, 0.0, 1.0)  # starts at 50, 150, ... 550
+    speed = np.where(np.arange(600) % 100 < 40, 0.0, 1.0)  # starts at 40, 140, ... 540
     parts = chained_blocks(seconds, [speed])
-    assert [int(np.flatnonzero(parts == k)[0]) for k in range(1, parts.max() + 1)] == [150, 250, 350, 450, 550]
+    assert [int(np.flatnonzero(parts == k)[0]) for k in range(1, parts.max() + 1)] == [140, 240, 340, 440, 540]
+    rare = chained_blocks(
+        seconds, [np.where(np.isin(np.arange(600) // 10, (12, 30, 52)), 0.0, 1.0)]
+    )  # rests three times
+    np.testing.assert_array_equal(np.flatnonzero(np.diff(rare)) + 1, [130, 220, 310, 420, 530])
     without = chained_blocks(seconds, [])
     np.testing.assert_array_equal(np.bincount(without), np.full(8, 75))
 
