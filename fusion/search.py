@@ -212,10 +212,14 @@ def _check_columns(members: Sequence[Member], readings: Readings) -> None:
             raise SearchError(f"{columns.shape[1]} columns but {len(member.units)} units at {dict(member.parameters)}")
 
 
+#: Words that a closer look may change: what a lead may be mistaken for, and what the machine did before the log began.
+_OPEN_WORDS = frozenset({"possible_leads", "start"})
+
+
 def _same_kind(member: Member, found: Member) -> bool:
     """Alike in what is a word (shape, driver); numbers may differ."""
     words = {
-        name: value for name, value in found.parameters.items() if isinstance(value, str) and name != "possible_leads"
+        name: value for name, value in found.parameters.items() if isinstance(value, str) and name not in _OPEN_WORDS
     }
     return all(member.parameters.get(name) == value for name, value in words.items())
 
