@@ -17,7 +17,7 @@ from fusion.products import write_atomically
 from fusion.progress import Report
 from fusion.results import Notice
 from fusion.sources import Source, counted, listed
-from thermography.camera import find_repeats, find_steps, read_levels
+from thermography.camera import DEAD, NOISY, OFFSET, find_bad_pixels, find_repeats, find_steps, read_levels
 from thermography.clock import estimate_clock_offset
 from thermography.contract import FIELDS
 from thermography.exr import write_maps
@@ -33,6 +33,8 @@ _REGISTRATION_FRAMES = 5
 _CHECKED_FRAMES = 1000
 #: Longer recordings keep what is finished on disk while they are reduced; for shorter ones that would cost more than it saves.
 _CHECKPOINT_FRAMES = 2000
+#: Frames in which bad pixels are looked for: enough to tell a noisy pixel, over a time in which the table hardly changes.
+_PIXEL_FRAMES = 24
 _KELVIN = 273.15
 
 
@@ -43,6 +45,8 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
     """
     override = Overrides(campaign_constants(source))
     notices = camera_notices(source, override, report=report)
+    if source.thermography.table == "still":
+        notices += pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:_PIXEL_FRAMES]]))
     report("registration", 0, 1)
     # A moving table is somewhere else in the next frame, so its plan is registered on one frame alone.
     first = source.frames[: 1 if source.thermography.table == "moving" else _REGISTRATION_FRAMES]
@@ -172,6 +176,25 @@ def camera_notices(source: Source, override: Overrides, *, report: Report) -> li
             "camera_artefacts",
             f"{counted(len(flags), 'camera artefact')} found, not corrected here: {listed(named)}.",
             "Compare with the effect camera_offset of the model; let the camera warm up before the test.",
+        )
+    ]
+
+
+def pixel_notices(counts: np.ndarray) -> list[Notice]:
+    """Return a notice for pixels that do not follow their neighbours in the first frames, (time, row, column)."""
+    flags = find_bad_pixels(counts)
+    found = int(np.count_nonzero(flags))
+    if not found:
+        return []
+    kinds = {"dead": DEAD, "off its neighbours": OFFSET, "noisy": NOISY}
+    named = ", ".join(
+        f"{int(np.count_nonzero(flags & flag))} {name}" for name, flag in kinds.items() if (flags & flag).any()
+    )
+    return [
+        Notice(
+            "bad_pixels",
+            f"{counted(found, 'pixel')} do not follow their neighbours ({named}); they count in their cells like others.",
+            "Have the camera replace them (a one-point correction, or its maker's service); single cells may be off by their error.",
         )
     ]
 
