@@ -103,27 +103,52 @@ def reduce_frames(
     times = check_frames(references, spans[0].registration.shape)
     correction = check_correction(correction_K, len(references))
     cycles = cycle_of(times, bounds)
-    if (cycles == NOT_NUMBERED).all():
-        raise FieldError(
-            f"no frame lies within a cycle: frames {times[0]} to {times[-1]}, cycles {bounds[0, 0]} to {bounds[-1, 1]}; "
-            "check the time zones and the clock offset"
-        )
+    _check_meeting(times, bounds, cycles)
     kept = None
     if checkpoint is not None:
         parameters = [override(frame) for frame in references]
         kept = Checkpoint(checkpoint, describe(references, parameters, correction, bounds, grid, spans, block_s))
     run = Reduction(references, times, correction, grid, spans, override, kept)
-    done = run.resume(override)
+    _reduce(run, cycles, block_s=block_s, scheduler=scheduler, progress=progress)
+    return run.dataset(bounds, cycles)
+
+
+def _reduce(
+    run: Reduction,
+    cycles: Array,
+    *,
+    block_s: float,
+    scheduler: str | None,
+    progress: Callable[[int], None] | None,
+) -> None:
+    """Send the frames that are not done through the pool, block by block; after a knock, cut the rest anew."""
+    done = run.resume()
     if progress is not None and done:
         progress(done)
     with open_pool(scheduler) as pool:
-        while done < len(references):
+        while done < len(run.references):
             blocks = cut_blocks(
-                references, times, cycles, run.spans, correction, override=override, block_s=block_s, first=done
+                run.references,
+                run.times,
+                cycles,
+                run.spans,
+                run.correction_K,
+                override=run.override,
+                block_s=block_s,
+                first=done,
             )
             cameras = [pool.share(camera) for camera in run.cameras]
             tasks = (
-                (b, (reduce_block, references[b.first : b.stop], b.parameters, cameras[b.span], run.keep_statistics))
+                (
+                    b,
+                    (
+                        reduce_block,
+                        run.references[b.first : b.stop],
+                        b.parameters,
+                        cameras[b.span],
+                        run.keep_statistics,
+                    ),
+                )
                 for b in blocks
             )
             results = in_order(pool, tasks)
@@ -135,7 +160,6 @@ def reduce_frames(
                 done = block.stop
                 if progress is not None:
                     progress(block.stop - block.first)
-    return run.dataset(bounds, cycles)
 
 
 def check_bounds(cycle_bounds: Array) -> Array:
@@ -179,6 +203,14 @@ def cycle_of(times: Array, bounds: Array) -> NDArray[np.int64]:
     index = np.searchsorted(bounds[:, 0], times, side="right") - 1
     inside = (index >= 0) & (times < bounds[np.maximum(index, 0), 1])
     return np.where(inside, index, NOT_NUMBERED)
+
+
+def _check_meeting(times: Array, bounds: Array, cycles: Array) -> None:
+    if (cycles == NOT_NUMBERED).all():
+        raise FieldError(
+            f"no frame lies within a cycle: frames {times[0]} to {times[-1]}, cycles {bounds[0, 0]} to {bounds[-1, 1]}; "
+            "check the time zones and the clock offset"
+        )
 
 
 def _check_spans(spans: Sequence[RegisteredFrom]) -> None:

@@ -64,10 +64,6 @@ class MovingResult:
     discs: Array
 
 
-_PER_CELL = ("count", "mean", "squares")
-_PER_FRAME = ("shift_mm", "u_mm", "discs")
-
-
 def reduce_moving_frames(
     references: Sequence[FrameReference],
     registration: Registration,
@@ -120,28 +116,22 @@ def reduce_moving_frames(
     cycles = cycle_of(times, bounds)
     spans = [RegisteredFrom(0, registration)]
     blocks = cut_blocks(references, times, cycles, spans, correction, override=override, block_s=block_s)
-    tracker = make_tracker(registration, grid, -axis, reach_mm=reach_mm)
-    samples = sample_points(registration, grid)
     kept = None
     if checkpoint is not None:
         parameters = [override(frame) for frame in references]
         described = describe(references, parameters, correction, bounds, grid, spans, block_s)
         kept = _Kept(Checkpoint(checkpoint, {**described, "axis": axis.tolist(), "reach_mm": reach_mm}))
-    results = kept.load(blocks) if kept is not None else []
-    if progress is not None and results:
-        progress(blocks[len(results) - 1].stop)
-    with open_pool(scheduler) as pool:
-        shared = pool.share((tracker, samples))
-        tasks = (
-            (b, (_reduce_shared, references[b.first : b.stop], b.parameters, shared, correction[b.first : b.stop]))
-            for b in blocks[len(results) :]
-        )
-        for block, result in in_order(pool, tasks):
-            results.append(result)
-            if kept is not None:
-                kept.save(blocks, results)
-            if progress is not None:
-                progress(block.stop - block.first)
+    tracker = make_tracker(registration, grid, -axis, reach_mm=reach_mm)
+    samples = sample_points(registration, grid)
+    results = _reduce(blocks, references, correction, (tracker, samples), kept, scheduler=scheduler, progress=progress)
+    return _together(blocks, results, references, times, cycles, bounds, axis, samples, registration, grid)
+
+
+def _together(
+    blocks: Sequence[Block], results: Sequence[MovingResult], references: Sequence[FrameReference], times: Array, cycles: Array,
+    bounds: Array, axis: Array, samples: Samples, registration: Registration, grid: PlanGrid,
+) -> xr.Dataset:  # fmt: skip
+    """Put the blocks together to one field per cycle and the places of the table."""
     discs = np.concatenate([result.discs for result in results])
     if not discs.any():
         raise FieldError(
@@ -171,6 +161,39 @@ def reduce_moving_frames(
         return json.dumps([f"{references[i].path.name}#{references[i].index}" for i in np.flatnonzero(chosen)])
 
     return fields.assign_attrs(frames_outside_cycles=named(cycles == NOT_NUMBERED), frames_unplaced=named(discs == 0))
+
+
+def _reduce(
+    blocks: Sequence[Block],
+    references: Sequence[FrameReference],
+    correction: Array,
+    shared: tuple[Tracker, Samples],
+    kept: _Kept | None,
+    *,
+    scheduler: str | None,
+    progress: Callable[[int], None] | None,
+) -> list[MovingResult]:
+    """Send the blocks that are not done through the pool."""
+    results = kept.load(blocks) if kept is not None else []
+    if progress is not None and results:
+        progress(blocks[len(results) - 1].stop)
+    with open_pool(scheduler) as pool:
+        known = pool.share(shared)
+        tasks = (
+            (b, (_reduce_shared, references[b.first : b.stop], b.parameters, known, correction[b.first : b.stop]))
+            for b in blocks[len(results) :]
+        )
+        for block, result in in_order(pool, tasks):
+            results.append(result)
+            if kept is not None:
+                kept.save(blocks, results)
+            if progress is not None:
+                progress(block.stop - block.first)
+    return results
+
+
+_PER_CELL = ("count", "mean", "squares")
+_PER_FRAME = ("shift_mm", "u_mm", "discs")
 
 
 class _Kept:

@@ -61,7 +61,7 @@ class Reduction:
         """Sums of counts are kept where there is a place for them."""
         return self.checkpoint is not None
 
-    def resume(self, override: Override) -> int:
+    def resume(self) -> int:
         """Take over what an earlier run has finished; return the first frame that is not done."""
         done = 0
         if self.checkpoint is None:
@@ -71,18 +71,18 @@ class Reduction:
         for finished in self.checkpoint.load():
             if finished.first_frame != done:
                 break
-            done = self._take_over(finished, override)
+            done = self._take_over(finished)
         self.saved_blocks = len(self.blocks)
         unfinished = self.checkpoint.load_open()
         if unfinished is not None and unfinished.first_frame == done:
-            done = self._take_over(unfinished, override)
+            done = self._take_over(unfinished)
             self.groups = list(unfinished.groups)
         self.kept_frames = done
         return done
 
-    def _take_over(self, found: Finished, override: Override) -> int:
+    def _take_over(self, found: Finished) -> int:
         for first, stop, cycle, span in found.blocks.tolist():
-            self.blocks.append(Block(first, stop, cycle, span, override(self.references[first])))
+            self.blocks.append(Block(first, stop, cycle, span, self.override(self.references[first])))
         self.stack.extend(found.stack)
         self.parts.append(found.part)
         self.shift_px[found.first_frame : found.stop_frame] = found.shift_px

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,6 +14,7 @@ from scipy import ndimage, sparse
 
 from thermography.plan import PlanGrid
 from thermography.registration import Registration
+from thermography.scheduling import THREADS
 
 Array = NDArray[Any]
 
@@ -120,7 +122,13 @@ def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float
     across, down = np.meshgrid(np.arange(columns + 1) - 0.5, np.arange(top, bottom + 2) - 0.5)
     corners = registration.to_plan(np.stack([across, down], axis=-1))
     discs = np.array([(disc.x_mm, disc.y_mm, disc.diameter_mm / 2) for disc in registration.masked])
-    cell, pixel, area, x, y = _parts(corners, discs, (grid.width_mm, grid.height_mm), grid.cell_size_mm, margin_px)
+    size, middle = (grid.width_mm, grid.height_mm), (bottom + 1 - top) // 2
+    with ThreadPoolExecutor(THREADS) as executor:
+        halves = executor.map(
+            lambda rows: _parts(corners, rows, discs, size, grid.cell_size_mm, margin_px),
+            [(0, middle), (middle, bottom + 1 - top)],
+        )
+        cell, pixel, area, x, y = (np.concatenate(both) for both in zip(*halves, strict=True))
     if len(cell) == 0:
         raise ValueError("no pixel of the frame lies on the plan; check the fiducials and the plan's size")
     cells = grid.shape[0] * grid.shape[1]
@@ -139,16 +147,16 @@ def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float
 
 @numba.njit(cache=True, nogil=True)
 def _parts(
-    corners: Array, discs: Array, size: tuple[float, float], cell_mm: float, margin_px: float
+    corners: Array, own_rows: tuple[int, int], discs: Array, size: tuple[float, float], cell_mm: float, margin_px: float
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Cut every unmasked pixel in parts and add them up by cell: cell, pixel, area (mm2) and mean place (mm) of every pair."""
-    rows, columns = corners.shape[0] - 1, corners.shape[1] - 1
+    """Cut every unmasked pixel of some rows in parts and add them up by cell: cell, pixel, area (mm2) and mean place (mm) of every pair."""
+    columns = corners.shape[1] - 1
     nx, ny = round(size[0] / cell_mm), round(size[1] / cell_mm)
-    most = 4 * rows * columns
+    most = 4 * (own_rows[1] - own_rows[0]) * columns
     cell, pixel = np.empty(most, np.int32), np.empty(most, np.int32)
     area, x_mean, y_mean = np.empty(most), np.empty(most), np.empty(most)
     count = 0
-    for row in range(rows):
+    for row in range(own_rows[0], own_rows[1]):
         for column in range(columns):
             ux, vx, px = _sides(
                 corners[row, column, 0],

@@ -198,52 +198,16 @@ def _locate(counts: Array, discs: Array, lens: Array, size: tuple[float, float],
             if left < 0 or top < 0 or left + 2 * half_c >= width or top + 2 * half_r >= height:
                 found[d, 2] = 0
                 break
-            normal = np.zeros((3, 3))
-            right = np.zeros(3)
-            inner_sum, inner_c, inner_r, inner_n, ring_n, squares = 0.0, 0.0, 0.0, 0, 0, 0.0
-            cut = max(radius - blur, 0.45 * radius)
-            for i in range(top, top + 2 * half_r + 1):
-                for j in range(left, left + 2 * half_c + 1):
-                    u, v = j - column, i - row
-                    px, py = (j11 * u - j01 * v) / det, (j00 * v - j10 * u) / det
-                    distance = px * px + py * py
-                    value = float(counts[i, j])
-                    if distance < cut * cut:
-                        inner_sum += value
-                        inner_c += u
-                        inner_r += v
-                        inner_n += 1
-                    elif rim * rim < distance < outer * outer:
-                        tx, ty = discs[d, 0] + px, discs[d, 1] + py
-                        if blur < tx < size[0] - blur and blur < ty < size[1] - blur:
-                            basis = (1.0, u, v)
-                            for a in range(3):
-                                right[a] += basis[a] * value
-                                for b in range(3):
-                                    normal[a, b] += basis[a] * basis[b]
-                            ring_n += 1
-                            squares += value * value
-            if ring_n < 12 or inner_n < 3:
+            patch = (left, top, left + 2 * half_c, top + 2 * half_r)
+            radii = (max(radius - blur, 0.45 * radius), rim, outer)
+            table = (discs[d, 0], discs[d, 1], size[0], size[1], blur)
+            plane, contrast, noise = _contrast(counts, patch, (column, row), (j00, j01, j10, j11), radii, table)
+            if not abs(contrast) > least * noise:
                 found[d, 2] = 0
                 break
-            plane = np.linalg.solve(normal, right)
-            noise = np.sqrt(np.maximum(squares - plane @ right, 0.0) / (ring_n - 3))
-            contrast = inner_sum / inner_n - (plane[0] + plane[1] * inner_c / inner_n + plane[2] * inner_r / inner_n)
-            if abs(contrast) <= least * noise:
-                found[d, 2] = 0
-                break
-            total, moment_c, moment_r = 0.0, 0.0, 0.0
-            for i in range(top, top + 2 * half_r + 1):
-                for j in range(left, left + 2 * half_c + 1):
-                    u, v = j - column, i - row
-                    px, py = (j11 * u - j01 * v) / det, (j00 * v - j10 * u) / det
-                    if px * px + py * py < rim * rim:
-                        part = (counts[i, j] - plane[0] - plane[1] * u - plane[2] * v) / contrast
-                        # The disc has one temperature; the table around it a slope. Coverage is taken against their difference.
-                        part /= 1 - (plane[1] * u + plane[2] * v) / contrast
-                        total += part
-                        moment_c += part * u
-                        moment_r += part * v
+            total, moment_c, moment_r = _moments(
+                counts, patch, (column, row), (j00, j01, j10, j11), rim, plane, contrast
+            )
             area = np.pi * radius * radius * abs(det)
             if not 0.6 * area < total < 1.4 * area:
                 found[d, 2] = 0
@@ -257,3 +221,70 @@ def _locate(counts: Array, discs: Array, lens: Array, size: tuple[float, float],
         if abs(column - c0) + abs(row - r0) > 2.5 * radius * np.sqrt(abs(det)):
             found[d, 2] = 0
     return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _contrast(
+    counts: Array,
+    patch: tuple[int, int, int, int],
+    centre: tuple[float, float],
+    jacobian: tuple[float, float, float, float],
+    radii: tuple[float, float, float],
+    table: tuple[float, float, float, float, float],
+) -> tuple[Array, float, float]:
+    """Plane through the ring around a disc, contrast of the disc to it, and noise of the ring; NaN where there are too few pixels."""
+    j00, j01, j10, j11 = jacobian
+    det = j00 * j11 - j01 * j10
+    cut, rim, outer = radii
+    x0, y0, width, height, blur = table
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    inner_sum, inner_c, inner_r, inner_n, ring_n, squares = 0.0, 0.0, 0.0, 0, 0, 0.0
+    for i in range(patch[1], patch[3] + 1):
+        for j in range(patch[0], patch[2] + 1):
+            u, v = j - centre[0], i - centre[1]
+            px, py = (j11 * u - j01 * v) / det, (j00 * v - j10 * u) / det
+            distance = px * px + py * py
+            value = float(counts[i, j])
+            if distance < cut * cut:
+                inner_sum, inner_c, inner_r, inner_n = inner_sum + value, inner_c + u, inner_r + v, inner_n + 1
+                continue
+            in_ring = rim * rim < distance < outer * outer
+            if in_ring and blur < x0 + px < width - blur and blur < y0 + py < height - blur:
+                basis = (1.0, u, v)
+                for a in range(3):
+                    right[a] += basis[a] * value
+                    for b in range(3):
+                        normal[a, b] += basis[a] * basis[b]
+                ring_n += 1
+                squares += value * value
+    if ring_n < 12 or inner_n < 3:
+        return right, np.nan, np.nan
+    plane = np.linalg.solve(normal, right)
+    noise = float(np.sqrt(max(squares - float(plane @ right), 0.0) / (ring_n - 3)))
+    return plane, inner_sum / inner_n - (plane[0] + (plane[1] * inner_c + plane[2] * inner_r) / inner_n), noise
+
+
+@numba.njit(cache=True, nogil=True)
+def _moments(
+    counts: Array,
+    patch: tuple[int, int, int, int],
+    centre: tuple[float, float],
+    jacobian: tuple[float, float, float, float],
+    rim: float,
+    plane: Array,
+    contrast: float,
+) -> tuple[float, float, float]:
+    """Sum and first moments of the coverage of a disc, 1 within it and 0 around it."""
+    j00, j01, j10, j11 = jacobian
+    det = j00 * j11 - j01 * j10
+    total, moment_c, moment_r = 0.0, 0.0, 0.0
+    for i in range(patch[1], patch[3] + 1):
+        for j in range(patch[0], patch[2] + 1):
+            u, v = j - centre[0], i - centre[1]
+            px, py = (j11 * u - j01 * v) / det, (j00 * v - j10 * u) / det
+            if px * px + py * py < rim * rim:
+                part = (counts[i, j] - plane[0] - plane[1] * u - plane[2] * v) / contrast
+                # The disc has one temperature; the table around it a slope. Coverage is taken against their difference.
+                part /= 1 - (plane[1] * u + plane[2] * v) / contrast
+                total, moment_c, moment_r = total + part, moment_c + part * u, moment_r + part * v
+    return total, moment_c, moment_r

@@ -56,14 +56,23 @@ def registration():
     return register(Scene(disc_K=-4.0).render(), DISCS, grid=GRID)
 
 
-def seconds(work: Callable[[], object], repeat: int = 5) -> tuple[float, float]:
-    """Smallest wall time and smallest processor time of a few calls, s; the machine may be shared."""
-    wall, cpu = np.inf, np.inf
-    for _ in range(repeat):
-        start, used = time.perf_counter(), time.process_time()
+def take_turns(*works: Callable[[], object], rounds: int = 9) -> np.ndarray:
+    """Wall times, (rounds, works), s: all take turns, because the machine may be shared; their ratios are compared round by round."""
+    for work in works:
         work()
-        wall, cpu = min(wall, time.perf_counter() - start), min(cpu, time.process_time() - used)
-    return wall, cpu
+    times = np.empty((rounds, len(works)))
+    for row in times:
+        for i, work in enumerate(works):
+            start = time.perf_counter()
+            work()
+            row[i] = time.perf_counter() - start
+    return times
+
+
+def median_of(values: np.ndarray) -> str:
+    """Median, with the quartiles over the rounds."""
+    low, middle, high = np.percentile(values, (25, 50, 75))
+    return f"{middle:.3g} ({low:.3g} to {high:.3g})"
 
 
 def flirpy_reads(path: Path, frames: int) -> None:
@@ -88,27 +97,21 @@ def test_still_table_file_to_cycle_fields(film: Path, registration) -> None:
         references, _ = index_frames([film])
         reduce_frames(references, registration, GRID, bounds)
 
-    two, _ = index_frames([film])
-    del two[2:]
+    references, _ = index_frames([film])
 
     def set_up() -> None:
-        reduce_frames(two, registration, GRID, bounds)
+        reduce_frames(references[:2], registration, GRID, bounds)
 
-    reduce()
-    ours, once = seconds(reduce), seconds(set_up)
-    peer = seconds(lambda: flirpy_reads(film, 60), 2)
-    limit = seconds(lambda: map_and_sum(film))
-    for clock, name in enumerate(("wall", "processor")):
-        rate = FRAMES / ours[clock]
-        streaming = (FRAMES - 2) / max(ours[clock] - once[clock], 1e-9)
-        flirpy, mapped = 60 / peer[clock], FRAMES / limit[clock]
-        print(
-            f"\nstill, {name} time: {rate:.0f} frames/s with set-up, {streaming:.0f} without (set-up {once[clock]:.3f} s); flirpy Seq "
-            f"{flirpy:.0f}: {rate / flirpy:.1f} x and {streaming / flirpy:.1f} x; summing the mapped file {mapped:.0f}: "
-            f"{rate / mapped:.2f} and {streaming / mapped:.2f}"
-        )
+    ours, start, peer, limit = take_turns(reduce, set_up, lambda: flirpy_reads(film, 60), lambda: map_and_sum(film)).T
+    print(
+        f"\nstill: {median_of(FRAMES / ours)} frames/s with index and set-up ({np.median(start):.3f} s); "
+        f"against flirpy Seq to temperature ({median_of(60 / peer)} frames/s): {median_of(peer / 60 * FRAMES / ours)} x; "
+        f"against summing the mapped file ({median_of(FRAMES / limit)} frames/s): {median_of(limit / ours)}, "
+        f"without set-up {median_of(limit / (ours - start))}"
+    )
 
 
+@pytest.mark.filterwarnings("ignore")
 def test_moving_table(film: Path, registration) -> None:
     references, _ = index_frames([film])
     bounds = bounds_of(FRAMES, 2)
@@ -116,10 +119,11 @@ def test_moving_table(film: Path, registration) -> None:
     def reduce() -> None:
         reduce_moving_frames(references, registration, GRID, bounds, direction=(-1, 0))
 
-    reduce()
-    wall, cpu = seconds(reduce, 3)
+    times = take_turns(reduce, lambda: flirpy_reads(film, 60), rounds=5)
+    ours, peer = times.T
     print(
-        f"\nmoving: {FRAMES / wall:.0f} frames/s; {FRAMES / cpu:.0f} per second of processor time (two cores: twice that at most)"
+        f"\nmoving: {median_of(FRAMES / ours)} frames/s; "
+        f"against flirpy Seq to temperature: {median_of(peer / 60 * FRAMES / ours)} x"
     )
 
 
@@ -141,14 +145,17 @@ def test_cold_file(film: Path, registration) -> None:
         drop()
         reduce_frames(references, registration, GRID, bounds_of(FRAMES, 2))
 
-    ours, reader = seconds(reduce, 3)[0], seconds(plain, 3)[0]
-    print(f"\ncold: {FRAMES / ours:.0f} frames/s, plain reader {FRAMES / reader:.0f}: {reader / ours:.2f}")
+    ours, reader = take_turns(reduce, plain).T
+    print(
+        f"\ncold: {median_of(FRAMES / ours)} frames/s, plain reader {median_of(FRAMES / reader)}: "
+        f"{median_of(reader / ours)} of its speed"
+    )
 
 
 def test_recalibration_of_100_cycles(film: Path, registration, tmp_path: Path) -> None:
     references, _ = index_frames([film])
     reduce_frames(references, registration, GRID, bounds_of(FRAMES, 100), checkpoint=tmp_path)
-    wall, cpu = seconds(
+    again, whole = take_turns(
         lambda: recalibrate(
             tmp_path,
             [RegisteredFrom(0, registration)],
@@ -156,9 +163,13 @@ def test_recalibration_of_100_cycles(film: Path, registration, tmp_path: Path) -
             100,
             lambda parameters: override(parameters, emissivity=0.9),
         ),
-        3,
+        lambda: reduce_frames(references, registration, GRID, bounds_of(FRAMES, 100)),
+        rounds=5,
+    ).T
+    print(
+        f"\nrecalibrating 100 cycles: {median_of(again)} s, reducing their frames anew ({FRAMES // 100} per cycle) {median_of(whole)} s: "
+        f"{median_of(whole / again)} x"
     )
-    print(f"\nrecalibrating 100 cycles: {wall:.2f} s, {cpu:.2f} s of processor time")
 
 
 PEAK = """
@@ -198,7 +209,12 @@ def test_overhead_of_a_cluster(film: Path, registration) -> None:
         n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
     ) as cluster:
         address = cluster.scheduler_address
-        clustered = seconds(lambda: reduce_frames(references, registration, GRID, bounds, scheduler=address), 3)[0]
-    alone = seconds(lambda: reduce_frames(references, registration, GRID, bounds), 3)[0]
-    more = (clustered - alone) / FRAMES * 1000
-    print(f"\ncluster of two workers: {clustered:.2f} s, threads {alone:.2f} s: {more:.2f} s per 1000 frames more")
+        clustered, alone = take_turns(
+            lambda: reduce_frames(references, registration, GRID, bounds, scheduler=address),
+            lambda: reduce_frames(references, registration, GRID, bounds),
+            rounds=5,
+        ).T
+    print(
+        f"\ncluster of two workers: {median_of(clustered)} s, threads {median_of(alone)} s: "
+        f"{median_of((clustered - alone) / FRAMES * 1000)} s per 1000 frames more"
+    )
