@@ -20,6 +20,7 @@ from interferometry.compensation import (
     followed_factor_um,
 )
 from interferometry.iso230 import Iso230Budget
+from thermography.uncertainty import InputUncertainty
 
 Array = NDArray[np.float64]
 _NO_LOG = "log air temperature, pressure and humidity, and name the file as [interferometry] environment"
@@ -138,8 +139,8 @@ def _redone(redone: xr.Dataset, stated: bool, seen: SeenMaterial | None) -> Noti
 def see_material(fields: xr.Dataset, axis: AxisGeometry, deviations: xr.Dataset) -> SeenMaterial:
     """Return the mean temperature that the camera saw between axis position 0 and each target, at each reading's time.
 
-    Readings before the first or after the last frame take that frame. The camera's uncertainty is taken as common to the whole
-    axis, so that it does not average out along it.
+    Readings before the first or after the last frame take that frame. The camera's accuracy (the data sheet's +-2 K) is the same
+    error in every frame and place: it does not average out along the axis, but it makes no drift.
     """
     position = deviations["position"].values
     line = MeasuredLine(fields, axis, position)
@@ -149,7 +150,8 @@ def see_material(fields: xr.Dataset, axis: AxisGeometry, deviations: xr.Dataset)
     mean = np.where(position == 0.0, at_target, line.integrate(samples) / length)
     at_readings = interpolate_series(deviations["time"].values, fields["time"].values.astype("datetime64[ns]"), mean)
     u = line.sample(fields["temperature_u"].values.astype(float))
-    return SeenMaterial(deviations["deviation"].copy(data=at_readings), float(np.nanmean(u)))
+    u_K = float(np.hypot(np.nanmean(u), InputUncertainty().camera_offset_K))
+    return SeenMaterial(deviations["deviation"].copy(data=at_readings), u_K)
 
 
 def correct_dead_path(

@@ -81,13 +81,13 @@ def fit_joint(
         unknown = sorted(set(components) - set(COMPONENTS))
         if unknown:
             raise DriftDataError(f"components {unknown} are not known; choose from {', '.join(COMPONENTS)}")
-        return _fit(readings, cells, cell, tuple(components), robust, order, None)
-    joint = _fit(readings, cells, cell, BASE_COMPONENTS, robust, order, None)
+        return _fit(readings, cells, cell, tuple(components), robust, order)
+    joint = _fit(readings, cells, cell, BASE_COMPONENTS, robust, order)
     wanted = _asked_for(joint)
     if not wanted:
         return joint
-    start = np.concatenate([joint.fit.system.ratios, np.full(len(wanted), joint.fit.system.ratios.min() * 1e-2)])
-    return _fit(readings, cells, cell, (*BASE_COMPONENTS, *wanted), robust, joint.fit.system.order, start)
+    # What was missing has bent the others' variances and order; they are searched anew.
+    return _fit(readings, cells, cell, (*BASE_COMPONENTS, *wanted), robust, order)
 
 
 def _check_readings(deviations: xr.Dataset, readings: xr.Dataset) -> None:
@@ -165,7 +165,6 @@ def _fit(
     components: tuple[str, ...],
     robust: bool,
     order: Order | None,
-    start: Array | None,
 ) -> JointFit:
     sign = readings["sign"].values.astype(float)
     loadings = loadings_of(sign, readings["position"].values, components, span_mm(readings))
@@ -179,7 +178,6 @@ def _fit(
         order=order,
         robust=robust,
         settling=True,
-        start=start,
     )
     return JointFit(readings, cells, cell, components, fit)
 

@@ -38,6 +38,7 @@ __all__ = [
 
 #: Search limits of log10(drift variance ratio): from a drift that nobody can see to one that hides everything else.
 _LOG_RATIO_LIMITS = (-14.0, 4.0)
+_FIRST_STEP = 1.5
 #: A reading whose deletion residual exceeds this many standard deviations is given a larger variance (robust fit).
 _OUTLIER_LIMIT = 3.0
 #: A whitened column of which less than this share is not explained by the others counts as dependent.
@@ -198,14 +199,16 @@ def _maximise(system: DriftSystem, response: Array, design: Array, start: Array 
         return _solve(replace(system, ratios=ratios), problem)
 
     guess = np.zeros(components) if start is None else np.clip(np.log10(np.maximum(start, 1e-300)) - unit, low, high)
-    simplex = np.vstack([guess, guess + 1.5 * np.eye(components)])
+    # Steps that would leave the limits go the other way: clipped, they would leave the simplex without volume.
+    step = np.where(guess + _FIRST_STEP > high, -_FIRST_STEP, _FIRST_STEP)
+    simplex = np.vstack([guess, guess + np.diag(step)])
     found = optimize.minimize(
         lambda log_ratio: -fitted(log_ratio).log_likelihood,
         guess,
         method="Nelder-Mead",
         bounds=[_LOG_RATIO_LIMITS] * components,
         options={
-            "initial_simplex": np.clip(simplex, low, high),
+            "initial_simplex": simplex,
             "xatol": 0.03,
             "fatol": 1e-3,
             "maxfev": 120 * components,

@@ -108,7 +108,8 @@ def test_the_camera_gives_the_mean_temperature_between_zero_and_the_target(readi
     minutes = (readings["time"].values - START) / np.timedelta64(1, "m")
     expected = 20.0 + 0.01 * readings["position"].values / 2 + 0.01 * minutes
     np.testing.assert_allclose(seen.temperature.values, expected, atol=1e-6)
-    assert seen.u_K == pytest.approx(0.7)
+    # Noise and the data sheet's +-2 K, taken as a rectangle.
+    assert seen.u_K == pytest.approx(np.hypot(0.7, 2 / 3**0.5))
 
 
 def test_a_campaign_with_the_camera_as_thermometer(campaign_folder: Path, results_folder: Path) -> None:
@@ -131,5 +132,5 @@ def test_a_campaign_with_the_camera_as_thermometer(campaign_folder: Path, result
     np.testing.assert_allclose(found.dataset["material_u"], source.deviations["material_u"])
     plain = stages.evaluate_interferometry(recorded)
     # The camera's temperature enters E and A along the axis, but cancels where both directions meet at one place.
-    assert found.parts["iso230"]["E_um"]["u"] > 1.5 * plain.parts["iso230"]["E_um"]["u"]
+    assert found.parts["iso230"]["E_um"]["u"] > 3 * plain.parts["iso230"]["E_um"]["u"]
     assert found.parts["iso230"]["B_um"]["u"] == pytest.approx(plain.parts["iso230"]["B_um"]["u"], rel=0.2)

@@ -131,6 +131,16 @@ def test_a_wandering_reversal_is_found_and_tracked(rng: np.random.Generator) -> 
     assert float(history["as_read_u"].mean()) == pytest.approx(0.566, rel=0.05)
 
 
+def test_a_strong_drift_of_the_reversal_leaves_the_noise_what_it_is(rng: np.random.Generator) -> None:
+    deviations, truth = simulate(rng, cycles=24, kind="none")
+    growth = 1.0 - np.exp(-truth.seconds / 2500.0)
+    deviations["deviation"].values[:] += 10.0 * growth * np.array([1.0, -1.0])[None, :, None]
+    estimated = estimate_drift(deviations)
+    # Without its own component the others wander from reading to reading after it; they have to settle again once it has one.
+    assert float(estimated["sigma"]) == pytest.approx(SIGMA_UM, rel=0.06)
+    assert estimated.attrs["order"] == 2
+
+
 def test_a_reversal_that_stays_is_reported_constant(rng: np.random.Generator) -> None:
     deviations, _ = simulate(rng, cycles=30)
     history = track_reversal(deviations, estimate_drift(deviations))
