@@ -49,7 +49,7 @@ class FffSource:
 
     def __init__(self, file: BinaryIO, path: Path, segments: Segments) -> None:
         self.file, self.path, self.segments = file, path, segments
-        self.size = sum(length for _, length in segments)
+        self.size = segments[0][1] if len(segments) == 1 else sum(length for _, length in segments)
 
     def read(self, offset: int, length: int) -> bytes:
         """Return up to `length` bytes from `offset` of the record; fewer where it ends."""
@@ -86,11 +86,22 @@ class FffSource:
 
 @dataclass(frozen=True)
 class Directory:
-    """The records of one FFF: type -> (offset, length, checksum), the end of the last one, and the declared length (0: none)."""
+    """The records of one FFF, type -> (offset, length), the directory as read, the end of the last, the declared length (0: none)."""
 
-    records: Mapping[int, tuple[int, int, int]]
+    records: Mapping[int, tuple[int, int]]
+    order: str
+    table: bytes
     end: int
     declared_length: int
+
+    @property
+    def checksums(self) -> dict[int, int]:
+        """The checksum that the directory states for every type of record, 0 for none."""
+        stated: dict[int, int] = {}
+        for kind, _, _, _, _, length, _, _, checksum in struct.iter_unpack(self.order + "2H7I", self.table):
+            if kind and length:
+                stated.setdefault(kind, checksum)
+        return stated
 
 
 def plausible_header(data: bytes) -> bool:
@@ -128,19 +139,27 @@ def read_directory(source: FffSource) -> Directory:
         raise source.error(0x18, f"a directory after the header (offset >= {HEADER_SIZE})", str(offset))
     end = offset + slots * ENTRY_SIZE
     table = head[offset:end] if end <= len(head) else source.take(offset, slots * ENTRY_SIZE, "a directory")
-    records, last = _records(order, table)
+    # All frames of a sequence lie alike; only the checksums of their records differ.
+    layout = int.from_bytes(table, "little") & _without_checksums(slots)
+    records, last = _records(order, layout.to_bytes(len(table), "little"))
     (declared,) = struct.unpack_from(order + "I", head, 0x34)
-    return Directory(records, max(end, last), declared)
+    return Directory(records, order, table, max(end, last), declared)
 
 
 @lru_cache(maxsize=64)
-def _records(order: str, table: bytes) -> tuple[Mapping[int, tuple[int, int, int]], int]:
-    """Return the records of a directory and the end of the last one; most sequences repeat one directory, hence the cache."""
-    records: dict[int, tuple[int, int, int]] = {}
+def _without_checksums(slots: int) -> int:
+    """A mask of all bytes of a directory but the last four of every entry."""
+    return int.from_bytes((b"\xff" * (ENTRY_SIZE - 4) + bytes(4)) * slots, "little")
+
+
+@lru_cache(maxsize=64)
+def _records(order: str, table: bytes) -> tuple[Mapping[int, tuple[int, int]], int]:
+    """Return the records of a directory and the end of the last one; most sequences repeat one layout, hence the cache."""
+    records: dict[int, tuple[int, int]] = {}
     last = 0
-    for kind, _, _, _, offset, length, _, _, checksum in struct.iter_unpack(order + "2H7I", table):
+    for kind, _, _, _, offset, length, *_ in struct.iter_unpack(order + "2H7I", table):
         if kind and length:
-            records.setdefault(kind, (offset, length, checksum))
+            records.setdefault(kind, (offset, length))
             last = max(last, offset + length)
     return MappingProxyType(records), last
 
@@ -158,16 +177,16 @@ def find_record(source: FffSource, directory: Directory, kind: int, name: str) -
     if kind not in directory.records:
         found = ", ".join(f"0x{k:02X}" for k in directory.records) or "none"
         raise source.error(HEADER_SIZE, f"{name} (type 0x{kind:02X}) in the directory", f"types {found}")
-    offset, length, _ = directory.records[kind]
-    return offset, length
+    return directory.records[kind]
 
 
 def damaged_records(source: FffSource, directory: Directory) -> list[int]:
     """Return the types of the records that do not have the CRC-32 which their directory entry states (0 states none)."""
+    stated = directory.checksums
     return [
         kind
-        for kind, (offset, length, checksum) in directory.records.items()
-        if checksum and zlib.crc32(source.read(offset, length)) != checksum
+        for kind, place in directory.records.items()
+        if stated[kind] and zlib.crc32(source.read(*place)) != stated[kind]
     ]
 
 
