@@ -32,7 +32,7 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
     Returns
     -------
     list of (str, str)
-        Name and finding per part of the drift, for the terminal.
+        Place and verdict of every source that either session shows, for the terminal.
 
     Raises
     ------
@@ -61,7 +61,11 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
             folder / "report.html",
             render_report(_json(folder, "results"), _json(folder, "provenance"), datasets[at], joint=joint),
         )
-    return rows
+    if not table:
+        return [("sources", "neither session shows one")]
+    return [
+        (f"x, y {place} mm, {part}", f"{verdict}; {first}; {second}") for place, part, first, second, verdict in table
+    ]
 
 
 def source_row(one: Agreement, titles: Sequence[str]) -> list[str]:

@@ -94,9 +94,10 @@ def _beside(maps: xr.Dataset, found: Found) -> list[str]:
             f"With it taken as given, {join([named[k] for k in np.flatnonzero(adds)])} goes with what is left."
         )
     if alike.any():
-        verb = "passes" if alike.sum() == 1 else "pass"
+        verb, adding = ("passes", "adds") if alike.sum() == 1 else ("pass", "add")
         sentences.append(
-            f"By itself {join([named[k] for k in np.flatnonzero(alike)])} {verb} too, but adds nothing: it may only warm with it."
+            f"By themselves {join([named[k] for k in np.flatnonzero(alike)])} {verb} too, but {adding} nothing to it: these places may "
+            "only warm with it."
         )
     return sentences
 
@@ -105,7 +106,8 @@ def _worth(found: Found, joint: Mapping[str, Any] | None, duty: xr.Dataset | Non
     """Whether this is a cause: where two sessions agree, or where the duty was randomised."""
     causes = [] if duty is None else [str(name) for name in duty["source"].values[(duty["p_value"] <= LEVEL).values]]
     if causes:
-        return f"The duty was switched at random, and by that {join(causes)} is a cause of drift (below)."
+        verb = "is a cause" if len(causes) == 1 else "are causes"
+        return f"Loads were switched at random, which shows that {join(causes)} {verb} of drift (below)."
     if joint is not None and joint["causes"]:
         return f"It is a cause where {joint['other']} agrees: {join(joint['causes'])} (below)."
     if found.verdict != "attributable":
