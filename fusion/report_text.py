@@ -88,6 +88,7 @@ def describe(
         "field_uncertainty": _field_uncertainty(fields),
         "positions": _position_rows(deviations),
         "neighbours_text": _neighbours_text(results),
+        "comparison": _comparison_rows(deviations),
         "anomaly_advice": [wording.CAUSES[item["cause"]][1] for item in anomalies],
         "evidence": [evidence(item["evidence"]) for item in anomalies],
         "correlation": correlation,
@@ -234,6 +235,24 @@ def _position_rows(deviations: xr.Dataset | None) -> list[list[str]]:
         row += [f"{float(conventional['standard_deviation'].sel(one)):.2f}" for one in at]
         rows.append(row)
     return rows
+
+
+def _comparison_rows(deviations: xr.Dataset | None) -> list[list[str]]:
+    """Conventional, differenced, their ratio and the joint estimate's own standard deviation, per position and direction."""
+    if deviations is None:
+        return []
+    table = group(deviations, "comparison")
+    return [
+        [
+            str(link),
+            *(
+                f"{float(table[name].sel(link=link, direction=direction)):.2f}"
+                for direction in ("positive", "negative")
+                for name in ("conventional", "differenced", "ratio", "joint")
+            ),
+        ]
+        for link in table["link"].values
+    ]
 
 
 def _neighbours_text(results: Mapping[str, Any]) -> str:
