@@ -8,6 +8,8 @@ from fusion.readings import ENVIRONMENT, Array, Readings, Series
 
 #: Instants per cycle at which an event is tried: a knock may come at any target, and is dated to a quarter of a cycle.
 _EVENTS_PER_CYCLE = 4
+#: More instants than this are thinned, so that a long campaign takes no longer per reading; a closer look dates an event all the same.
+_MOST_INSTANTS = 240
 #: An event needs this many cycles on either side, or it cannot be told from an outlier.
 _EVENT_MARGIN_CYCLES = 2
 #: A jump in a log or in the field counts as one where it exceeds its neighbours' changes this many times (robust sigma).
@@ -22,19 +24,25 @@ def cycle_starts(readings: Readings) -> Array:
 
 
 def event_instants(readings: Readings) -> Array:
-    """Instants at which an event is tried: quarters of every cycle that has enough cycles on both sides."""
+    """Instants at which an event is tried: quarters of every cycle that has enough cycles on both sides, fewer in a long campaign."""
     starts = cycle_starts(readings)
     margin = _EVENT_MARGIN_CYCLES
     if starts.size <= 2 * margin + 1:
         return np.empty(0)
     inner = starts[margin : starts.size - margin + 1]
     parts = np.arange(_EVENTS_PER_CYCLE) / _EVENTS_PER_CYCLE
-    return (inner[:-1, None] + np.diff(inner)[:, None] * parts).ravel()
+    return np.asarray((inner[:-1, None] + np.diff(inner)[:, None] * parts).ravel()[:: _stride(starts.size)])
+
+
+def _stride(cycles: int) -> int:
+    """Every how many quarters of a cycle an event is tried."""
+    return max(1, int(np.ceil(_EVENTS_PER_CYCLE * cycles / _MOST_INSTANTS)))
 
 
 def instants_near(readings: Readings, instant: float) -> Array:
-    """The gaps between readings within a quarter of a cycle of an instant: an event can be dated no better than by its neighbours."""
-    reach = float(np.median(np.diff(cycle_starts(readings)))) / _EVENTS_PER_CYCLE
+    """The gaps between readings up to the next instants that were tried: an event can be dated no better than by its neighbours."""
+    starts = cycle_starts(readings)
+    reach = float(np.median(np.diff(starts))) / _EVENTS_PER_CYCLE * _stride(starts.size)
     return np.unique(readings.seconds[np.abs(readings.seconds - instant) <= reach])
 
 

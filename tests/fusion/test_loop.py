@@ -10,6 +10,7 @@ import pytest
 
 from fusion.alignment import AxisGeometry, align
 from fusion.effects import Effect, library
+from fusion.episodes import event_instants, instants_near
 from fusion.loop import LoopError, close_loop, set_aside_sites
 from fusion.members import Member, Prior
 from fusion.readings import Readings, ReadingsError, Series, read_fused
@@ -254,3 +255,15 @@ def test_what_could_be_found_is_found_at_that_size():
 
 def _few(*names: str) -> dict[str, Effect]:
     return {name: library()[name] for name in (*DECLARED, *names)}
+
+
+def test_a_long_campaign_has_no_more_candidates_than_a_long_day():
+    """What is tried must not grow with the readings, or the search would grow with their square."""
+    long, short = readings_of(test={"cycles": 150}), readings_of()
+    assert event_instants(short).size == 220  # four in each of the 55 cycles with enough cycles on both sides
+    assert 120 < event_instants(long).size <= 240
+    steps = np.diff(event_instants(long))
+    near = instants_near(long, float(event_instants(long)[40]))
+    # A closer look reaches from one tried instant to the next.
+    assert np.ptp(near) == pytest.approx(2.0 * np.median(steps), rel=0.1)
+    assert len(list(library()["periodic_disturbance"].members(long, {}, None))) <= 600
