@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,7 +21,7 @@ from thermography.plan import PlanGrid
 from thermography.radiometry import calibrate
 from thermography.refinement import image_shift, shifted
 from thermography.registration import Registration
-from thermography.resampling import plan_weights
+from thermography.resampling import plan_weights, plan_window
 
 Array = NDArray[Any]
 
@@ -42,6 +43,7 @@ class Reduction:
     override: Override
     checkpoint: Checkpoint | None = None
     cameras: list[Camera] = field(default_factory=list)
+    covariances: list[Array] = field(default_factory=list)
     parts: list[CyclePart] = field(default_factory=list)
     blocks: list[Block] = field(default_factory=list)
     stack: list[NDArray[np.float32]] = field(default_factory=list)
@@ -54,7 +56,8 @@ class Reduction:
 
     def __post_init__(self) -> None:
         self.shift_px = np.full(len(self.references), np.nan)
-        self.cameras = [self._camera(span.registration) for span in self.spans]
+        prepared = [self._prepare(span.registration) for span in self.spans]
+        self.cameras, self.covariances = [one for one, _ in prepared], [other for _, other in prepared]
 
     @property
     def keep_statistics(self) -> bool:
@@ -90,9 +93,14 @@ class Reduction:
         self.shaken.update(found.shaken)
         return found.stop_frame
 
-    def _camera(self, registration: Registration) -> Camera:
-        weights = plan_weights(registration, self.grid)
-        return Camera(weights, watch(registration, self.grid, weights.window))
+    def _prepare(self, registration: Registration) -> tuple[Camera, Array]:
+        """What the workers need of a registration, and the covariance of the place of every cell."""
+        # Side by side: the weights are loops over pixels, the others many small steps.
+        with ThreadPoolExecutor(1) as executor:
+            looks = executor.submit(watch, registration, self.grid, plan_window(registration, self.grid))
+            covariance = executor.submit(position_covariance, registration, self.grid)
+            camera = Camera(plan_weights(registration, self.grid), looks.result())
+        return camera, covariance.result()
 
     def renew(self, block: Block, result: BlockResult) -> bool:
         """Look for a knock in a block; register anew from its first moved frame and return True, so that the block is cut again."""
@@ -138,7 +146,9 @@ class Reduction:
         if self.checkpoint is not None:
             self.checkpoint.note_knock(i, span, shift.tolist())
         self.spans.insert(span + 1, RegisteredFrom(i, registration, (float(shift[0]), float(shift[1]))))
-        self.cameras.insert(span + 1, self._camera(registration))
+        camera, covariance = self._prepare(registration)
+        self.cameras.insert(span + 1, camera)
+        self.covariances.insert(span + 1, covariance)
         self.baseline_px = np.zeros(2)
 
     def _same_place(self, j: int, i: int, span: int, shift: Array) -> bool:
@@ -196,7 +206,6 @@ class Reduction:
     def dataset(self, bounds: Array, cycles: Array) -> xr.Dataset:
         """Put everything together."""
         self.close()
-        covariances = [position_covariance(span.registration, self.grid) for span in self.spans]
         coverages = [camera.weights.coverage for camera in self.cameras]
         blocks = self.blocks
         middles = [self.times[b.first] + (self.times[b.first : b.stop] - self.times[b.first]).mean() for b in blocks]
@@ -219,7 +228,7 @@ class Reduction:
             self.parts,
             len(bounds),
             self.grid,
-            covariances,
+            self.covariances,
             coverages,
             frames=frames,
             frame_coordinates={"time": np.array(middles)},

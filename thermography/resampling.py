@@ -86,8 +86,27 @@ class PlanWeights:
 
 
 def _row_squares(matrix: sparse.csr_array) -> Array:
-    rows = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
-    return np.bincount(rows, matrix.data**2, matrix.shape[0])
+    squares: Array = sparse.csr_array((matrix.data**2, matrix.indices, matrix.indptr), shape=matrix.shape) @ np.ones(
+        matrix.shape[1]
+    )
+    return squares
+
+
+def plan_window(registration: Registration, grid: PlanGrid) -> tuple[slice, slice]:
+    """Rows and columns of the sensor that hold the plan: whole rows, for they lie together in the file.
+
+    Raises
+    ------
+    ValueError
+        No pixel lies on the plan.
+    """
+    outline = registration.to_sensor(_outline(grid))
+    rows, columns = registration.shape
+    top = max(int(np.floor(outline[:, 1].min())), 0)
+    bottom = min(int(np.ceil(outline[:, 1].max())), rows - 1)
+    if bottom < top:
+        raise ValueError("no pixel of the frame lies on the plan; check the fiducials and the plan's size")
+    return slice(top, bottom + 1), slice(0, columns)
 
 
 def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float = 2.0) -> PlanWeights:
@@ -111,14 +130,8 @@ def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float
     ValueError
         No pixel lies on the plan.
     """
-    outline = registration.to_sensor(_outline(grid))
-    rows, columns = registration.shape
-    top = max(int(np.floor(outline[:, 1].min())), 0)
-    bottom = min(int(np.ceil(outline[:, 1].max())), rows - 1)
-    if bottom < top:
-        raise ValueError("no pixel of the frame lies on the plan; check the fiducials and the plan's size")
-    # Whole rows: they lie together in the file.
-    window = (slice(top, bottom + 1), slice(0, columns))
+    window = plan_window(registration, grid)
+    top, bottom, columns = window[0].start, window[0].stop - 1, window[1].stop
     across, down = np.meshgrid(np.arange(columns + 1) - 0.5, np.arange(top, bottom + 2) - 0.5)
     corners = registration.to_plan(np.stack([across, down], axis=-1))
     discs = np.array([(disc.x_mm, disc.y_mm, disc.diameter_mm / 2) for disc in registration.masked])
