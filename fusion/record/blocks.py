@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import xarray as xr
@@ -251,8 +252,5 @@ def chained_blocks(seconds: Array, drivers: list[Array]) -> NDArray[np.int64]:
     # A load that hardly ever rests leaves parts too long to tell anything from their few predictions.
     edges = [float(seconds[0]), *bounds, float(seconds[-1])]
     longest = (seconds[-1] - seconds[0]) / _LEAST_CHAINED
-    cuts = [
-        np.linspace(first, last, int(np.ceil((last - first) / longest)) + 1)[1:]
-        for first, last in zip(edges[:-1], edges[1:], strict=True)
-    ]
+    cuts = [np.linspace(first, last, int(np.ceil((last - first) / longest)) + 1)[1:] for first, last in pairwise(edges)]
     return np.searchsorted(np.concatenate(cuts)[:-1], seconds, side="right").astype(np.int64)

@@ -17,7 +17,6 @@ from fusion.record.prediction import Prediction, channel_rmse
 from fusion.record.remainder import RecordRemainder, examine
 from fusion.record.search import (
     MOST_EFFECTS,
-    WORSE,
     Chained,
     Progress,
     Round,
@@ -202,7 +201,7 @@ def close_record(
     terms = declare(declared, record)
     before, held_out = seal(record)
     found = search(record, before, terms, seed=seed, effects=effects, progress=progress)
-    found, predictions, errors = _open_seal(found)
+    found, predictions, errors = open_seal(found)
     progress(MOST_EFFECTS, MOST_EFFECTS, "examining what is left")
     whole = fit_record(record, found.terms, np.ones_like(before))
     remainder = examine(whole, errors[-1], np.random.default_rng(seed))
@@ -212,20 +211,23 @@ def close_record(
     return RecordResult(found, ~before, held_out, predictions, errors, persistence, whole, remainder, chained)
 
 
-def _open_seal(found: Search) -> tuple[Search, list[Prediction], Array]:
-    """Errors on the sealed part of every model in turn; an effect that makes them larger is withdrawn."""
+def open_seal(found: Search) -> tuple[Search, list[Prediction], Array]:
+    """Errors on the sealed part of every model in turn; an effect that does not make them smaller is withdrawn.
+
+    Nothing is re-zeroed at the seal, so an event before it has to prove itself there like any other effect.
+    """
     predictions = found.predictions()
     errors = np.array([channel_rmse(found.record, one.predicted, ~found.train) for one in predictions])
     mean = np.nanmean(errors, axis=1)
     for k, (score, _) in enumerate(found.entries):
-        if mean[k + 1] > WORSE * mean[k]:
+        if mean[k + 1] >= mean[k]:
             reason = (
-                f"withdrawn: it was found before the seal (p = {score.family_wise_p:.2g}), but the error on the sealed part rose from "
-                f"{mean[k]:.3g} to {mean[k + 1]:.3g} um with it"
+                f"withdrawn: it was found before the seal (p = {score.family_wise_p:.2g}), but the sealed part is predicted no better with "
+                f"it ({mean[k]:.3g} to {mean[k + 1]:.3g} um)"
             )
             kept = [j for j in range(len(found.entries)) if j != k]
             terms = (*found.terms[: found.declared], *(found.terms[found.declared + j] for j in kept))
             entries = tuple(found.entries[j] for j in kept)
             blocked = {**found.blocked, score.name: reason}
-            return _open_seal(replace(found, terms=terms, entries=entries, blocked=blocked))
+            return open_seal(replace(found, terms=terms, entries=entries, blocked=blocked))
     return found, predictions, errors

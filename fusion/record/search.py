@@ -30,8 +30,6 @@ SEALED_SHARE = 0.2
 #: does, so less chance is left to it than along an axis; an event, which no later part can confirm, is left less still.
 ENTRY_LEVEL, EVENT_LEVEL = 0.01, 0.001
 MOST_EFFECTS = 4
-#: An effect is withdrawn where the error on the sealed part grows by more than this factor with it.
-WORSE = 1.05
 _SUPERFLUOUS_GAIN = 2.0
 #: An effect must bring the forward-chained error down to this share of what it was, or it only follows chance.
 _EARNED = 0.98

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fusion.record.blocks import reduce_record
-from fusion.record.prediction import channel_rmse
+from fusion.record.loop import open_seal
 from fusion.record.search import declare, seal, search
 from fusion.twin.recipe import EffectRecipe
 from tests.fusion.record_tables import twin_table
@@ -36,11 +36,10 @@ def test_rates_of_names_on_records(capsys: pytest.CaptureFixture[str]) -> None:
         for seed in range(FIRST_SEED, FIRST_SEED + RUNS):
             record = reduce_record(twin_table(*([effect] if effect else []), seed=seed))
             train, _ = seal(record)
-            found = search(record, train, declare(["quasi_static"], record))
+            found, _, sealed = open_seal(search(record, train, declare(["quasi_static"], record)))
             names[tuple(score.name for score, _ in found.entries)] += 1
-            errors = [channel_rmse(record, one.predicted, ~train).mean() for one in found.predictions()]
-            before.append(errors[0])
-            after.append(errors[-1])
+            before.append(sealed[0].mean())
+            after.append(sealed[-1].mean())
         right = sum(count for found_names, count in names.items() if found_names == ((kind,) if effect else ()))
         wrong[kind] = sum(count for found_names, count in names.items() if set(found_names) - {kind})
         rows.append(
