@@ -19,7 +19,7 @@ AVERAGING_LIMIT_K = 0.5e-3
 #: Frames read and added at once, so that they are still in the cache when they are added and looked at.
 CHUNK_FRAMES = 8
 #: Pixels per tile, whose sums stay in the first cache while the frames of a chunk are added to them.
-TILE_PX = 4096
+TILE_PX = 2048
 #: Steps below this from the first frame are squared and added in 32 bits, ...
 NEAR = 2048
 #: ... which hold them, and the sums of all steps, for as many frames as this.
