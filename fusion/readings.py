@@ -152,7 +152,10 @@ class Readings:
     def gaps(self) -> list[Gap]:
         """Stretches without a sample, five times the usual interval and more, in what was logged while readings were taken."""
         found = []
+        logged = {*self.drivers, *ENVIRONMENT}
         for name, series in self.series.items():
+            if name not in logged:
+                continue
             steps = np.diff(series.seconds)
             if steps.size < 3:
                 continue
