@@ -40,9 +40,6 @@ THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "st
 #: amounts that follow the motion, more scatter in one direction, a slow walk in one direction (beside its parameter). Plain scatter
 #: exceeds one of them by chance in about one case of twenty.
 APPROACH_NATS = {"along": 2.1, "one_direction": 4.0, "slow": 2.0}
-#: What a slow walk in both directions must gain beside its parameter before it counts as likely as scatter (nats): its size is searched
-#: on a grid, so that plain scatter gains a little from it as well.
-SLOW_NATS = 1.0
 #: A local temperature of which at least this share follows the exponentials of one warm-up explains whatever else is slow as well.
 WARM_UP_SHARE = 0.98
 #: Level of the bootstrap test that a lasting cause must pass; local temperature is the name that costs most when it is wrong.
@@ -173,7 +170,7 @@ def weigh(case: _Case) -> dict[str, float]:
             case.slow.white + float(np.log(max(share, 1e-30))),
             case.slow.one_direction - one - APPROACH_NATS["slow"],
         ),
-        "slow": case.slow.shared - one - SLOW_NATS,
+        "slow": case.slow.shared - one,
         "step": case.step.log_likelihood - one - float(np.log(step_columns(cycles).shape[1])),
     }
     if case.temperature is not None:
