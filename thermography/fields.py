@@ -78,17 +78,17 @@ def reduce_frames(
     scheduler
         Address of a dask scheduler whose workers see the same files; without it two threads do the work.
     checkpoint
-        Folder to which every finished cycle is written with the sums of its counts. A run that finds the folder goes on after the
-        last finished cycle; `thermography.checkpoint.recalibrate` calibrates the cycles anew without the frames.
+        Folder for what is finished, with its sums of counts. A run that finds it goes on from there, within a long cycle too;
+        `thermography.checkpoint.recalibrate` calibrates the cycles anew without the frames.
     progress
         Called with the number of frames done since the last call.
 
     Returns
     -------
     xr.Dataset
-        Keeps `thermography.contract.FIELDS`; further `temperature_rate`, `quality_flag`, the registration's `position_u`, and
-        as JSON texts the attributes `frames_outside_cycles` (named; their fields are in the stack), `knocks` (frame and shift
-        in px), `frames_shaken` (moved for one frame only) and `frames_unchecked` (too little contrast to see the fiducials).
+        Keeps `thermography.contract.FIELDS`; further `temperature_rate`, `quality_flag`, `position_u`, and as JSON texts the attributes
+        `frames_outside_cycles` (their fields are in the stack), `knocks` (frame and shift in px), `frames_shaken` (moved for one
+        frame only) and `frames_unchecked` (too little contrast to see the fiducials).
 
     Raises
     ------
@@ -97,8 +97,7 @@ def reduce_frames(
     CheckpointError
         The checkpoint belongs to another reduction.
     """
-    spans = [RegisteredFrom(0, registration)] if isinstance(registration, Registration) else list(registration)
-    _check_spans(spans)
+    spans = _check_spans([RegisteredFrom(0, registration)] if isinstance(registration, Registration) else registration)
     bounds = check_bounds(cycle_bounds)
     times = check_frames(references, spans[0].registration.shape)
     correction = check_correction(correction_K, len(references))
@@ -213,10 +212,11 @@ def _check_meeting(times: Array, bounds: Array, cycles: Array) -> None:
         )
 
 
-def _check_spans(spans: Sequence[RegisteredFrom]) -> None:
+def _check_spans(spans: Sequence[RegisteredFrom]) -> list[RegisteredFrom]:
     starts = [span.first for span in spans]
     if not starts or starts[0] != 0 or (np.diff(starts) <= 0).any():
         raise FieldError(f"registrations start at frames {starts}; they must start at 0 and rise")
+    return list(spans)
 
 
 def check_correction(correction_K: Array | None, frames: int) -> Array:
