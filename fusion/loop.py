@@ -234,13 +234,14 @@ def _declare(readings: Readings, declared: Sequence[str], effects: Mapping[str, 
 def _open_seal(search: Search, models: list[ModelFit], chosen: Chosen) -> tuple[list[ModelFit], Chosen, list[float]]:
     """Errors on the sealed cycles of every model in turn; an effect that makes them larger is withdrawn.
 
-    An event before the seal shifts a level that the carried drift has learnt by then, so it is not judged by this error.
+    An event before the seal shifts a level that the carried drift has learnt by then, so it is not judged by this error. What is withdrawn
+    may come back in the look at all cycles, where its time constant is known better.
     """
     errors = [rmse(model.open_loop_errors()[0]) for model in models]
     for k, (score, _) in enumerate(chosen):
         if member_of(score).event_s is None and errors[k + 1] > _WORSE * errors[k]:
             search.blocked[score.name] = (
-                f"withdrawn: it was found before the seal (p = {score.family_wise_p:.2g}), but the error on the sealed cycles rose from "
+                f"withdrawn at the seal: it was found before (p = {score.family_wise_p:.2g}), but the error on the sealed cycles rose from "
                 f"{errors[k]:.3f} to {errors[k + 1]:.3f} um with it"
             )
             return _open_seal(search, *_rebuild(search, models[0], [pair for j, pair in enumerate(chosen) if j != k]))
@@ -303,6 +304,7 @@ def _second_look(
             )
             whole = before
             continue
+        search.blocked.pop(best.name, None)
         step = make_step(whole, term, best, scores, error, after)
         steps = [*steps, replace(step, confirmed=confirmed)]
         whole, steps = _drop_superfluous(search, whole, steps)

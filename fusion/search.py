@@ -162,7 +162,7 @@ class Search:
         return None
 
     def _withdrawn(self, score: FamilyScore) -> bool:
-        return self.blocked.get(score.name, "").startswith("withdrawn")
+        return self.blocked.get(score.name, "").startswith("withdrawn:")
 
     def _blocked(self, score: FamilyScore, model: ModelFit) -> str | None:
         part = self.readings.subset(model.used)
