@@ -69,7 +69,10 @@ def test_tables_and_lists_reach_the_recipe(tmp_path):
         ("[test]\npositions_mm = 3", r"test\.positions_mm = 3; write a list"),
         ("test = 3", r"test = 3; write a table, \[test\]"),
         ("[duty]\nkind = 'wild'", r"duty\.kind = 'wild'; write one of random, constant, switched, randomised"),
-        ("[duty]\nleast_hold_min = 40", r"duty\.least_hold_min = 40\.?0?; write a number from 0 to below duty\.mean_hold_min"),
+        (
+            "[duty]\nleast_hold_min = 40",
+            r"duty\.least_hold_min = 40\.?0?; write a number from 0 to below duty\.mean_hold_min",
+        ),
         ("[plan]\ndirection = [-1, 1]", r"plan\.direction = \[-1\.0, 1\.0\]; write a unit vector such as \[-1, 0\]"),
         ("[plan]\norigin_mm = [1]", r"plan\.origin_mm has 1 numbers; write two, \[x, y\]"),
         ("[plan]\nfiducials_x_mm = [1]", r"fiducials_x_mm and plan\.fiducials_y_mm differ in length"),
