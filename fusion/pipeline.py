@@ -21,7 +21,7 @@ from fusion.progress import Report, silent
 from fusion.provenance import describe_run, hash_inputs, versions
 from fusion.report import render_report
 from fusion.results import Notice, assemble
-from fusion.sources import compensate_by_camera, read_source
+from fusion.sources import Source, compensate_by_camera, read_source
 
 #: Where each stage keeps its Dataset; what ends up in fusion.nc is kept apart while it may have to be resumed.
 FILES = {
@@ -136,12 +136,25 @@ def run_campaign(
     campaign = load_campaign(path, effect_names=stages.effect_names())
     folder = Path(out)
     if campaign.record is not None:
-        return _run_record(campaign, folder, resume=resume, report=report)
+        record = stages_record.read_source(campaign)
+        return _run_record(_open_run(campaign, folder, resume=resume, report=report), record)
     source = read_source(campaign)
+    run = _open_run(campaign, folder, resume=resume, report=report)
+    return _run_instruments(run, source, scheduler=scheduler)
+
+
+def _open_run(campaign: Campaign, folder: Path, *, resume: bool, report: Report) -> Run:
+    """Open the results folder of a campaign whose input has been read, and note what it was made from."""
     open_folder(folder, resume=resume)
     started = datetime.now(UTC)
     inputs = hash_inputs(campaign.input_files(), report=report)
-    run = Run(campaign, folder, report, StageStamps(folder), inputs, started, notices=list(source.notices))
+    return Run(campaign, folder, report, StageStamps(folder), inputs, started)
+
+
+def _run_instruments(run: Run, source: Source, *, scheduler: str | None) -> dict[str, Any]:
+    """Run the main job on camera and laser, stage after stage."""
+    folder, report = run.folder, run.report
+    run.notices.extend(source.notices)
     seen = ("thermography", "plan", "interferometry")
     checkpoint = run.checkpoint(run.key_of("fields", seen, ()))
     fields = run.stage(
@@ -179,14 +192,9 @@ def run_campaign(
     return _finish(run, {"fields": fields, "deviations": deviations, "fusion": fusion})
 
 
-def _run_record(campaign: Campaign, folder: Path, *, resume: bool, report: Report) -> dict[str, Any]:
+def _run_record(run: Run, source: stages_record.RecordSource) -> dict[str, Any]:
     """Run the main job on a record: one table, one stage."""
-    source = stages_record.read_source(campaign)
-    open_folder(folder, resume=resume)
-    started = datetime.now(UTC)
-    inputs = hash_inputs(campaign.input_files(), report=report)
-    run = Run(campaign, folder, report, StageStamps(folder), inputs, started)
-    record = run.stage("record", ("record", "model"), (), lambda: stages_record.model_record(source, report=report))
+    record = run.stage("record", ("record", "model"), (), lambda: stages_record.model_record(source, report=run.report))
     return _finish(run, {"record": record})
 
 
