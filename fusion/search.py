@@ -81,6 +81,8 @@ class Search:
 
     def _families(self, model: ModelFit) -> dict[str, list[Member]]:
         present = {term.effect for term in model.terms}
+        # One event happens once, however its column was weighed when it was found.
+        happened = {(term.effect, term.member.event_s) for term in model.terms if term.member.event_s is not None}
         families = {}
         for name, effect in self.effects.items():
             if name in self.not_tried:
@@ -88,7 +90,8 @@ class Search:
             if name in present and name not in _MAY_REPEAT:
                 continue
             try:
-                families[name] = list(effect.members(self.readings, model.coefficients(), None))
+                offered = effect.members(self.readings, model.coefficients(), None)
+                families[name] = [member for member in offered if (name, member.event_s) not in happened]
                 _check_columns(families[name], self.readings)
             except Exception as fault:
                 # A user's effect must not end the search for the others; a fault of our own must be seen.

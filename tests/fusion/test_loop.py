@@ -16,6 +16,7 @@ from fusion.members import Member, Prior
 from fusion.readings import Readings, ReadingsError, Series, read_fused
 from fusion.twin import Recipe, deviations_of, driver_log, environment_log, fields_of, simulate
 from fusion.twin.recipe import EffectRecipe
+from tests.fusion import loop_bench
 
 DECLARED = ["axis_expansion", "table_offset"]
 
@@ -267,3 +268,11 @@ def test_a_long_campaign_has_no_more_candidates_than_a_long_day():
     # A closer look reaches from one tried instant to the next.
     assert np.ptp(near) == pytest.approx(2.0 * np.median(steps), rel=0.1)
     assert len(list(library()["periodic_disturbance"].members(long, {}, None))) <= 600
+
+
+def test_one_jump_of_the_camera_is_named_once():
+    """Weighed by the coefficients of two rounds its column differs, and both columns become one when they settle."""
+    readings = loop_bench.readings_of(loop_bench.effect_of("camera_offset", 0.4, 9007), seed=9007)
+    found = close_loop(readings, DECLARED)
+    events = [term.member.event_s for term in found.after.terms if term.effect == "camera_offset"]
+    assert len(events) == len(set(events)) >= 1
