@@ -12,7 +12,7 @@ from fusion.effects import Effect
 from fusion.members import Member, warm_up
 from fusion.model import ModelFit
 from fusion.projections import residual_squares
-from fusion.readings import Readings, Series
+from fusion.readings import Readings, Series, sample_noise
 from interferometry.statespace import Array, fit_fixed_effects
 
 #: Temperature noise over range beyond which a lag is not believed: where the machine is switched, and for one warm-up only.
@@ -73,9 +73,7 @@ def noise_share(series: Series) -> float:
     values = series.values
     if values.size < 5:
         return 1.0
-    second = np.diff(values, 2)
-    scatter = 1.4826 * np.median(np.abs(second - np.median(second))) / np.sqrt(6.0)
-    return float(scatter / max(np.ptp(values), 1e-12))
+    return sample_noise(values) / max(float(np.ptp(values)), 1e-12)
 
 
 def protection(part: Readings) -> Array:

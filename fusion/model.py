@@ -29,6 +29,15 @@ class Term:
         return self.member.columns.shape[1]
 
 
+def place_of(terms: Sequence[Term], term: Term, start: int = 0) -> slice:
+    """Where the columns of a term stand among those of all terms, the first of which begins at `start`."""
+    for other in terms:
+        if other is term:
+            return slice(start, start + term.width)
+        start += other.width
+    raise KeyError(term.effect)
+
+
 @dataclass(frozen=True)
 class ModelFit:
     """A model fitted to a part of the readings.
@@ -50,12 +59,7 @@ class ModelFit:
 
     def place(self, term: Term) -> slice:
         """Where the coefficients of a term stand in the fit."""
-        start = self.profile.shape[1]
-        for other in self.terms:
-            if other is term:
-                return slice(start, start + term.width)
-            start += other.width
-        raise KeyError(term.effect)
+        return place_of(self.terms, term, self.profile.shape[1])
 
     def priors(self) -> list[tuple[int, Prior]]:
         """Places of the coefficients that something is known of beforehand, and what."""

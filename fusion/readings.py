@@ -182,6 +182,12 @@ class Readings:
         )
 
 
+def sample_noise(samples: Array) -> float:
+    """Noise of single samples of a series from their second differences, in which whatever is slow cancels."""
+    second = np.diff(samples, 2)
+    return float(1.4826 * np.median(np.abs(second - np.median(second))) / np.sqrt(6.0))
+
+
 def read_fused(fused: xr.Dataset) -> Readings:
     """Lay the fused Dataset out as readings.
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion.adequacy import Remainder
 from fusion.identifiability import Identifiable
+from fusion.members import Member
 from fusion.model import ModelFit, Term, unexplained_drift
 from fusion.readings import Readings
 from fusion.scoring import FamilyScore
@@ -157,19 +159,45 @@ def _size(model: ModelFit, term: Term) -> float:
     return float(np.sqrt(np.mean((series - (total / number)[site]) ** 2)))
 
 
+class Scored(Protocol):
+    """What a score of any search tells of its effect."""
+
+    @property
+    def name(self) -> str:
+        """Effect."""
+
+    @property
+    def member(self) -> Member | None:
+        """Its best member, None where none can be told from the model."""
+
+    @property
+    def excess(self) -> float:
+        """Gain beyond what chance finds."""
+
+    @property
+    def p_value(self) -> float:
+        """Chance of the gain for this effect alone."""
+
+    @property
+    def family_wise_p(self) -> float:
+        """The same for the best of all that were tried."""
+
+
+def rivals(score: Scored, scores: Sequence[Scored]) -> tuple[list[str], dict[str, float | str]]:
+    """Effects of a round (best excess first) that these data cannot tell from the chosen one; the next best, how far behind."""
+    others = [other for other in scores if other.name != score.name and other.member is not None]
+    tied = [other.name for other in others if other.p_value < _RIVAL_LEVEL and score.excess - other.excess < TIE_GAIN]
+    if not others:
+        return tied, {}
+    behind = score.excess - others[0].excess
+    return tied, {"effect": others[0].name, "behind_by": behind, "p_value": others[0].family_wise_p}
+
+
 def make_step(
     model: ModelFit, term: Term, score: FamilyScore, scores: list[FamilyScore], before: float, after: float
 ) -> Step:
     """Describe an added effect: the score that let it in, all scores of its round, the error on the sealed cycles before and after."""
-    others = [other for other in scores if other.name != score.name and other.member is not None]
-    tied = [other.name for other in others if other.p_value < _RIVAL_LEVEL and score.excess - other.excess < TIE_GAIN]
-    runner_up: dict[str, float | str] = {}
-    if others:
-        runner_up = {
-            "effect": others[0].name,
-            "behind_by": score.excess - others[0].excess,
-            "p_value": others[0].family_wise_p,
-        }
+    tied, runner_up = rivals(score, scores)
     return Step(
         effect=term.effect,
         parameters=term.member.parameters,

@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from fusion.readings import Readings, Series
+from fusion.readings import Readings, Series, sample_noise
 from interferometry.statespace import Array
 
 #: Blocks that a record is averaged to at most: more cost time and hold no more of what is slow.
@@ -27,7 +27,7 @@ EXPONENTS = (1, 2)
 _REST_SHARE = 0.02
 #: A driver is switched where it changes by this share of its range from one block to the next.
 _SWITCHED = 0.2
-#: Shortest and most chained blocks that a record is cut into.
+#: Most and fewest parts that a record is cut into for forward chaining.
 _MOST_CHAINED = 8
 _LEAST_CHAINED = 4
 
@@ -172,7 +172,8 @@ def reduce_record(table: xr.Dataset) -> Record:
         block_s=blocks.length_s,
         displacement=displacement,
         temperature=temperature[:, kept],
-        temperature_noise=np.array([_noise(samples[:, k]) for k in kept]) / np.sqrt(per_block),
+        temperature_noise=np.array([sample_noise(samples[np.isfinite(samples[:, k]), k]) for k in kept])
+        / np.sqrt(per_block),
         drivers=drivers,
         channels=channels,
         sensors=tuple(sensors[k] for k in kept),
@@ -195,12 +196,6 @@ def _lay_blocks(source: str, elapsed: Array) -> _Blocks:
     number = np.floor((elapsed + 0.5 * step) / length).astype(int)
     numbers, place = np.unique(number, return_inverse=True)
     return _Blocks(source, place, np.asarray((numbers + 0.5) * length - 0.5 * step, np.float64), length, {})
-
-
-def _noise(samples: Array) -> float:
-    """Noise of single samples from their second differences, in which whatever is slow cancels."""
-    second = np.diff(samples[np.isfinite(samples)], 2)
-    return float(1.4826 * np.median(np.abs(second - np.median(second))) / np.sqrt(6.0))
 
 
 def _drivers(table: xr.Dataset, blocks: _Blocks) -> dict[str, dict[int, Array]]:

@@ -40,15 +40,13 @@ class RecordEffect:
 
     Attributes
     ----------
-    name, physics, source : as in the library of :mod:`fusion.effects`
+    name : as in the library of :mod:`fusion.effects`
     members : from the record (and a member near which to look closer) to columns (blocks, q) that every channel follows with its
         own coefficients
     needs : why it cannot be tried with this record, or None
     """
 
     name: str
-    physics: str
-    source: str
     members: Callable[[Record, Member | None], Iterator[Member]]
     needs: Callable[[Record], str | None]
 
@@ -185,11 +183,11 @@ def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[st
     found, not_tried = {}, {}
     for name, effect in (library() if effects is None else effects).items():
         if name in _MEMBERS:
-            found[name] = RecordEffect(name, effect.physics, effect.source, _MEMBERS[name], _needs(name))
+            found[name] = RecordEffect(name, _MEMBERS[name], _needs(name))
         elif name in built_in:
             not_tried[name] = _ALONG_AN_AXIS
         else:
-            found[name] = RecordEffect(name, effect.physics, effect.source, _as_it_is(effect), _own_needs(effect))
+            found[name] = RecordEffect(name, _as_it_is(effect), _own_needs(effect))
     return found, not_tried
 
 

@@ -49,7 +49,7 @@ def blocked_reason(effect: RecordEffect, member: Member, model: RecordFit) -> st
                 "with a late sensor or a source nearby; that is not a lag"
             )
         smooth = Member(smoothed(record, rise, float(member.parameters["time_constant_min"]))[:, None], {}, ("um/K",))
-        found, _ = gains(model, [np.empty((rows.size, 0)) for rows in model.rows], [member, smooth])
+        found, _ = gains(model, [member, smooth])
         advantage = float(found[0, 0] - found[1, 0])
         if advantage < _SMOOTH_GAIN:
             return (

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.effects import Effect
-from fusion.model import Term
+from fusion.model import Term, place_of
 from fusion.record.blocks import Record
 from fusion.record.model import RecordFit, fit_record
-from fusion.record.prediction import Prediction, channel_rmse
+from fusion.record.prediction import Prediction, channel_rmse, persistence_rmse
 from fusion.record.remainder import RecordRemainder, examine
 from fusion.record.search import (
     MOST_EFFECTS,
@@ -26,11 +26,8 @@ from fusion.record.search import (
     seal,
     search,
 )
-from fusion.search import TIE_GAIN
+from fusion.story import rivals
 from interferometry.statespace import Array
-
-#: An effect that is not even significant alone is no rival.
-_RIVAL_LEVEL = 0.05
 
 
 @dataclass(frozen=True)
@@ -118,12 +115,8 @@ class RecordResult:
     def _step(self, k: int) -> dict[str, Any]:
         score, turn = self.found.entries[k]
         term = self.found.terms[self.found.declared + k]
-        others = [one for one in turn.scores if one.name != score.name and one.member is not None]
-        tied = [one.name for one in others if one.p_value < _RIVAL_LEVEL and score.excess - one.excess < TIE_GAIN]
-        runner_up: dict[str, Any] = {}
-        if others:
-            behind = score.excess - others[0].excess
-            runner_up = {"effect": others[0].name, "behind_by": behind, "p_value": others[0].family_wise_p}
+        tied, runner_up = rivals(score, turn.scores)
+        squares = self.contribution(term) ** 2
         before, after = np.nanmean(self.errors[k]), np.nanmean(self.errors[k + 1])
         return {
             "effect": term.effect,
@@ -131,9 +124,9 @@ class RecordResult:
             "p_value": score.family_wise_p,
             "rmse_before_um": float(before),
             "rmse_after_um": float(after),
-            "rms_um": float(np.sqrt(np.mean(self.contribution(term) ** 2))),
+            "rms_um": float(np.sqrt(np.mean(squares))),
             "rms_by_channel_um": {
-                name: float(np.sqrt(np.mean(self.contribution(term)[:, channel] ** 2)))
+                name: float(np.sqrt(np.mean(squares[:, channel])))
                 for channel, name in enumerate(self.found.record.channels)
             },
             "chained_rmse_before_um": turn.chained_rmse,
@@ -147,14 +140,8 @@ class RecordResult:
 
     def contribution(self, term: Term) -> Array:
         """What a term contributes to the prediction by the final model, about its mean, um (blocks, channels)."""
-        start = 0
-        for other in self.found.terms:
-            if other is term:
-                break
-            start += other.width
-        final = self.predictions[-1]
-        place = slice(start, start + term.width)
-        series = term.member.columns @ final.coefficients[place]
+        place = place_of(self.found.terms, term)
+        series = term.member.columns @ self.predictions[-1].coefficients[place]
         return np.asarray(series - series.mean(axis=0))
 
 
@@ -205,8 +192,7 @@ def close_record(
     progress(MOST_EFFECTS, MOST_EFFECTS, "examining what is left")
     whole = fit_record(record, found.terms, np.ones_like(before))
     remainder = examine(whole, errors[-1], np.random.default_rng(seed))
-    last = np.array([column[before & np.isfinite(column)][-1] for column in record.displacement.T])
-    persistence = channel_rmse(record, np.broadcast_to(last, record.displacement.shape), ~before)
+    persistence = persistence_rmse(record, before, ~before)
     chained = chain_forward(record, terms, seed=seed, effects=effects, progress=progress)
     return RecordResult(found, ~before, held_out, predictions, errors, persistence, whole, remainder, chained)
 

@@ -143,12 +143,13 @@ def _walk(fit: DriftFit, normal: Array) -> Array:
     return np.asarray(np.cumsum((before + own) * steps, axis=0))
 
 
-def gains(model: RecordFit, draws: Sequence[Array], members: Sequence[Member]) -> tuple[Array, NDArray[np.bool_]]:
+def gains(model: RecordFit, members: Sequence[Member], draws: Sequence[Array] = ()) -> tuple[Array, NDArray[np.bool_]]:
     """Gain in log-likelihood of every member, all channels together, for the record and every draw (members, 1 + draws).
 
     Every channel has its own drift, whose variance is chosen anew for every member, and for the model without one. A further
     coefficient must earn its keep (Akaike).
     """
+    draws = draws or [np.empty((rows.size, 0)) for rows in model.rows]
     total = np.zeros((len(members), 1 + draws[0].shape[1]))
     separable = np.zeros(len(members), bool)
     for fit, rows, drawn in zip(model.channels, model.rows, draws, strict=True):

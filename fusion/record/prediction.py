@@ -61,6 +61,12 @@ def predict(record: Record, columns: Array, train: NDArray[np.bool_]) -> Predict
     return Prediction(*_paths(record, columns, train)[best], float(PENALTIES[best]), float(mean[best]))
 
 
+def persistence_rmse(record: Record, train: NDArray[np.bool_], where: NDArray[np.bool_]) -> Array:
+    """Error of repeating the last training value of every channel over some blocks, um (channels,)."""
+    last = np.array([column[train & np.isfinite(column)][-1] for column in record.displacement.T])
+    return channel_rmse(record, np.broadcast_to(last, record.displacement.shape), where)
+
+
 def chained_parts(record: Record, train: NDArray[np.bool_]) -> list[int]:
     """Parts of the training blocks that are predicted from those before them: those of the later half.
 

@@ -22,7 +22,7 @@ from fusion.record.blocks import Record, RecordError
 from fusion.record.effects import QUASI_STATIC, RecordEffect, quasi_static_columns, record_library
 from fusion.record.gates import blocked_reason
 from fusion.record.model import RecordFit, columns_of, fit_record, gains, simulate_channels
-from fusion.record.prediction import Prediction, channel_rmse, predict
+from fusion.record.prediction import Prediction, channel_rmse, persistence_rmse, predict
 from interferometry.statespace import Array
 
 SEALED_SHARE = 0.2
@@ -224,7 +224,7 @@ def _of_all(p_value: float, tried: int) -> float:
 
 
 def _score(name: str, members: Sequence[Member], model: RecordFit, draws: Sequence[Array]) -> RecordScore:
-    gain, separable = gains(model, draws, members)
+    gain, separable = gains(model, members, draws)
     if not separable.any():
         return RecordScore(name, None, 0.0, 0.0, 1.0, 1.0)
     gain = gain[separable]
@@ -240,7 +240,7 @@ def _refined(score: RecordScore, effect: RecordEffect, model: RecordFit) -> Reco
     near = [member for member in effect.members(model.record, score.member) if _varies(member, model.used)]
     if not near:
         return score
-    gain, _ = gains(model, [np.empty((rows.size, 0)) for rows in model.rows], near)
+    gain, _ = gains(model, near)
     return replace(score, member=near[int(np.argmax(gain[:, 0]))])
 
 
@@ -261,7 +261,7 @@ def _re_examine(
     for k in range(len(entries) - 1):
         others = [term for j, term in enumerate(terms) if j != first + k]
         without = fit_record(record, others, train)
-        gain, separable = gains(without, [np.empty((rows.size, 0)) for rows in without.rows], [terms[first + k].member])
+        gain, separable = gains(without, [terms[first + k].member])
         if not separable[0] or gain[0, 0] < _SUPERFLUOUS_GAIN:
             return _re_examine(record, train, others, [pair for j, pair in enumerate(entries) if j != k])
     return terms, entries
@@ -306,14 +306,13 @@ def chain_forward(
         before, part = record.chained < number, record.chained == number
         result = search(record, before, declared, seed=seed, effects=effects)
         predictions = result.predictions()
-        last = np.array([column[before & np.isfinite(column)][-1] for column in record.displacement.T])
         hours = record.seconds[part] / 3600.0
         found.append(
             Chained(
                 float(hours[0]),
                 float(hours[-1]),
                 tuple(score.name for score, _ in result.entries),
-                channel_rmse(record, np.broadcast_to(last, record.displacement.shape), part),
+                persistence_rmse(record, before, part),
                 channel_rmse(record, predictions[0].predicted, part),
                 channel_rmse(record, predictions[-1].predicted, part),
             )
