@@ -87,11 +87,17 @@ def warm_up(readings: Readings, minutes: float) -> Array:
 
 
 def _near(near: Member | None, parameter: str, grid: Iterable[float], *, ratio: float) -> tuple[float, ...]:
-    """The grid of a parameter, or a finer one within a factor of what was found."""
-    if near is None:
-        return tuple(grid)
-    found = float(near.parameters[parameter])
-    return (0.0,) if found == 0.0 else tuple(float(found * factor) for factor in np.geomspace(1 / ratio, ratio, 11))
+    """The grid of a parameter, or a finer one within a factor of what was found and of the grid's ends.
+
+    Zero has no factor, and so no finer grid.
+    """
+    tried = tuple(grid)
+    found = 0.0 if near is None else float(near.parameters[parameter])
+    if found == 0.0:
+        return tried
+    least, most = 0.999 * min(value for value in tried if value > 0.0) / ratio, 1.001 * max(tried) * ratio
+    finer = (float(found * factor) for factor in np.geomspace(1 / ratio, ratio, 11))
+    return tuple(value for value in finer if least <= value <= most)
 
 
 #: Time constants of a second body, as shares of the first one's: heat may reach a part through another. The search tries one, a closer

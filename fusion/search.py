@@ -19,9 +19,10 @@ from fusion.readings import Readings
 from fusion.scoring import FamilyScore, Judge, ask_sealed, known_of
 
 #: Chance of adding an effect where nothing is missing, over everything that is tried. The search before the seal has the largest part
-#: of it; the rest is for the one question to the sealed cycles and for the look at all cycles after that.
-ENTRY_LEVEL = 0.05
-SEARCH_LEVEL, ASKED_LEVEL, SECOND_LEVEL = 0.03, 0.01, 0.01
+#: of it; the rest is for the one question to the sealed cycles and for the look at all cycles after that. Every effect that is found
+#: opens the search again with the same chance, and a campaign may lack two: half of the 5 % that a wrong name may have.
+ENTRY_LEVEL = 0.025
+SEARCH_LEVEL, ASKED_LEVEL, SECOND_LEVEL = 0.015, 0.005, 0.005
 #: Chance that an effect which is not there passes its confirmation on unused readings; the search has been paid for already.
 CONFIRMATION_LEVEL = 0.1
 #: Evidence so strong that an inconclusive confirmation does not stop it: few switchings of a load leave early blocks without a say.
@@ -35,6 +36,10 @@ TIE_GAIN = 3.0
 _WORTH_CONFIRMING = 0.1
 #: Share of the cycles from which the later ones are predicted to confirm an effect.
 _EARLY_SHARE = 0.5
+#: Neighbourhoods that are looked at in turn: the search tries few states for every wave, and the best is a neighbour's neighbour.
+#: A gain in log-likelihood below this is not worth another one.
+_CLOSER_LOOKS = 3
+_WORTH_MOVING = 0.1
 _MAY_REPEAT = frozenset({"step_event", "camera_offset", "sensor_fault", "periodic_disturbance"})
 
 
@@ -190,7 +195,16 @@ class Search:
         return None
 
     def _refined(self, score: FamilyScore, judge: Judge, model: ModelFit) -> FamilyScore:
-        """The best member in the neighbourhood of the one that was found."""
+        """The best member in the neighbourhood of the one that was found, and in that one's, as long as it moves."""
+        for _ in range(_CLOSER_LOOKS):
+            before = score.gain
+            score = self._best_near(score, judge, model)
+            if score.gain < before + _WORTH_MOVING:
+                break
+        return score
+
+    def _best_near(self, score: FamilyScore, judge: Judge, model: ModelFit) -> FamilyScore:
+        """The best member next to the one that was found, or the same score where none is better."""
         found = member_of(score)
         offered = self.effects[score.name].members(self.readings, model.coefficients(), found)
         near = self._inside((member for member in offered if _same_kind(member, found)), model)
@@ -215,12 +229,13 @@ def _check_columns(members: Sequence[Member], readings: Readings) -> None:
             raise SearchError(f"{columns.shape[1]} columns but {len(member.units)} units at {dict(member.parameters)}")
 
 
-#: Words that a closer look may change: what a lead may be mistaken for, and what the machine did before the log began.
-_OPEN_WORDS = frozenset({"possible_leads", "start"})
+#: Words that a closer look may change: what a lead may be mistaken for, the state that scales a pattern, and what the machine did
+#: before the log began.
+_OPEN_WORDS = frozenset({"possible_leads", "follows", "start"})
 
 
 def _same_kind(member: Member, found: Member) -> bool:
-    """Alike in what is a word (shape, driver); numbers may differ."""
+    """Alike in what is a word (shape, sensor); numbers may differ."""
     words = {
         name: value for name, value in found.parameters.items() if isinstance(value, str) and name not in _OPEN_WORDS
     }
