@@ -229,11 +229,19 @@ def periods_min(readings: Readings) -> Array:
 
     Periods that the cycle or its halves would imitate are left out: every slow change of the profile has lines there.
     """
-    span = float(readings.seconds[-1] - readings.seconds[0]) / 60.0
-    frequencies = np.arange(3.0 / span, 1.0 / 3.0, 0.5 / span)
+    span = _span_min(readings)
+    return np.asarray(1.0 / _off_the_cycle(readings, np.arange(3.0 / span, 1.0 / 3.0, 0.5 / span, dtype=np.float64)))
+
+
+def _span_min(readings: Readings) -> float:
+    return float(readings.seconds[-1] - readings.seconds[0]) / 60.0
+
+
+def _off_the_cycle(readings: Readings, frequencies: Array) -> Array:
+    """Those frequencies (1/min) that are not within four lines of the cycle or its parts."""
     cycle = 60.0 / float(np.median(np.diff(cycle_starts(readings))))
     order = np.maximum(1.0, np.round(frequencies / cycle))
-    return np.asarray(1.0 / frequencies[np.abs(frequencies - order * cycle) > 4.0 / span])
+    return np.asarray(frequencies[np.abs(frequencies - order * cycle) > 4.0 / _span_min(readings)])
 
 
 def periodic_disturbance_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
@@ -291,9 +299,11 @@ def hidden_leads_mm(readings: Readings) -> str:
 
 
 def _close_periods(readings: Readings, found_min: float) -> Array:
-    """Periods around one that was found, as close as the record can tell apart."""
-    span = float(readings.seconds[-1] - readings.seconds[0]) / 60.0
-    return np.asarray(1.0 / (1.0 / found_min + np.linspace(-0.5, 0.5, 21) / span))
+    """Periods around one that was found, as close as the record can tell apart; none that the search would not have tried."""
+    span = _span_min(readings)
+    near = 1.0 / found_min + np.linspace(-0.5, 0.5, 21) / span
+    near = near[(near > 2.999 / span) & (near < 1.001 / 3.0)]
+    return np.asarray(1.0 / _off_the_cycle(readings, near))
 
 
 def pitch_error_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
@@ -306,9 +316,9 @@ def pitch_error_members(readings: Readings, _: Mapping[str, float], near: Member
         states = [p for p in states if p[1]["time_constant_min"] != 0.0 and p[1].get("start") != "at rest"]
     frequencies = spatial_frequencies(readings)
     if near is not None:
-        frequencies = 1.0 / float(near.parameters["period_mm"]) + np.linspace(-0.25, 0.25, 5) / np.ptp(
-            readings.positions_mm
-        )
+        close = 1.0 / float(near.parameters["period_mm"]) + np.linspace(-0.25, 0.25, 5) / np.ptp(readings.positions_mm)
+        # A wave longer than half the travel is a bending, not a screw's.
+        frequencies = close[(close > 0.999 * frequencies[0]) & (close < 1.001 * frequencies[-1])]
     for frequency in frequencies:
         phase = 2 * np.pi * frequency * readings.position_mm
         waves = _column(np.cos(phase), np.sin(phase))

@@ -28,6 +28,8 @@ _EVENT_MARGIN = 0.05
 _EVENT_INSTANTS = 200
 #: A sensor's jump belongs to the sensor alone where it exceeds that of the others' mean so many times.
 _OWN_JUMP = 5.0
+#: A sensor that jumps alone more often is a quick one close to a source, not a faulty one.
+_MOST_FAULTS = 2
 #: Fewer periods than this are no rhythm: any slow drift looks like them.
 _LEAST_PERIODS = 6.0
 
@@ -128,11 +130,14 @@ def sensor_faults(record: Record) -> list[tuple[int, float, float]]:
     for k in range(len(record.sensors)):
         others = np.delete(record.rise, k, axis=1)
         common = others.mean(axis=1) if others.shape[1] else np.zeros(record.seconds.size)
+        own = []
         for before, after, size in jumps(Series(record.seconds, record.rise[:, k], "K")):
             at = np.searchsorted(record.seconds, (before, after))
             alone = abs(size) > _OWN_JUMP * abs(common[at[1]] - common[at[0]])
             if alone and not switched[at[0] : at[1] + 1].any():
-                found.append((k, after, size))
+                own.append((k, after, size))
+        if len(own) <= _MOST_FAULTS:
+            found += own
     return found
 
 

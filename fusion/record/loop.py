@@ -16,6 +16,7 @@ from fusion.record.model import RecordFit, fit_record
 from fusion.record.prediction import Prediction, channel_rmse, persistence_rmse
 from fusion.record.remainder import RecordRemainder, examine
 from fusion.record.search import (
+    EARNED,
     MOST_EFFECTS,
     Chained,
     Progress,
@@ -23,6 +24,7 @@ from fusion.record.search import (
     Search,
     chain_forward,
     declare,
+    member_of,
     seal,
     search,
 )
@@ -189,11 +191,14 @@ def close_record(
     before, held_out = seal(record)
     found = search(record, before, terms, seed=seed, effects=effects, progress=progress)
     found, predictions, errors = open_seal(found)
+    chained = chain_forward(record, terms, seed=seed, effects=effects, progress=progress)
+    kept = without_unrepeated(found, chained)
+    if kept is not found:
+        found, predictions, errors = open_seal(kept)
     progress(MOST_EFFECTS, MOST_EFFECTS, "examining what is left")
     whole = fit_record(record, found.terms, np.ones_like(before))
     remainder = examine(whole, errors[-1], np.random.default_rng(seed))
     persistence = persistence_rmse(record, before, ~before)
-    chained = chain_forward(record, terms, seed=seed, effects=effects, progress=progress)
     return RecordResult(found, ~before, held_out, predictions, errors, persistence, whole, remainder, chained)
 
 
@@ -211,9 +216,37 @@ def open_seal(found: Search) -> tuple[Search, list[Prediction], Array]:
                 f"withdrawn: it was found before the seal (p = {score.family_wise_p:.2g}), but the sealed part is predicted no better with "
                 f"it ({mean[k]:.3g} to {mean[k + 1]:.3g} um)"
             )
-            kept = [j for j in range(len(found.entries)) if j != k]
-            terms = (*found.terms[: found.declared], *(found.terms[found.declared + j] for j in kept))
-            entries = tuple(found.entries[j] for j in kept)
-            blocked = {**found.blocked, score.name: reason}
-            return open_seal(replace(found, terms=terms, entries=entries, blocked=blocked))
+            return open_seal(_withdrawn(found, k, reason))
     return found, predictions, errors
+
+
+def without_unrepeated(found: Search, chained: Sequence[Chained]) -> Search:
+    """The search without effects that the same procedure also found on earlier time, and predicted no better with.
+
+    A model may fall upon the sealed part by chance; where it has been tried on several parts, all of them count. An event is not asked: it
+    happens once.
+    """
+    for k, (score, _) in enumerate(found.entries):
+        tried = [one for one in chained if score.name in one.effects]
+        if not tried or member_of(score).event_s is not None:
+            continue
+        before, after = (
+            float(np.nanmean([np.nanmean(one) for one in errors]))
+            for errors in zip(*((one.rmse_declared_um, one.rmse_final_um) for one in tried), strict=True)
+        )
+        if after >= EARNED * before:
+            parts = "the part" if len(tried) == 1 else f"the {len(tried)} parts"
+            reason = (
+                f"withdrawn: it was found before the seal (p = {score.family_wise_p:.2g}), but {parts} of the record that it was tried on "
+                f"with the time before alone came out no better ({before:.3g} to {after:.3g} um)"
+            )
+            return without_unrepeated(_withdrawn(found, k, reason), chained)
+    return found
+
+
+def _withdrawn(found: Search, k: int, reason: str) -> Search:
+    """The search without its k-th effect, with the reason."""
+    kept = [j for j in range(len(found.entries)) if j != k]
+    terms = (*found.terms[: found.declared], *(found.terms[found.declared + j] for j in kept))
+    blocked = {**found.blocked, found.entries[k][0].name: reason}
+    return replace(found, terms=terms, entries=tuple(found.entries[j] for j in kept), blocked=blocked)

@@ -32,7 +32,7 @@ ENTRY_LEVEL, EVENT_LEVEL = 0.01, 0.001
 MOST_EFFECTS = 4
 _SUPERFLUOUS_GAIN = 2.0
 #: An effect must bring the forward-chained error down to this share of what it was, or it only follows chance.
-_EARNED = 0.98
+EARNED = 0.98
 #: An event may make the forward-chained error larger by this factor: chance, not harm.
 _HARMLESS = 1.01
 _MAY_REPEAT = frozenset({"step_event", "periodic_disturbance", "sensor_fault"})
@@ -162,7 +162,7 @@ def search(
         if chosen is None:
             break
         entries.append((chosen, found))
-        terms.append(Term(chosen.name, _member(chosen)))
+        terms.append(Term(chosen.name, member_of(chosen)))
         terms, entries = _re_examine(record, train, terms, entries)
     return Search(record, train, tuple(terms), tuple(entries), tuple(rounds), not_tried, blocked)
 
@@ -204,12 +204,12 @@ def _one_round(
             continue
         refined = _refined(one, tried[one.name], model)
         after = predict(
-            record, np.column_stack([columns_of(record, terms), _member(refined).columns]), train
+            record, np.column_stack([columns_of(record, terms), member_of(refined).columns]), train
         ).chained_rmse
         refined = scores[place] = replace(refined, chained_rmse=after)
         # A level shift is re-learnt by the coefficients of the next part, so an event must only not harm.
-        event = _member(refined).event_s is not None
-        if after < _EARNED * start or (event and after <= _HARMLESS * start) or not np.isfinite(after):
+        event = member_of(refined).event_s is not None
+        if after < EARNED * start or (event and after <= _HARMLESS * start) or not np.isfinite(after):
             return Round(start, tuple(scores), one.name, rejected), refined
         rejected[one.name] = (
             f"significant (p = {one.family_wise_p:.2g}), but the parts of the record that follow are predicted no better with it "
@@ -248,7 +248,8 @@ def _varies(member: Member, train: NDArray[np.bool_]) -> bool:
     return bool((np.ptp(member.columns[train], axis=0) > 0.0).all())
 
 
-def _member(score: RecordScore) -> Member:
+def member_of(score: RecordScore) -> Member:
+    """Best member of a scored effect."""
     assert score.member is not None
     return score.member
 

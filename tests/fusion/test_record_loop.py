@@ -13,12 +13,12 @@ from fusion.config import load_campaign
 from fusion.effects import LIBRARY, Effect, library
 from fusion.members import Member
 from fusion.record.blocks import RecordError, reduce_record
-from fusion.record.effects import thermal_lag_members, unseen_heat_source_members
+from fusion.record.effects import sensor_faults, thermal_lag_members, unseen_heat_source_members
 from fusion.record.gates import blocked_reason, one_switching_share
-from fusion.record.loop import close_record, open_seal
+from fusion.record.loop import close_record, open_seal, without_unrepeated
 from fusion.record.model import fit_record, simulate_channels
 from fusion.record.prediction import channel_rmse
-from fusion.record.search import chain_forward, declare, seal, search
+from fusion.record.search import Chained, chain_forward, declare, seal, search
 from fusion.tables import read_record
 from fusion.twin.recipe import EffectRecipe
 from tests.fusion.record_tables import table_of, twin_table
@@ -151,6 +151,34 @@ def test_an_effect_that_fails_the_seal_is_withdrawn():
     kept, predictions, errors = open_seal(turned)
     assert (kept.entries, len(predictions), len(errors)) == ((), 1, 1)
     assert kept.blocked["periodic_disturbance"].startswith("withdrawn: it was found before the seal")
+
+
+def test_an_effect_that_earlier_parts_did_not_bear_out_is_withdrawn():
+    _, _, found = searched(EffectRecipe("periodic_disturbance", 0.6, parameters={"period_min": 37.0}), seed=44)
+
+    def part(effects: tuple[str, ...], declared: float, final: float) -> Chained:
+        return Chained(0.0, 1.0, effects, np.array([9.0]), np.array([declared]), np.array([final]))
+
+    name = "periodic_disturbance"
+    helped, hurt, without = part((name,), 2.0, 1.0), part((name,), 1.0, 2.1), part((), 1.0, 1.0)
+    assert without_unrepeated(found, [without]) is found
+    assert without_unrepeated(found, [helped, without]) is found
+    kept = without_unrepeated(found, [helped, hurt, without])
+    assert kept.entries == ()
+    assert "the 2 parts of the record that it was tried on" in kept.blocked[name]
+
+
+def test_a_quick_sensor_is_not_a_faulty_one(rng):
+    """A sensor at a source answers every switching of a load that nobody logged; one jump of a slow sensor is a fault."""
+    slow = 20.0 + np.cumsum(rng.normal(0.0, 0.004, (1200, 3)), axis=0)
+    jumped = slow.copy()
+    jumped[600:, 1] += 1.0
+    quick = slow.copy()
+    for first in range(100, 1100, 200):
+        quick[first : first + 100, 1] += 1.0
+    displacement = slow[:, :1] - 20.0 + rng.normal(0.0, 0.01, (1200, 1))
+    assert [place for place, _, _ in sensor_faults(reduce_record(table_of(displacement, jumped)))] == [1]
+    assert sensor_faults(reduce_record(table_of(displacement, quick))) == []
 
 
 CAIVIAC = """\
