@@ -67,24 +67,59 @@ def _map(values: Any) -> dict[str, Any]:
     return {"type": "object", "additionalProperties": values}
 
 
+#: Most values of results.json; a number is null where the data do not determine it.
+_TEXT: dict[str, Any] = {"type": "string"}
+_NUMBER: dict[str, Any] = {"type": ["number", "null"]}
+
+
+def _correlation_schema() -> dict[str, Any]:
+    return _at_least(
+        verdict={"enum": list(ATTRIBUTIONS)},
+        excitation=_TEXT,
+        false_alarm_rate=_NUMBER,
+        source=_map({}),
+        would_tell=_TEXT,
+        unexplained_drift_um_per_h=_map(_NUMBER),
+        modes=_list(_at_least(name=_TEXT, x_mm=_NUMBER, y_mm=_NUMBER, parts=_map({}))),
+        regions=_list(_at_least(name=_TEXT, x_mm=_NUMBER, y_mm=_NUMBER, parts=_map({}))),
+        sensors=_map({}),
+        randomised_duty={
+            "type": ["array", "null"],
+            "items": _at_least(name=_TEXT, cause={"type": "boolean"}, p_value=_NUMBER),
+        },
+    )
+
+
+def _loop_schema() -> dict[str, Any]:
+    step = _at_least(
+        effect=_TEXT,
+        parameters=_map({}),
+        p_value=_NUMBER,
+        rmse_before_um=_NUMBER,
+        rmse_after_um=_NUMBER,
+        runner_up=_map({}),
+    )
+    return _at_least(
+        declared=_list(_TEXT),
+        held_out=_TEXT,
+        noise_floor_um=_NUMBER,
+        rmse_declared_um=_NUMBER,
+        rmse_final_um=_NUMBER,
+        steps=_list(step),
+        verdict={"enum": list(VERDICTS)},
+        unexplained=_at_least(shape=_TEXT, rms_um=_NUMBER),
+    )
+
+
 def results_schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of results.json. A number is null where the data do not determine it."""
-    text = {"type": "string"}
-    number = {"type": ["number", "null"]}
+    text, number = _TEXT, _NUMBER
     measured = _of(value=number, u=number)
     by_direction = {
         "type": "object",
         "properties": {"positive": _list(number), "negative": _list(number)},
         "additionalProperties": False,
     }
-    step = _at_least(
-        effect=text,
-        parameters=_map({}),
-        p_value=number,
-        rmse_before_um=number,
-        rmse_after_um=number,
-        runner_up=_map({}),
-    )
     properties = {
         "schema": {"const": SCHEMA_VERSION},
         "campaign": text,
@@ -114,31 +149,8 @@ def results_schema() -> dict[str, Any]:
                 lag_s=number,
             )
         ),
-        "correlation": _at_least(
-            verdict={"enum": list(ATTRIBUTIONS)},
-            excitation=text,
-            false_alarm_rate=number,
-            source=_map({}),
-            would_tell=text,
-            unexplained_drift_um_per_h=_map(number),
-            modes=_list(_at_least(name=text, x_mm=number, y_mm=number, parts=_map({}))),
-            regions=_list(_at_least(name=text, x_mm=number, y_mm=number, parts=_map({}))),
-            sensors=_map({}),
-            randomised_duty={
-                "type": ["array", "null"],
-                "items": _at_least(name=text, cause={"type": "boolean"}, p_value=number),
-            },
-        ),
-        "loop": _at_least(
-            declared=_list(text),
-            held_out=text,
-            noise_floor_um=number,
-            rmse_declared_um=number,
-            rmse_final_um=number,
-            steps=_list(step),
-            verdict={"enum": list(VERDICTS)},
-            unexplained=_at_least(shape=text, rms_um=number),
-        ),
+        "correlation": _correlation_schema(),
+        "loop": _loop_schema(),
     }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

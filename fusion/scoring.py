@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from fusion.members import Member
 from fusion.model import ModelFit
-from fusion.nulls import DRAWS, critical_gain, least_ratio, simulate_null, tail_probability
+from fusion.nulls import DRAWS, critical_gain, least_ratio, of_all, of_each, simulate_null, tail_probability
 from fusion.projections import (
     by_width,
     density_ahead,
@@ -155,8 +155,8 @@ class Judge:
             p_value, excess = tail_probability(gain, null), gain - float(null.mean())
             place = int(places[best])
             found = FamilyScore(name, named[best][1], gain, excess, p_value, 1.0, 0.0, 1.0, collinear, place)
-            scores.append(replace(found, critical=critical_gain(1.0 - (1.0 - level) ** (1.0 / tried), null)))
-        return [replace(score, family_wise_p=1.0 - (1.0 - score.p_value) ** tried) for score in scores]
+            scores.append(replace(found, critical=critical_gain(of_each(level, tried), null)))
+        return [replace(score, family_wise_p=of_all(score.p_value, tried)) for score in scores]
 
     def refine(self, score: FamilyScore, near: Sequence[Member]) -> FamilyScore:
         """The best of some members near the one that was found; the p-value stays that of the search."""

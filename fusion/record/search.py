@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from fusion.effects import Effect
 from fusion.members import Member
 from fusion.model import Term
-from fusion.nulls import DRAWS, tail_probability
+from fusion.nulls import DRAWS, of_all, tail_probability
 from fusion.record.blocks import Record, RecordError
 from fusion.record.effects import QUASI_STATIC, RecordEffect, quasi_static_columns, record_library
 from fusion.record.gates import blocked_reason
@@ -190,7 +190,7 @@ def _one_round(
             continue
         if members:
             scores.append(_score(name, members, model, draws))
-    scores = [replace(one, family_wise_p=_of_all(one.p_value, len(scores))) for one in scores]
+    scores = [replace(one, family_wise_p=of_all(one.p_value, len(scores))) for one in scores]
     scores.sort(key=lambda one: -one.excess)
     rejected: dict[str, str] = {}
     for place, one in enumerate(scores):
@@ -216,11 +216,6 @@ def _one_round(
             f"({start:.3g} to {after:.3g} um)"
         )
     return Round(start, tuple(scores), "", rejected), None
-
-
-def _of_all(p_value: float, tried: int) -> float:
-    """Chance that the best of so many effects does as well (Sidak), exact for tiny values."""
-    return float(-np.expm1(tried * np.log1p(-min(p_value, 1.0 - 1e-12))))
 
 
 def _score(name: str, members: Sequence[Member], model: RecordFit, draws: Sequence[Array]) -> RecordScore:
