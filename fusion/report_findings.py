@@ -124,6 +124,23 @@ def parameters(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{spaced(name)} {in_words(value)}" for name, value in values.items())
 
 
+def parameters_with_ranges(values: Mapping[str, Any], ranges: Mapping[str, Any]) -> str:
+    """Return parameters, each with what fits as well: ``time constant / min 39.6 (29 to 56), follows duty (or warm up)``."""
+    return ", ".join(
+        f"{spaced(name)} {in_words(value)}{_as_well(ranges[name]) if name in ranges else ''}"
+        for name, value in values.items()
+    )
+
+
+def _as_well(found: Sequence[Any]) -> str:
+    if all(isinstance(word, str) for word in found):
+        return f" (or {join([readable(word) for word in found])})"
+    low, high = (None if value is None else number(float(value), 3) for value in found)
+    if low is None and high is None:
+        return " (not determined)"
+    return f" (at most {high})" if low is None else f" (at least {low})" if high is None else f" ({low} to {high})"
+
+
 _UNITS = {
     "_um_per_K": " / (µm/K)",
     "_um": " / µm",

@@ -17,7 +17,7 @@ from fusion.report_findings import (
     describe_identifiability,
     describe_model,
     evidence,
-    parameters,
+    parameters_with_ranges,
     runner_up,
 )
 from fusion.wording import duration, join, measured, moment, number
@@ -95,7 +95,11 @@ def describe(
         "joint": joint,
         "model": describe_model(loop) if loop else [],
         "loop_numbers": wording.verdict_numbers(loop) if loop else "",
-        "parameters": [parameters(step["parameters"]) for step in loop["steps"]] if loop else [],
+        "parameters": [
+            parameters_with_ranges(step["parameters"], step.get("parameter_ranges", {})) for step in loop["steps"]
+        ]
+        if loop
+        else [],
         "runners_up": [runner_up(step["runner_up"]) for step in loop["steps"]] if loop else [],
         "candidates": describe_candidates(loop) if loop else None,
         "identifiability": describe_identifiability(loop) if loop else [],

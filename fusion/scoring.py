@@ -9,7 +9,7 @@ current model and its drift act, with noise drawn from the residuals; from them 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from fusion.members import Member
 from fusion.model import ModelFit
 from fusion.nulls import DRAWS, critical_gain, least_ratio, of_all, of_each, simulate_null, tail_probability
+from fusion.parameter_ranges import Range, parameter_ranges
 from fusion.projections import (
     by_width,
     density_ahead,
@@ -63,6 +64,7 @@ class FamilyScore:
     collinear : share of members that the model already contains
     drift_place : which drift of the grid suits the member best
     critical : gain from which on the effect enters, as far as chance is concerned
+    ranges : values of the parameters that fit as well, where they were looked at closely
     """
 
     name: str
@@ -76,6 +78,7 @@ class FamilyScore:
     collinear: float
     drift_place: int = 0
     critical: float = np.inf
+    ranges: Mapping[str, Range] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -163,10 +166,12 @@ class Judge:
         gains, places, separable = self._gains(near, np.empty((self.fit.response.size, 0)))
         best = int(np.argmax(np.where(separable, gains[:, 0], -np.inf)))
         gain = float(gains[best, 0])
-        if not separable[best] or gain < score.gain:
+        if separable[best] and gain >= score.gain:
+            excess = score.excess + gain - score.gain
+            score = replace(score, member=near[best], gain=gain, excess=excess, drift_place=int(places[best]))
+        if score.member is None:
             return score
-        excess = score.excess + gain - score.gain
-        return replace(score, member=near[best], gain=gain, excess=excess, drift_place=int(places[best]))
+        return replace(score, ranges=parameter_ranges(near, gains[:, 0], score.member, score.gain))
 
     def confirm(self, scores: Sequence[FamilyScore], families: Mapping[str, Sequence[Member]]) -> list[FamilyScore]:
         """The same scores with the gain in predictive log-density on unused readings, and its chance where nothing is missing.

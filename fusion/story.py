@@ -13,6 +13,7 @@ from fusion.adequacy import Remainder
 from fusion.identifiability import Identifiable
 from fusion.members import Member
 from fusion.model import ModelFit, Term, unexplained_drift
+from fusion.parameter_ranges import Range
 from fusion.readings import Readings
 from fusion.scoring import FamilyScore
 from fusion.search import CONFIRMATION_LEVEL, SEARCH_LEVEL, TIE_GAIN, SealedQuestion
@@ -29,6 +30,7 @@ class Step:
     Attributes
     ----------
     effect, parameters, coefficients : what was added; coefficients by unit as (value, standard uncertainty), from all cycles
+    parameter_ranges : values of the parameters that fit as well (profile likelihood, 95 %)
     p_value : chance that the search adds any effect where nothing is missing
     held_out_p : chance of its gain on unused readings where it is not there
     rmse_before_um, rmse_after_um : open-loop error on the sealed cycles without and with it
@@ -41,6 +43,7 @@ class Step:
 
     effect: str
     parameters: Mapping[str, float | str]
+    parameter_ranges: Mapping[str, Range]
     coefficients: list[dict[str, float | str]]
     p_value: float
     held_out_p: float
@@ -120,7 +123,7 @@ class LoopResult:
 
 
 def _step_json(step: Step) -> dict[str, object]:
-    return {**vars(step), "parameters": dict(step.parameters)}
+    return {**vars(step), "parameters": dict(step.parameters), "parameter_ranges": dict(step.parameter_ranges)}
 
 
 def _score_json(score: FamilyScore) -> dict[str, object]:
@@ -201,6 +204,7 @@ def make_step(
     return Step(
         effect=term.effect,
         parameters=term.member.parameters,
+        parameter_ranges=score.ranges,
         coefficients=coefficients_of(model, term),
         p_value=_entry_p(score),
         held_out_p=score.held_out_p,

@@ -123,6 +123,7 @@ class RecordResult:
         return {
             "effect": term.effect,
             "parameters": dict(term.member.parameters),
+            "parameter_ranges": dict(score.ranges),
             "p_value": score.family_wise_p,
             "rmse_before_um": float(before),
             "rmse_after_um": float(after),

@@ -8,7 +8,7 @@ shrunk together. The last fifth of the time is sealed and touched once, at the e
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from fusion.effects import Effect
 from fusion.members import Member
 from fusion.model import Term
 from fusion.nulls import DRAWS, of_all, tail_probability
+from fusion.parameter_ranges import Range, parameter_ranges
 from fusion.record.blocks import Record, RecordError
 from fusion.record.effects import QUASI_STATIC, RecordEffect, quasi_static_columns, record_library
 from fusion.record.gates import blocked_reason
@@ -50,6 +51,7 @@ class RecordScore:
     gain, excess : gain in log-likelihood over all channels, and that minus the mean gain where nothing is missing
     p_value, family_wise_p : chance of such a gain where nothing is missing, for this effect alone and for the best of all tried
     chained_rmse : error of the forward-chained training blocks with it, um; NaN where it was not worth trying
+    ranges : values of the parameters that fit as well, where they were looked at closely
     """
 
     name: str
@@ -59,6 +61,7 @@ class RecordScore:
     p_value: float
     family_wise_p: float
     chained_rmse: float = np.nan
+    ranges: Mapping[str, Range] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -236,7 +239,10 @@ def _refined(score: RecordScore, effect: RecordEffect, model: RecordFit) -> Reco
     if not near:
         return score
     gain, _ = gains(model, near)
-    return replace(score, member=near[int(np.argmax(gain[:, 0]))])
+    best = int(np.argmax(gain[:, 0]))
+    return replace(
+        score, member=near[best], ranges=parameter_ranges(near, gain[:, 0], near[best], float(gain[best, 0]))
+    )
 
 
 def _varies(member: Member, train: NDArray[np.bool_]) -> bool:

@@ -276,3 +276,15 @@ def test_one_jump_of_the_camera_is_named_once():
     found = close_loop(readings, DECLARED)
     events = [term.member.event_s for term in found.after.terms if term.effect == "camera_offset"]
     assert len(events) == len(set(events)) >= 1
+
+
+def test_the_seal_judges_an_effect_beside_the_others():
+    """The first of two missing effects makes the sealed error larger, because the drift still bends to the second; both are right."""
+    missing = ("air_index", "reversal_drift")
+    found = close_loop(
+        loop_bench.readings_of(*(loop_bench.effect_of(name, 0.4, 21001) for name in missing), seed=21001), DECLARED
+    )
+    assert {step.effect for step in found.steps} == set(missing)
+    first, last = found.steps[0], found.steps[-1]
+    assert first.rmse_after_um > first.rmse_before_um
+    assert last.rmse_after_um < first.rmse_before_um
