@@ -20,6 +20,7 @@ from fusion.report_findings import (
     parameters_with_ranges,
     runner_up,
 )
+from fusion.search import ENTRY_LEVEL
 from fusion.wording import duration, join, measured, moment, number
 
 GLOSSARY = (
@@ -298,6 +299,9 @@ def _uncertainty(results: Mapping[str, Any], fields: xr.Dataset | None) -> list[
             f"{wording.effect_name(step['effect']).capitalize()}: {step['confirmed']}."
             for step in results["loop"]["steps"]
             if "confirmed" in step
+        )
+        sentences.append(
+            f"Where nothing is missing, the closed loop is set to add an effect with a chance of {100 * ENTRY_LEVEL:g} %."
         )
     sentences.append("p-values are corrected for everything that was tried (family-wise), at a level of 5 %.")
     return sentences
