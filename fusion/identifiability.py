@@ -162,8 +162,8 @@ def _alike(
     count, p = len(typical), judge.fit.design.shape[1]
     q, _ = np.linalg.qr(errors[:, count : count + p])
     y = errors[:, :count] - q @ (q.T @ errors[:, :count])
-    reduced, _ = reductions(errors[:, count + p :], y, q, groups)
-    alike = reduced > _ALIKE_SHARE * np.maximum((y**2).sum(axis=0), 1e-300)[:, None]
+    reduced, given, _ = reductions(errors[:, count + p :], y, q, groups)
+    alike = reduced - given > _ALIKE_SHARE * np.maximum((y**2).sum(axis=0), 1e-300)[:, None]
     return [set(names[row].tolist()) for row in alike]
 
 

@@ -43,7 +43,8 @@ class Prior:
 class Member:
     """One way an effect could enter: columns (n, q) in um per unit coefficient, and the parameters that made them.
 
-    ``prior`` is what is known of the first coefficient beforehand, None where nothing is.
+    ``prior`` is what is known of the first coefficient beforehand, None where nothing is. The last ``beside`` columns may be there without
+    the effect; what they explain is no evidence for it.
     """
 
     columns: Array
@@ -51,6 +52,7 @@ class Member:
     units: tuple[str, ...]
     event_s: float | None = None
     prior: Prior | None = None
+    beside: int = 0
 
 
 def _column(*columns: Array) -> Array:
@@ -172,7 +174,8 @@ def unseen_heat_source_members(readings: Readings, _: Mapping[str, float], near:
                 start = [memory * factor for factor in along]
                 per = (f"um/({unit})",) * len(along)
                 yield Member(_column(*known), {**found, "start": "settled"}, per)
-                yield Member(_column(*known, *start), {**found, "start": "free"}, per + ("um",) * len(along))
+                units = per + ("um",) * len(along)
+                yield Member(_column(*known, *start), {**found, "start": "free"}, units, beside=len(along))
 
 
 def refractivity_change_ppm(readings: Readings) -> Array:

@@ -117,32 +117,37 @@ def _evidence(moments: Moments, prior: Array, flat: int) -> Array:
 
 @dataclass(frozen=True)
 class Group:
-    """Members with the same number of columns: their places, and the first column of each, then the second of each (n, width * size)."""
+    """Members with as many columns: their places, and the first column of each, then the second of each (n, width * size).
+
+    The columns that are no evidence for a member stand before its others.
+    """
 
     places: NDArray[np.int64]
     width: int
+    beside: int
     columns: Array
 
 
 def by_width(members: Sequence[Member], used: NDArray[np.bool_]) -> list[Group]:
     """Members at the used readings in groups of equal width, laid out so that products of their columns are products of whole matrices."""
-    widths = np.array([member.columns.shape[1] for member in members])
+    kinds = np.array([(member.columns.shape[1], member.beside) for member in members]).reshape(-1, 2)
     groups = []
-    for width in np.unique(widths):
-        places = np.flatnonzero(widths == width)
-        stacked = np.stack([members[k].columns[used] for k in places], axis=2)
-        groups.append(Group(places, int(width), stacked.reshape(stacked.shape[0], -1)))
+    for width, beside in np.unique(kinds, axis=0):
+        places = np.flatnonzero((kinds == (width, beside)).all(axis=1))
+        stacked = np.stack([np.roll(members[k].columns[used], beside, axis=1) for k in places], axis=2)
+        groups.append(Group(places, int(width), int(beside), stacked.reshape(stacked.shape[0], -1)))
     return groups
 
 
-def reductions(c: Array, y: Array, q: Array, groups: Sequence[Group]) -> tuple[Array, NDArray[np.bool_]]:
+def reductions(c: Array, y: Array, q: Array, groups: Sequence[Group]) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Reduction of the residual sum of squares by every member (responses, members), and which members are separable.
 
-    All whitened: c the members' columns by group, y the responses freed of the model, q an orthonormal basis of the model.
+    Between them, the reduction by what is no evidence for a member. All whitened: c the members' columns by group, y the responses freed
+    of the model, q an orthonormal basis of the model.
     """
     total = sum(group.places.size for group in groups)
     count = y.shape[1]
-    reduced = np.zeros((count, total))
+    reduced, given = np.zeros((count, total)), np.zeros((count, total))
     separable = np.zeros(total, bool)
     products = np.column_stack([y, q]).T @ c
     moments, within = products[:count], products[count:]
@@ -163,18 +168,26 @@ def reductions(c: Array, y: Array, q: Array, groups: Sequence[Group]) -> tuple[A
         # A member that is not separable explains nothing: its factor is replaced, its moment made zero.
         gram[~good] = np.eye(width)
         scaled = [moments[:, slot] * (good / own[k]) for k, slot in enumerate(slots)]
-        reduced[:, group.places] = _explained(np.asarray(np.linalg.cholesky(gram)), scaled)
+        reduced[:, group.places], given[:, group.places] = _explained(
+            np.asarray(np.linalg.cholesky(gram)), scaled, group.beside
+        )
         separable[group.places] = good
-    return reduced, separable
+    return reduced, given, separable
 
 
-def _explained(lower: Array, moment: list[Array]) -> Array:
-    """Squared length of every response along each member, by forward substitution with the Cholesky factors (members, width, width)."""
+def _explained(lower: Array, moment: list[Array], first: int) -> tuple[Array, Array]:
+    """Squared length of every response along each member and along its first columns, by forward substitution.
+
+    ``lower`` (members, width, width) are the Cholesky factors.
+    """
     total = np.zeros_like(moment[0])
+    along_first = total
     solved: list[Array] = []
     for i, along in enumerate(moment):
+        if i == first:
+            along_first = total.copy()
         for j, before in enumerate(solved):
             along = along - lower[:, i, j] * before
         solved.append(along / lower[:, i, i])
         total += solved[i] ** 2
-    return total
+    return total, along_first

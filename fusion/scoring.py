@@ -60,7 +60,7 @@ class FamilyScore:
     excess : gain minus the mean gain the same search finds where nothing is missing
     p_value : chance of such a gain where nothing is missing, for this effect alone
     family_wise_p : the same for the best of all effects that were tried
-    held_out_gain, held_out_p : gain on blocks that were not used for the coefficients, and its chance where nothing is missing
+    held_out_gain, held_out_p : gain on readings that were not used for the coefficients, and its chance where nothing is missing
     collinear : share of members that the model already contains
     drift_place : which drift of the grid suits the member best
     critical : gain from which on the effect enters, as far as chance is concerned
@@ -157,7 +157,9 @@ class Judge:
             gain = float(gains[best, 0])
             p_value, excess = tail_probability(gain, null), gain - float(null.mean())
             place = int(places[best])
-            found = FamilyScore(name, named[best][1], gain, excess, p_value, 1.0, 0.0, 1.0, collinear, place)
+            found = FamilyScore(
+                name, named[best][1], gain, excess, p_value, 1.0, 0.0, 1.0, collinear, drift_place=place
+            )
             scores.append(replace(found, critical=critical_gain(of_each(level, tried), null)))
         return [replace(score, family_wise_p=of_all(score.p_value, tried)) for score in scores]
 
@@ -224,6 +226,9 @@ class Judge:
         n, count = known.shape[0], known.shape[1] - self.fit.design.shape[1]
         best_null = np.full(count, -np.inf)
         best = np.full((count, len(members)), -np.inf)
+        known_beside = np.array([member.beside for member in members])
+        started = np.flatnonzero(known_beside)
+        best_started = np.full((count, started.size), -np.inf)
         best_grid = np.zeros(len(members), int)
         separable = np.zeros(len(members), bool)
         for place, system in enumerate(self.systems()):
@@ -235,20 +240,19 @@ class Judge:
             q, _ = np.linalg.qr(x)
             y -= q @ (q.T @ y)
             rss = (y**2).sum(axis=0)
-            reduced, separate = reductions(c, y[:n], q[:n], groups)
-            # In place: these matrices are large, and fetching memory for new ones takes as long as the sums.
-            likelihood = np.subtract(rss[:, None], reduced, out=reduced)
-            np.log(np.maximum(likelihood, 1e-12 * rss[:, None], out=likelihood), out=likelihood)
-            likelihood *= -0.5 * n
-            likelihood -= 0.5 * log_determinant
+            reduced, given, separate = reductions(c, y[:n], q[:n], groups)
+            likelihood = _likelihood(rss, reduced, n, log_determinant)
             best_null = np.maximum(best_null, -0.5 * (n * np.log(rss) + log_determinant))
+            best_started = np.maximum(best_started, _likelihood(rss, given[:, started], n, log_determinant))
             better = likelihood[0] > best[0]
             best_grid[better] = place
             np.maximum(best, likelihood, out=best)
             separable |= separate
         # A further coefficient must earn its keep (Akaike): the simpler of two members that fit alike is preferred.
         widths = np.array([member.columns.shape[1] for member in members])
-        return (best - best_null[:, None] - (widths - 1.0)).T, best_grid, separable
+        without = np.repeat(best_null[:, None], len(members), axis=1)
+        without[:, started] = np.maximum(without[:, started], best_started - known_beside[started])
+        return (best - without - (widths - 1.0)).T, best_grid, separable
 
     def _event_gain(self, members: Sequence[Member], place: int) -> Array:
         """Gain of an event whose instant and size come from one half of the targets on the other half, and back, (1 + draws,)."""
@@ -290,6 +294,16 @@ class Judge:
             for before, after in zip(known, ahead, strict=True)
         ]
         return [np.asarray(one - chosen[0]) for one in chosen[1:]]
+
+
+def _likelihood(squares: Array, reduced: Array, readings: int, log_determinant: float) -> Array:
+    """Log-likelihood (responses, members) once ``reduced`` is taken from the sums of squares (responses,); overwrites ``reduced``."""
+    # In place: these matrices are large, and fetching memory for new ones takes as long as the sums.
+    likelihood = np.subtract(squares[:, None], reduced, out=reduced)
+    np.log(np.maximum(likelihood, 1e-12 * squares[:, None], out=likelihood), out=likelihood)
+    likelihood *= -0.5 * readings
+    likelihood -= 0.5 * log_determinant
+    return likelihood
 
 
 def _is_event(score: FamilyScore) -> bool:

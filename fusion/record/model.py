@@ -178,7 +178,7 @@ def _channel_gains(
         q, _ = np.linalg.qr(x)
         y = y - q @ (q.T @ y)
         rss = (y**2).sum(axis=0)
-        reduced, tells = reductions(c, y, q, groups)
+        reduced, _, tells = reductions(c, y, q, groups)
         left = np.maximum(rss[:, None] - reduced, 1e-12 * rss[:, None])
         best = np.maximum(best, -0.5 * (n * np.log(left) + log_determinant))
         without = np.maximum(without, -0.5 * (n * np.log(rss) + log_determinant))
