@@ -288,3 +288,10 @@ def test_the_seal_judges_an_effect_beside_the_others():
     first, last = found.steps[0], found.steps[-1]
     assert first.rmse_after_um > first.rmse_before_um
     assert last.rmse_after_um < first.rmse_before_um
+
+
+def test_a_laser_that_warms_up_is_no_heat_source():
+    """The memory of a body that starts warm decays alike, but that is no evidence for the load."""
+    laser = loop_bench.effect_of("laser_warm_up", 0.4, 22004)
+    found = close_loop(loop_bench.readings_of(laser, seed=22004), DECLARED)
+    assert [step.effect for step in found.steps] == ["laser_warm_up"]
