@@ -172,7 +172,7 @@ def unseen_heat_source_members(readings: Readings, _: Mapping[str, float], near:
                 found: Parameters = {"follows": name, **response, "shape": shape}
                 known = [settled * factor for factor in along]
                 start = [memory * factor for factor in along]
-                per = (f"um/({unit})",) * len(along)
+                per = (_per(unit),) * len(along)
                 yield Member(_column(*known), {**found, "start": "settled"}, per)
                 units = per + ("um",) * len(along)
                 yield Member(_column(*known, *start), {**found, "start": "free"}, units, beside=len(along))
@@ -215,7 +215,12 @@ def reversal_drift_members(readings: Readings, _: Mapping[str, float], near: Mem
 
 def _state_unit(readings: Readings, found: Mapping[str, float | str]) -> str:
     follows = str(found["follows"])
-    return "um" if follows == "warm_up" else f"um/({readings.series[follows].units})"
+    return "um" if follows == "warm_up" else _per(readings.series[follows].units)
+
+
+def _per(unit: str) -> str:
+    """Unit of a shift per unit of what drives it; a share has none."""
+    return "um" if unit == "1" else f"um/({unit})"
 
 
 def step_event_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
