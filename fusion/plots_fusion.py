@@ -133,6 +133,33 @@ def plot_residual_direction(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axe
     return ax
 
 
+def plot_residual_spectrum(loop: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot the power of the innovations over period, before and after the loop, with the limit that noise alone hardly exceeds."""
+    ax = new_axes(ax)
+    for name, colour, text in _stages(loop):
+        power = loop[name.replace("residual", "periodogram")]
+        ax.plot(power["period"], power, color=colour, label=text)
+    ax.axhline(power.attrs["limit"], color=MUTED, linewidth=0.8, linestyle="--", label="strongest of noise, 95 %")
+    ax.set(xlabel="period / min", ylabel="power over that of noise", xscale="log", ylim=(0, None))
+    ax.legend()
+    return ax
+
+
+def plot_residual_events(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot the sum of all innovations up to every reading: a walk without preference where nothing happens, a kink at an event."""
+    ax = new_axes(ax)
+    hours = hours_since_start(deviations).values.ravel()
+    for name, colour, text in _stages(loop):
+        values = loop[name.replace("residual", "innovation")].transpose("cycle", "direction", "target").values.ravel()
+        known = np.flatnonzero(np.isfinite(values) & np.isfinite(hours))
+        order = known[np.argsort(hours[known], kind="stable")]
+        ax.plot(hours[order], np.cumsum(values[order]) / np.sqrt(order.size), color=colour, label=text)
+    ax.axhline(0.0, color=MUTED, linewidth=0.8)
+    ax.set(xlabel="time since first reading / h", ylabel="sum of innovations / √n")
+    ax.legend()
+    return ax
+
+
 def plot_contributions(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot what each effect of the final model contributes over time at the far end of the axis, positive approach."""
     ax = new_axes(ax)

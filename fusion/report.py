@@ -98,6 +98,8 @@ def draw_figures(results: Mapping[str, Any], datasets: Mapping[str, xr.Dataset])
         charts["residual_time"] = lambda: plots_fusion.plot_residual_time(loop, deviations)
         charts["residual_position"] = lambda: plots_fusion.plot_residual_position(loop, deviations)
         charts["residual_direction"] = lambda: plots_fusion.plot_residual_direction(loop, deviations)
+        charts["residual_spectrum"] = lambda: plots_fusion.plot_residual_spectrum(loop)
+        charts["residual_events"] = lambda: plots_fusion.plot_residual_events(loop, deviations)
         charts["contributions"] = lambda: plots_fusion.plot_contributions(loop, deviations)
     return {name: svg_text(draw, name) for name, draw in charts.items()}
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fusion import wording
-from fusion.wording import join, measured, number
+from fusion.wording import duration, join, measured, number
 
 
 def describe_model(loop: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -102,6 +102,41 @@ def describe_candidates(loop: Mapping[str, Any]) -> dict[str, Any] | None:
         "p (held out)",
     ]
     return {"columns": columns, "rows": rows} if rows else None
+
+
+#: Shapes of a residual in the order they are told: key in results.json, words, and what says where it is.
+_SHAPES = (
+    ("memory", "memory from reading to reading"),
+    ("event", "a shift at one instant"),
+    ("rhythm", "a rhythm"),
+    ("curvature", "curvature along the axis"),
+    ("one place", "one position by itself"),
+    ("direction", "difference of the approaches"),
+    ("direction along the axis", "difference of the approaches that grows along the axis"),
+    ("pattern", "any pattern of positions"),
+    ("slow pattern", "any slow pattern of positions"),
+)
+
+
+def describe_residual(loop: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Return every shape of the residual with its p-value, or its size, for the declared and the final model."""
+    tests = loop.get("residual_tests")
+    if not tests:
+        return []
+    declared, final = tests["declared"], tests["final"]
+    rows = [(words, _chance(declared, name), _chance(final, name)) for name, words in _SHAPES]
+    for name, words in (("drift_common_um", "shift of all positions"), ("drift_stretch_um", "stretch of the axis")):
+        rows.append((words, f"{_small(declared[name])} µm rms", f"{_small(final[name])} µm rms"))
+    return rows
+
+
+def _chance(tests: Mapping[str, Any], name: str) -> str:
+    """Return p, and where the shape is: the instant of an event, the period of a rhythm."""
+    place = {
+        "event": f", {duration(tests['event_s'])} from the start",
+        "rhythm": f", {number(tests['period_min'], 2)} min",
+    }
+    return f"p {wording.p_value(tests['p_values'][name])}{place.get(name, '')}"
 
 
 def runner_up(found: Mapping[str, Any]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,6 +22,7 @@ from fusion.outcome import Outcome
 from fusion.progress import Report
 from fusion.readings import Readings, read_fused
 from fusion.record.effects import QUASI_STATIC
+from fusion.residual_tests import ResidualTests, examine_residual
 from fusion.results import Notice
 from fusion.sources import Source, counted, listed
 from interferometry import iso230, neighbours
@@ -156,7 +157,13 @@ def model_drift(
         found = on_corrected_fields(
             found, read_fused(right), {one.effect for one in errors}, effects=library_for(source)
         )
-    variables = loop_variables(fused, found)
+    # The declared model is shown on the fields as they came, also where they were put right afterwards.
+    declared = fit_model(found.before.readings, found.before.terms)
+    tests = {
+        name: examine_residual(model, np.random.default_rng(1))
+        for name, model in (("declared", declared), ("final", found.after))
+    }
+    variables = loop_variables(fused, found, declared, tests)
     if errors:
         corrected = {f"{name}_corrected": right[name] for name in ("mean_rise", "axis_integral", "local_rise")}
         variables = variables.assign(corrected_variables(fields, fused, errors)).assign(corrected)
@@ -177,7 +184,11 @@ def model_drift(
     report("anomalies", 1, 1)
     parts = {
         "anomalies": [anomaly_part(*pair) for pair in zip(anomalies, diagnoses, strict=True)],
-        "loop": {**found.as_json(), "field_corrections": [one.as_json() for one in errors]},
+        "loop": {
+            **found.as_json(),
+            "field_corrections": [one.as_json() for one in errors],
+            "residual_tests": {name: one.as_json() for name, one in tests.items()},
+        },
     }
     return Outcome(variables, parts, (*gap_notices(readings), *field_notices(errors)))
 
@@ -289,11 +300,11 @@ def outside_notices(fused: xr.Dataset) -> list[Notice]:
     ]
 
 
-def loop_variables(fused: xr.Dataset, found: LoopResult) -> xr.Dataset:
-    """Return the residuals before and after, and what each effect contributes, at every reading."""
+def loop_variables(
+    fused: xr.Dataset, found: LoopResult, declared: ModelFit, tests: Mapping[str, ResidualTests]
+) -> xr.Dataset:
+    """Return the residuals before and after with their spectra, and what each effect contributes, at every reading."""
     readings = found.after.readings
-    # The declared model is shown on the fields as they came, also where they were put right afterwards.
-    declared = fit_model(found.before.readings, found.before.terms)
     dims = ("cycle", "direction", "target")
     shape = tuple(fused.sizes[name] for name in dims)
     place = (
@@ -317,8 +328,34 @@ def loop_variables(fused: xr.Dataset, found: LoopResult) -> xr.Dataset:
             "residual_declared": (dims, spread(centred(declared)), um),
             "residual_final": (dims, spread(centred(found.after)), um),
             "contribution": (("effect", *dims), contribution, um),
+            **{
+                f"innovation_{name}": (
+                    dims,
+                    spread(one.innovations),
+                    {
+                        "units": "1",
+                        "long_name": "reading against its prediction from those before it, over its standard deviation",
+                    },
+                )
+                for name, one in tests.items()
+            },
+            **{
+                f"periodogram_{name}": (
+                    "period",
+                    one.power,
+                    {
+                        "units": "1",
+                        "long_name": "power of the innovations over that of noise",
+                        "limit": one.power_limit,
+                    },
+                )
+                for name, one in tests.items()
+            },
         },
-        coords={"effect": unique},
+        coords={
+            "effect": unique,
+            "period": ("period", tests["final"].periods_min, {"units": "min", "long_name": "period"}),
+        },
     )
 
 
