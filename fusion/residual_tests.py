@@ -13,15 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion import adequacy
+from fusion.episodes import cycle_starts
 from fusion.model import ModelFit, unexplained_drift
 from interferometry.statespace import Array
 
 _PERMUTATIONS = 400
 #: Autocorrelations that count as memory; one turn of a cycle has some thirty readings.
 _LAGS = 12
-#: Shortest period, and how many are looked at: half the resolution of the record apart from two periods on.
+#: Shortest period, how many are looked at, half the resolution of the record apart, and how many turns the longest makes.
 _SHORTEST_MIN = 3.0
 _MOST_PERIODS = 300
+_FEWEST_TURNS = 2.0
+#: A rhythm so many lines of the spectrum from that of the cycles is theirs.
+_CYCLE_LINES = 4.0
 #: Single readings beyond this many standard deviations count as this many.
 _CLIP = 4.0
 _LIMIT = 0.95
@@ -40,6 +44,7 @@ class ResidualTests:
     innovations : (n,) every reading against its prediction from those before it, in standard deviations
     periods_min, power : (m,) periods and their power, 1 where nothing but noise is
     power_limit : the power that the strongest of all periods exceeds by chance once in 20 campaigns
+    cycle_min : length of a cycle, min
     """
 
     p_values: dict[str, float]
@@ -50,6 +55,14 @@ class ResidualTests:
     periods_min: Array
     power: Array
     power_limit: float
+    cycle_min: float
+
+    @property
+    def period_is_cycle(self) -> bool:
+        """Whether the strongest rhythm is that of the cycles: any slow change of the profile or the reversal has lines there."""
+        turns = self.cycle_min / self.period_min
+        resolution = self.cycle_min / (_FEWEST_TURNS * float(self.periods_min[0]))
+        return abs(turns - max(1.0, round(turns))) < _CYCLE_LINES * resolution
 
     @property
     def period_min(self) -> float:
@@ -64,6 +77,7 @@ class ResidualTests:
             "drift_stretch_um": self.stretch_um,
             "event_s": self.event_s,
             "period_min": self.period_min,
+            "period_is_cycle": self.period_is_cycle,
         }
 
 
@@ -103,13 +117,16 @@ def examine_residual(model: ModelFit, rng: np.random.Generator) -> ResidualTests
         periods_min=periods,
         power=power[0],
         power_limit=float(np.quantile(strongest, _LIMIT)),
+        cycle_min=float(np.median(np.diff(cycle_starts(readings)))) / 60.0,
     )
 
 
 def _periods_min(seconds: Array) -> Array:
     """Periods that are looked at, longest first."""
     span = float(seconds[-1] - seconds[0]) / 60.0
-    return np.asarray(1.0 / np.arange(2.0 / span, 1.0 / _SHORTEST_MIN, 0.5 / span, dtype=np.float64)[:_MOST_PERIODS])
+    return np.asarray(
+        1.0 / np.arange(_FEWEST_TURNS / span, 1.0 / _SHORTEST_MIN, 0.5 / span, dtype=np.float64)[:_MOST_PERIODS]
+    )
 
 
 def _shuffled(values: Array, rng: np.random.Generator) -> Array:

@@ -41,6 +41,13 @@ def test_a_rhythm_is_seen_with_its_period():
     assert found.p_values["rhythm"] < 0.005
     assert found.period_min == pytest.approx(9.0, rel=0.03)  # half the resolution of 4.2 h is 1.8 % of it
     assert found.power.max() > found.power_limit
+    assert not found.period_is_cycle
+
+
+def test_a_changing_reversal_is_known_by_the_rhythm_of_the_cycles():
+    _, found = residual_of(EffectRecipe("reversal_drift", amplitude_um=0.6))
+    assert found.p_values["direction"] < 0.005
+    assert found.period_is_cycle
 
 
 def test_the_same_seed_gives_the_same_chances():
