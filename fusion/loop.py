@@ -337,13 +337,18 @@ def _loss(model: ModelFit, terms: Sequence[Term]) -> float:
 def _keep_right_patterns(
     search: Search, whole: ModelFit, steps: list[Step], declared: int
 ) -> tuple[ModelFit, list[Step]]:
-    """Withdraw the name of an effect whose pattern along the axis is not what the readings show; it was the nearest, not the cause."""
+    """Withdraw the name of an effect whose pattern along the axis is not what the readings show; it was the nearest, not the cause.
+
+    What was found after it goes with it: it was judged beside a pattern that was not there.
+    """
     wrong = wrong_patterns(whole, whole.terms[declared:])
     if not wrong:
         return whole, steps
-    for number, reason in wrong.items():
-        search.blocked[steps[number].effect] = f"withdrawn: {reason}"
-    kept = [k for k in range(len(steps)) if k not in wrong]
+    first = min(wrong)
+    for number, step in enumerate(steps[first:], first):
+        beside = f"found beside {steps[first].effect}, whose name was withdrawn: the model it was judged by was wrong"
+        search.blocked[step.effect] = f"withdrawn: {wrong.get(number, beside)}"
+    kept = range(first)
     added = [whole.terms[declared + k] for k in kept]
     named = list(whole.terms[:declared])
     # Errors of the steps that remain are those without the withdrawn ones.
