@@ -5,6 +5,7 @@ from __future__ import annotations
 import fnmatch
 import json
 import re
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -17,6 +18,8 @@ from fusion.config import Campaign, CampaignError, RecordTable
 from fusion.quantities import QuantityError, conversion, unit_name
 from interferometry.delimited import BadReading, Rejected, parse_time, read_table, read_timed_rows, refuse_hopeless
 
+#: What pandas says of a line that has more fields than the header.
+_SKIPPED = re.compile(r"Skipping line (\d+): expected (\d+) fields, saw (\d+)")
 _HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
 
 
@@ -102,12 +105,13 @@ def read_record(campaign: Campaign) -> xr.Dataset:
     if record is None:
         raise TableError(f"{campaign.path}: there is no [record] in this campaign")
     path = campaign.resolve(record.file)
-    frame = _read_frame(path, record)
+    frame, misfits = _read_frame(path, record)
     columns = list(frame.columns)
     if record.time not in columns:
         raise TableError(f'{path}: no column is named "{record.time}"; the file has: {", ".join(columns)}')
     others = [column for column in columns if column != record.time]
     time, left_out = _times(path, frame[record.time], record)
+    left_out = [*misfits, *left_out]
     keep = ~np.isnat(time)
     order = np.argsort(time[keep], kind="stable")
 
@@ -144,16 +148,48 @@ def read_record(campaign: Campaign) -> xr.Dataset:
     )
 
 
-def _read_frame(path: Path, record: RecordTable) -> pd.DataFrame:
-    """Return the whole table as text and numbers, whatever the file's kind."""
+def _read_frame(path: Path, record: RecordTable) -> tuple[pd.DataFrame, list[Rejected]]:
+    """Return the whole table as text and numbers, whatever the file's kind, and the lines that do not fit its header."""
+    left_out: list[Rejected] = []
     try:
         if path.suffix.lower() in {".xlsx", ".xlsm"}:
             frame = pd.read_excel(path, sheet_name=record.sheet or 0)
         else:
-            frame = pd.read_csv(path, sep=None, engine="python", encoding="utf-8-sig")
+            frame, left_out = _read_text(path)
     except (ValueError, OSError, pd.errors.ParserError) as error:
         raise TableError(f"{path}: cannot be read as a table: {error}; save it as CSV in UTF-8 or as XLSX") from None
-    return frame.rename(columns=lambda name: str(name).strip())
+    return frame.rename(columns=lambda name: str(name).strip()), left_out
+
+
+def _read_text(path: Path) -> tuple[pd.DataFrame, list[Rejected]]:
+    """Read delimited text with the dialect that its header line shows."""
+    delimiter = _delimiter(path)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", pd.errors.ParserWarning)
+        frame = pd.read_csv(
+            path,
+            sep=delimiter,
+            # Spreadsheets that part fields by semicolons write decimal commas.
+            decimal="," if delimiter == ";" else ".",
+            comment="#",
+            skipinitialspace=True,
+            index_col=False,
+            on_bad_lines="warn",
+            encoding="utf-8-sig",
+        )
+    if any("loss of data" in str(one.message) for one in told):
+        raise ValueError("the lines hold more fields than the header names; name every column")
+    skipped = [found for one in told for found in _SKIPPED.findall(str(one.message))]
+    return frame, [
+        Rejected(path.name, int(line), f"{saw} fields", f"{due} were expected") for line, due, saw in skipped
+    ]
+
+
+def _delimiter(path: Path) -> str:
+    """Return what parts the fields of a text file, from its header line."""
+    with path.open(encoding="utf-8-sig") as file:
+        header = next((line for line in file if line.strip() and not line.startswith("#")), "")
+    return max(",;\t", key=header.count)
 
 
 def _times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarray, list[Rejected]]:

@@ -80,9 +80,32 @@ def test_a_record_is_converted_to_the_units_of_the_calculation(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
+    ("delimiter", "point", "end"), [(",", ".", ""), (";", ",", ""), (";", ".", ""), ("\t", ".", ""), (";", ",", ";")]
+)
+def test_a_record_may_be_written_as_any_spreadsheet_does(tmp_path: Path, delimiter: str, point: str, end: str) -> None:
+    lines = ["time [min]|t1 [degC]|ch1 [um]|spindle [rpm]", "0|20.5|1.25|0", "1|21.5|-2.5|500"]
+    written = [line.replace("|", delimiter) for line in lines[:1]]
+    written += [line.replace(".", point).replace("|", delimiter) + end for line in lines[1:]]
+    data = read_record(load_campaign(record(tmp_path, "# logger 7\n" + "\n".join(written) + "\n")))
+    np.testing.assert_array_equal(data["temperature"].values[:, 0], [20.5, 21.5])
+    np.testing.assert_array_equal(data["displacement"].values[:, 0], [1.25, -2.5])
+
+
+def test_lines_of_a_record_that_do_not_fit_its_header_are_listed(tmp_path: Path) -> None:
+    rows = "".join(f"{k},20,1,0\n" for k in range(5))
+    campaign = record(tmp_path, f"time [min],t1 [degC],ch1 [um],spindle [rpm]\n{rows}5,20,1,0,7\n6,20,1,0\n")
+    data = read_record(load_campaign(campaign))
+    assert data.sizes["time"] == 6
+    assert json.loads(data.attrs["left_out"]) == [
+        {"path": "record.csv", "line": 7, "value": "5 fields", "reason": "4 were expected"}
+    ]
+
+
+@pytest.mark.parametrize(
     ("content", "time", "message"),
     [
         ("time [min],t1 [bar],ch1 [um],spindle [rpm]\n0,1,1,1\n1,1,1,1\n", "time [min]", r'the column "t1 \[bar\]": "bar" is not a unit of a temperature'),
+        ("time [min],t1 [degC],ch1 [um],spindle [rpm]\n0,20,1,1,5\n1,21,1,1,5\n", "time [min]", "the lines hold more fields than the header names; name every column"),
         ("time [min],t1 [degC],ch1,spindle [rpm]\n0,1,1,1\n1,1,1,1\n", "time [min]", 'the column "ch1" has no unit'),
         ("time [min],t1 [degC],ch1 [um],spindle [rpm]\n0,a,1,1\n1,b,1,1\n", "time [min]", r'the column "t1 \[degC\]" holds no number'),
         ("time [min],t1 [degC],ch1 [um]\n0,1,1\n1,1,1\n", "time [min]", r'no column is named "spindle\*"; the file has: t1 \[degC\], ch1 \[um\]'),
