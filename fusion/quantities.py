@@ -10,7 +10,7 @@ UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "mm": {
         "nm": (1e-6, 0.0), "um": (1e-3, 0.0), "mm": (1.0, 0.0), "cm": (10.0, 0.0), "m": (1e3, 0.0), "in": (25.4, 0.0),
     },
-    "um": {"nm": (1e-3, 0.0), "um": (1.0, 0.0), "mm": (1e3, 0.0), "m": (1e6, 0.0)},
+    "um": {"nm": (1e-3, 0.0), "um": (1.0, 0.0), "mm": (1e3, 0.0), "m": (1e6, 0.0), "in": (25.4e3, 0.0)},
     "degC": {"degC": (1.0, 0.0), "K": (1.0, -273.15), "degF": (5.0 / 9.0, -160.0 / 9.0)},
     "s": {"ms": (1e-3, 0.0), "s": (1.0, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0)},
     "ppm/K": {"ppm/K": (1.0, 0.0), "um/m/K": (1.0, 0.0), "1/K": (1e6, 0.0)},
@@ -18,8 +18,15 @@ UNITS: dict[str, dict[str, tuple[float, float]]] = {
 }  # fmt: skip
 _SPELLINGS = {
     "µm": "um", "μm": "um", "°C": "degC", "℃": "degC", "C": "degC", "°F": "degF", "F": "degF", "sec": "s",
-    "minutes": "min", "hours": "h", "ppm/degC": "ppm/K", "ppm/°C": "ppm/K", "um/(m K)": "um/m/K", "µm/m/K": "um/m/K",
+    "ppm/degC": "ppm/K", "ppm/°C": "ppm/K", "um/(m K)": "um/m/K", "µm/m/K": "um/m/K",
     "K^-1": "1/K",
+}  # fmt: skip
+#: Units written out, in any case.
+_WORDS = {
+    "deg c": "degC", "degree c": "degC", "degrees c": "degC", "celsius": "degC", "degree celsius": "degC", "degrees celsius": "degC",
+    "kelvin": "K", "deg f": "degF", "fahrenheit": "degF", "micron": "um", "microns": "um", "micrometer": "um", "micrometers": "um",
+    "micrometre": "um", "micrometres": "um", "millimeter": "mm", "millimetre": "mm", "second": "s", "seconds": "s", "minute": "min",
+    "minutes": "min", "hr": "h", "hrs": "h", "hour": "h", "hours": "h",
 }  # fmt: skip
 _EXAMPLES = {
     "mm": "5 mm", "um": "5 um", "degC": "22 degC", "s": "37 s", "ppm/K": "11.7 ppm/K", "mm/min": "300 mm/min",
@@ -38,7 +45,7 @@ class QuantityError(ValueError):
 def unit_name(text: str) -> str:
     """Return the house spelling of a unit (``"°C"`` -> ``"degC"``), or the text itself where none is known."""
     text = text.strip()
-    return _SPELLINGS.get(text, text)
+    return _SPELLINGS.get(text) or _WORDS.get(text.lower(), text)
 
 
 def conversion(unit: str, target: str) -> tuple[float, float]:

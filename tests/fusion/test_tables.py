@@ -36,6 +36,8 @@ def record(folder: Path, content: str, *, time: str = "time [min]", more: str = 
 def test_headings_carry_name_and_unit() -> None:
     assert split_heading(Path("x"), "t1 [degC]") == ("t1", "degC")
     assert split_heading(Path("x"), "t1(°C)") == ("t1", "degC")
+    assert split_heading(Path("x"), "head (deg C)") == ("head", "degC")
+    assert split_heading(Path("x"), "Z [Microns]") == ("Z", "um")
     assert split_heading(Path("x"), "spindle speed (RPM) ") == ("spindle speed", "RPM")
     with pytest.raises(
         TableError, match=r'the column "duty" has no unit; write it in the heading, for example "duty \[1\]"'
