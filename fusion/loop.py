@@ -172,7 +172,7 @@ def on_corrected_fields(
         found,
         declared_coefficients=_declared_coefficients(whole, len(found.declared)),
         noise_floor_um=whole.fit.sigma,
-        rmse_final_um=rmse(fit_model(readings, terms, used=used).open_loop_errors()[0]),
+        rmse_final_um=_sealed_error(readings, used, terms),
         verdict=_verdict(bool(found.steps), bool(remainder.shape)),
         remainder=remainder,
         nuisance=nuisance_size(whole),
@@ -296,12 +296,10 @@ def _second_look(
         before = whole
         whole = settled(fit_model(search.readings, [*whole.terms, term]), search.effects)
         term = whole.terms[-1]
-        sealed_from = search.readings.seconds[~search.used].min()
-        if term.member.event_s is not None and term.member.event_s >= sealed_from - _cycle_length(search.readings):
-            after = _late_event_error(search, whole)
+        after = _sealed_error(search.readings, search.used, whole.terms)
+        if _is_late(search.readings, search.used, term):
             confirmed = "found among the sealed cycles; sized on one half of the targets, tested on the other"
         else:
-            after = rmse(search.fit(whole.terms).open_loop_errors()[0])
             confirmed = "named with the sealed cycles in view, coefficients from the cycles before: the error after is optimistic"
         if after > _WORSE * error:
             search.blocked[best.name] = (
@@ -358,7 +356,7 @@ def _keep_right_patterns(
 
 def _chain_errors(search: Search, declared: list[Term], added: list[Term], steps: list[Step]) -> list[Step]:
     """The same steps with the errors on the sealed cycles that they have one after the other."""
-    errors = [rmse(search.fit([*declared, *added[:k]]).open_loop_errors()[0]) for k in range(len(added) + 1)]
+    errors = [_sealed_error(search.readings, search.used, [*declared, *added[:k]]) for k in range(len(added) + 1)]
     return [replace(step, rmse_before_um=errors[k], rmse_after_um=errors[k + 1]) for k, step in enumerate(steps)]
 
 
@@ -370,8 +368,16 @@ def _cycle_length(readings: Readings) -> float:
     return float(np.median(np.diff(cycle_starts(readings))))
 
 
-def _late_event_error(search: Search, whole: ModelFit) -> float:
-    """Error on the sealed cycles where an event among them is sized on one half of the targets and tested on the other."""
-    half = search.readings.target_index % 2 == 0
-    parts = [fit_model(search.readings, whole.terms, used=search.used | fitted) for fitted in (half, ~half)]
+def _is_late(readings: Readings, used: NDArray[np.bool_], term: Term) -> bool:
+    """Whether a term is an event among the sealed cycles, of which the cycles before tell nothing."""
+    sealed_from = readings.seconds[~used].min()
+    return term.member.event_s is not None and term.member.event_s >= sealed_from - _cycle_length(readings)
+
+
+def _sealed_error(readings: Readings, used: NDArray[np.bool_], terms: Sequence[Term]) -> float:
+    """Error on the sealed cycles, um; where an event lies among them, it is sized on one half of the targets and tested on the other."""
+    if not any(_is_late(readings, used, term) for term in terms):
+        return rmse(fit_model(readings, terms, used=used).open_loop_errors()[0])
+    half = readings.target_index % 2 == 0
+    parts = [fit_model(readings, terms, used=used | fitted) for fitted in (half, ~half)]
     return rmse(np.concatenate([part.open_loop_errors()[0] for part in parts]))

@@ -295,3 +295,12 @@ def test_a_laser_that_warms_up_is_no_heat_source():
     laser = loop_bench.effect_of("laser_warm_up", 0.4, 22004)
     found = close_loop(loop_bench.readings_of(laser, seed=22004), DECLARED)
     assert [step.effect for step in found.steps] == ["laser_warm_up"]
+
+
+def test_an_event_among_the_sealed_cycles_does_not_hide_what_acts_beside_it():
+    """The cycles before the seal say nothing of the event, so every error beside it is that of sizing it on half of the targets."""
+    missing = ("unseen_heat_source:flat", "step_event")
+    effects = [loop_bench.effect_of(name, 0.4, 23018) for name in missing]
+    found = close_loop(loop_bench.readings_of(*effects, seed=23018), DECLARED)
+    assert [step.effect for step in found.steps] == ["step_event", "unseen_heat_source"]
+    assert found.rmse_final_um < 1.1 * found.noise_floor_um
