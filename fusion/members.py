@@ -238,14 +238,14 @@ def periods_min(readings: Readings) -> Array:
     Periods that the cycle or its halves would imitate are left out: every slow change of the profile has lines there.
     """
     span = _span_min(readings)
-    return np.asarray(1.0 / _off_the_cycle(readings, np.arange(3.0 / span, 1.0 / 3.0, 0.5 / span, dtype=np.float64)))
+    return np.asarray(1.0 / off_the_cycle(readings, np.arange(3.0 / span, 1.0 / 3.0, 0.5 / span, dtype=np.float64)))
 
 
 def _span_min(readings: Readings) -> float:
     return float(readings.seconds[-1] - readings.seconds[0]) / 60.0
 
 
-def _off_the_cycle(readings: Readings, frequencies: Array) -> Array:
+def off_the_cycle(readings: Readings, frequencies: Array) -> Array:
     """Those frequencies (1/min) that are not within four lines of the cycle or its parts."""
     cycle = 60.0 / float(np.median(np.diff(cycle_starts(readings))))
     order = np.maximum(1.0, np.round(frequencies / cycle))
@@ -311,7 +311,7 @@ def _close_periods(readings: Readings, found_min: float) -> Array:
     span = _span_min(readings)
     near = 1.0 / found_min + np.linspace(-0.5, 0.5, 21) / span
     near = near[(near > 2.999 / span) & (near < 1.001 / 3.0)]
-    return np.asarray(1.0 / _off_the_cycle(readings, near))
+    return np.asarray(1.0 / off_the_cycle(readings, near))
 
 
 def pitch_error_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:

@@ -132,9 +132,10 @@ def describe_residual(loop: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 
 def _chance(tests: Mapping[str, Any], name: str) -> str:
     """Return p, and where the shape is: the instant of an event, the period of a rhythm."""
+    whose = " (that of the cycles)" if tests["period_is_cycle"] else ""
     place = {
         "event": f", {duration(tests['event_s'])} from the start",
-        "rhythm": f", {number(tests['period_min'], 2)} min",
+        "rhythm": f", {number(tests['period_min'], 2)} min{whose}",
     }
     return f"p {wording.p_value(tests['p_values'][name])}{place.get(name, '')}"
 
@@ -157,6 +158,11 @@ def print_unit(unit: str) -> str:
 def parameters(values: Mapping[str, Any]) -> str:
     """Return parameters as ``name value, name value``."""
     return ", ".join(f"{spaced(name)} {in_words(value)}" for name, value in values.items())
+
+
+def step_parameters(loop: Mapping[str, Any]) -> list[str]:
+    """Return the parameters of every step of the loop, each with what fits as well."""
+    return [parameters_with_ranges(step["parameters"], step.get("parameter_ranges", {})) for step in loop["steps"]]
 
 
 def parameters_with_ranges(values: Mapping[str, Any], ranges: Mapping[str, Any]) -> str:

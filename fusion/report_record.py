@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from fusion import plots_record, wording
-from fusion.report_findings import in_words, parameters_with_ranges, runner_up
+from fusion.report_findings import in_words, runner_up, step_parameters
 from fusion.wording import duration, join, moment, number
 
 if TYPE_CHECKING:
@@ -94,9 +94,7 @@ def describe_record(results: Mapping[str, Any], provenance: Mapping[str, Any], r
             ("Input files", f"{len(provenance['inputs'])}, listed with their SHA-256 under Provenance"),
         ],
         "shown": list(enumerate(shown_channels(record))),
-        "parameters": [
-            parameters_with_ranges(step["parameters"], step.get("parameter_ranges", {})) for step in loop["steps"]
-        ],
+        "parameters": step_parameters(loop),
         "runners_up": [runner_up(step["runner_up"]) for step in loop["steps"]],
         "rejected": [
             (wording.effect_name(row["effect"]), readable_reason(row["rejected"]))

@@ -18,8 +18,8 @@ from fusion.report_findings import (
     describe_model,
     describe_residual,
     evidence,
-    parameters_with_ranges,
     runner_up,
+    step_parameters,
 )
 from fusion.search import ENTRY_LEVEL
 from fusion.wording import duration, join, measured, moment, number
@@ -97,11 +97,7 @@ def describe(
         "joint": joint,
         "model": describe_model(loop) if loop else [],
         "loop_numbers": wording.verdict_numbers(loop) if loop else "",
-        "parameters": [
-            parameters_with_ranges(step["parameters"], step.get("parameter_ranges", {})) for step in loop["steps"]
-        ]
-        if loop
-        else [],
+        "parameters": step_parameters(loop) if loop else [],
         "runners_up": [runner_up(step["runner_up"]) for step in loop["steps"]] if loop else [],
         "candidates": describe_candidates(loop) if loop else None,
         "residual": describe_residual(loop) if loop else [],

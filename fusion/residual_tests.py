@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion import adequacy
-from fusion.episodes import cycle_starts
+from fusion.members import off_the_cycle
 from fusion.model import ModelFit, unexplained_drift
 from interferometry.statespace import Array
 
@@ -24,8 +24,6 @@ _LAGS = 12
 _SHORTEST_MIN = 3.0
 _MOST_PERIODS = 300
 _FEWEST_TURNS = 2.0
-#: A rhythm so many lines of the spectrum from that of the cycles is theirs.
-_CYCLE_LINES = 4.0
 #: Single readings beyond this many standard deviations count as this many.
 _CLIP = 4.0
 _LIMIT = 0.95
@@ -44,7 +42,7 @@ class ResidualTests:
     innovations : (n,) every reading against its prediction from those before it, in standard deviations
     periods_min, power : (m,) periods and their power, 1 where nothing but noise is
     power_limit : the power that the strongest of all periods exceeds by chance once in 20 campaigns
-    cycle_min : length of a cycle, min
+    period_is_cycle : whether the strongest rhythm is that of the cycles, where any slow change of profile or reversal has lines
     """
 
     p_values: dict[str, float]
@@ -55,14 +53,7 @@ class ResidualTests:
     periods_min: Array
     power: Array
     power_limit: float
-    cycle_min: float
-
-    @property
-    def period_is_cycle(self) -> bool:
-        """Whether the strongest rhythm is that of the cycles: any slow change of the profile or the reversal has lines there."""
-        turns = self.cycle_min / self.period_min
-        resolution = self.cycle_min / (_FEWEST_TURNS * float(self.periods_min[0]))
-        return abs(turns - max(1.0, round(turns))) < _CYCLE_LINES * resolution
+    period_is_cycle: bool
 
     @property
     def period_min(self) -> float:
@@ -117,7 +108,7 @@ def examine_residual(model: ModelFit, rng: np.random.Generator) -> ResidualTests
         periods_min=periods,
         power=power[0],
         power_limit=float(np.quantile(strongest, _LIMIT)),
-        cycle_min=float(np.median(np.diff(cycle_starts(readings)))) / 60.0,
+        period_is_cycle=not off_the_cycle(readings, 1.0 / periods[[np.argmax(power[0])]]).size,
     )
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from fusion.effects import library
 from fusion.model import Term, fit_model
+from fusion.report_findings import describe_residual
 from fusion.residual_tests import examine_residual
 from fusion.twin.recipe import EffectRecipe
 from tests.fusion.loop_bench import DECLARED, readings_of
@@ -48,6 +49,9 @@ def test_a_changing_reversal_is_known_by_the_rhythm_of_the_cycles():
     _, found = residual_of(EffectRecipe("reversal_drift", amplitude_um=0.6))
     assert found.p_values["direction"] < 0.005
     assert found.period_is_cycle
+    rows = describe_residual({"residual_tests": {"declared": found.as_json(), "final": found.as_json()}})
+    told = {shape: declared for shape, declared, _ in rows}
+    assert told["a rhythm"].endswith("min (that of the cycles)")
 
 
 def test_the_same_seed_gives_the_same_chances():
