@@ -16,7 +16,16 @@ import xarray as xr
 
 from fusion.config import Campaign, CampaignError, RecordTable
 from fusion.quantities import QuantityError, conversion, unit_name
-from interferometry.delimited import BadReading, Rejected, parse_time, read_table, read_timed_rows, refuse_hopeless
+from interferometry.delimited import (
+    BadReading,
+    Rejected,
+    delimiter_of,
+    find_header,
+    parse_time,
+    read_table,
+    read_timed_rows,
+    refuse_hopeless,
+)
 
 #: What pandas says of a line that has more fields than the header.
 _SKIPPED = re.compile(r"Skipping line (\d+): expected (\d+) fields, saw (\d+)")
@@ -163,7 +172,9 @@ def _read_frame(path: Path, record: RecordTable) -> tuple[pd.DataFrame, list[Rej
 
 def _read_text(path: Path) -> tuple[pd.DataFrame, list[Rejected]]:
     """Read delimited text with the dialect that its header line shows."""
-    delimiter = _delimiter(path)
+    with path.open(encoding="utf-8-sig") as file:
+        before, header = find_header(file)
+    delimiter = delimiter_of(header)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", pd.errors.ParserWarning)
         frame = pd.read_csv(
@@ -171,7 +182,7 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, list[Rejected]]:
             sep=delimiter,
             # Spreadsheets that part fields by semicolons write decimal commas.
             decimal="," if delimiter == ";" else ".",
-            comment="#",
+            skiprows=before,
             skipinitialspace=True,
             index_col=False,
             on_bad_lines="warn",
@@ -179,17 +190,12 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, list[Rejected]]:
         )
     if any("loss of data" in str(one.message) for one in told):
         raise ValueError("the lines hold more fields than the header names; name every column")
+    # Lines are counted in the file.
+    frame.index += before
     skipped = [found for one in told for found in _SKIPPED.findall(str(one.message))]
     return frame, [
         Rejected(path.name, int(line), f"{saw} fields", f"{due} were expected") for line, due, saw in skipped
     ]
-
-
-def _delimiter(path: Path) -> str:
-    """Return what parts the fields of a text file, from its header line."""
-    with path.open(encoding="utf-8-sig") as file:
-        header = next((line for line in file if line.strip() and not line.startswith("#")), "")
-    return max(",;\t", key=header.count)
 
 
 def _times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarray, list[Rejected]]:
@@ -211,7 +217,7 @@ def _times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarr
             except BadReading:
                 continue
     for at in np.flatnonzero(np.isnat(time)):
-        left_out.append(Rejected(path.name, int(at) + 2, str(column.iloc[at]), "is not a time"))
+        left_out.append(Rejected(path.name, int(column.index[at]) + 2, str(column.iloc[at]), "is not a time"))
     refuse_hopeless(path, int((~np.isnat(time)).sum()), left_out)
     return time, left_out
 

@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -106,10 +106,10 @@ def read_table(path: Path, required: tuple[str, ...]) -> Table:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as fault:
         raise LaserFormatError(f"{path}: byte {fault.start} is not UTF-8 text; save the file as CSV in UTF-8") from None
-    header = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
+    _, header = find_header(text.splitlines())
     if not header:
         raise LaserFormatError(f"{path}: the file is empty; expected a header line {','.join(required)}")
-    delimiter = max(",;\t", key=header.count)
+    delimiter = delimiter_of(header)
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
     lines = [
         (reader.line_num, fields)
@@ -129,6 +129,16 @@ def read_table(path: Path, required: tuple[str, ...]) -> Table:
             f"{path}, line {head_line}: column {', '.join(repeated)} stands there more than once; keep one"
         )
     return Table(path, names, lines[1:], delimiter == ";")
+
+
+def find_header(lines: Iterable[str]) -> tuple[int, str]:
+    """Return the header line and how many stand before it: the first that is neither empty nor starts with ``#``, "" where none is."""
+    return next(((at, line) for at, line in enumerate(lines) if line.strip() and not line.startswith("#")), (0, ""))
+
+
+def delimiter_of(header: str) -> str:
+    """Return what parts the fields, from a header line: the comma, semicolon or tab that stands there most often."""
+    return max(",;\t", key=header.count)
 
 
 def read_timed_rows(

@@ -93,6 +93,16 @@ def test_a_record_may_be_written_as_any_spreadsheet_does(tmp_path: Path, delimit
     np.testing.assert_array_equal(data["displacement"].values[:, 0], [1.25, -2.5])
 
 
+def test_a_number_sign_in_a_heading_is_part_of_it_and_lines_are_counted_in_the_file(tmp_path: Path) -> None:
+    rows = "".join(f"{k},20,1,0\n" for k in range(5))
+    campaign = record(
+        tmp_path, f"# logger 7\ntime [min],t #1 [degC],ch1 [um],spindle [rpm]\n{rows}?,20,1,0\n5,20,1,0,7\n"
+    )
+    data = read_record(load_campaign(campaign))
+    assert data["sensor"].values.tolist() == ["t #1"]
+    assert [(one["line"], one["value"]) for one in json.loads(data.attrs["left_out"])] == [(9, "5 fields"), (8, "?")]
+
+
 def test_lines_of_a_record_that_do_not_fit_its_header_are_listed(tmp_path: Path) -> None:
     rows = "".join(f"{k},20,1,0\n" for k in range(5))
     campaign = record(tmp_path, f"time [min],t1 [degC],ch1 [um],spindle [rpm]\n{rows}5,20,1,0,7\n6,20,1,0\n")
