@@ -1,4 +1,4 @@
-"""around - The command: run, simulate, inspect, iso230, schema, export, plan. Bad input ends with one paragraph and exit code 2."""
+"""The command: run, simulate, inspect, iso230, schema, export, plan. Bad input ends with one paragraph and exit code 2."""
 
 from __future__ import annotations
 
@@ -73,9 +73,9 @@ def run(
 
     Temperature maps, drift, anomalies, the closed loop, and report.html.
     """
-    from fusion.pipeline import run_campaign
-    from fusion.progress import Reporter
-    from fusion.summary import summary_table
+    from fusion.pipeline.run import run_campaign
+    from fusion.products.progress import Reporter
+    from fusion.report.terminal import summary_table
 
     if len(campaigns) > 2:
         errors.print("thermofuse: one campaign, or two of one machine, can be analysed at a time", highlight=False)
@@ -89,7 +89,7 @@ def run(
             console.print(summary_table(results))
             console.print(f"report: {(folder / 'report.html').resolve()}", soft_wrap=True, highlight=False)
         if len(folders) == 2:
-            from fusion.joint import join_campaigns
+            from fusion.pipeline.two_campaigns import join_campaigns
 
             for name, text in join_campaigns([folder for _, folder in folders], folders[0][1].parent):
                 console.print(f"both campaigns, {name}: {text}", soft_wrap=True, highlight=False)
@@ -114,7 +114,7 @@ def simulate(
 
     Writes the files that the instruments would write; the truth is kept beside the folder.
     """
-    from fusion.progress import Reporter
+    from fusion.products.progress import Reporter
     from fusion.twin.instruments import simulate_campaign
 
     with _answering(), Reporter(console) as report:
@@ -128,7 +128,7 @@ def inspect(
     thumbnails: Annotated[Path | None, typer.Option(help="Folder for a small PNG of every thermal file.")] = None,
 ) -> None:
     """Tell what files hold and what looks wrong."""
-    from fusion.inspection import describe_file, write_thumbnail
+    from fusion.report.terminal import describe_file, write_thumbnail
 
     with _answering():
         for path in files:
@@ -146,7 +146,7 @@ def iso230(
     cycles: Annotated[str | None, typer.Option(help="Window, for example 1-5; left out: all cycles.")] = None,
 ) -> None:
     """Evaluate a file by ISO 230-2."""
-    from fusion.summary import iso230_tables
+    from fusion.report.terminal import iso230_tables
 
     with _answering():
         for table in iso230_tables(file, cycles):
@@ -158,8 +158,8 @@ def schema(
     name: Annotated[str, typer.Argument(metavar="results|campaign", help="Which file to describe.")] = "results",
 ) -> None:
     """Print the JSON Schema of a file."""
-    from fusion.config import campaign_schema
-    from fusion.results import results_schema
+    from fusion.campaign.config import campaign_schema
+    from fusion.products.results import results_schema
 
     schemas = {"results": results_schema, "campaign": campaign_schema}
     if name not in schemas:
@@ -178,7 +178,7 @@ def export(
 
     Drift, profile and fields as CSV, or the drift-free profile as the compensation table of a control.
     """
-    from fusion.exports import export_results
+    from fusion.report.exports import export_results
 
     with _answering():
         for path in export_results(results, format.value, out or results / "export"):
@@ -203,7 +203,7 @@ def plan(
 
     A random one, which tells heat sources apart that are otherwise taken for each other.
     """
-    from fusion.summary import duty_lines
+    from fusion.report.terminal import duty_lines
 
     with _answering():
         for line in duty_lines(source, effect=effect, drift=drift, noise=noise, cycle=cycle, power=power, seed=seed):

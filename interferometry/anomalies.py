@@ -1,4 +1,4 @@
-"""L3 - Positions that do not behave like the others: excess scatter, slow excess, step, periodic motion.
+"""Positions that do not behave like the others: excess scatter, slow excess, step, periodic motion.
 
 Everything is tested on the random part of the joint estimate, which belongs to one position and direction; the
 differences of the paper belong to two. Null distributions come from permutations of the readings themselves, so that
@@ -7,6 +7,8 @@ heavy tails do not raise false alarms, and every p-value is corrected for all po
 Two questions are kept apart: "do the positions scatter unequally?" (permutation, robust against tails) and "does one
 stand out from the natural spread of the others?" (generalised extreme Studentized deviate, Rosner 1983, Technometrics
 25, 165). A position with excess scatter is an anomaly of the machine only if both say so.
+
+Which of a few numbers stand out from the natural spread of the others.
 """
 
 from __future__ import annotations
@@ -20,9 +22,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import stats
 
-from interferometry.outliers import generalised_esd
-
-Array = NDArray[np.float64]
+from interferometry._typing import Array
 
 #: Share of the error probability given to each kind of anomaly (Bonferroni weights; they sum to one).
 WEIGHTS = {"scatter": 0.7, "slow": 0.1, "step": 0.1, "periodic": 0.1}
@@ -390,3 +390,42 @@ def _describe_series(
         at_cycle=at_cycle,
         period_s=period_s,
     )
+
+
+def generalised_esd(values: Array, *, most: int, level: float = 0.05, high_only: bool = False) -> NDArray[np.bool_]:
+    """Mark outliers by the generalised extreme Studentized deviate test (Rosner 1983).
+
+    Parameters
+    ----------
+    values : (n,) ndarray
+    most : int
+        Largest number of outliers looked for.
+    level : float
+    high_only : bool
+        Look for values that are too large only, and give the whole error probability to that side.
+
+    Returns
+    -------
+    (n,) bool ndarray
+    """
+    n = values.size
+    left = np.ones(n, dtype=bool)
+    order: list[int] = []
+    outliers = 0
+    for i in range(1, min(most, n - 2) + 1):
+        centre, spread = values[left].mean(), values[left].std(ddof=1)
+        if spread == 0:
+            break
+        deviation = np.where(
+            left, (values - centre) / spread if high_only else np.abs(values - centre) / spread, -np.inf
+        )
+        at = int(np.argmax(deviation))
+        p = 1 - level / ((1 if high_only else 2) * (n - i + 1))
+        t = stats.t.ppf(p, n - i - 1)
+        if deviation[at] > (n - i) * t / np.sqrt((n - i - 1 + t**2) * (n - i + 1)):
+            outliers = i
+        order.append(at)
+        left[at] = False
+    marked = np.zeros(n, dtype=bool)
+    marked[order[:outliers]] = True
+    return marked

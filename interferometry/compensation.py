@@ -1,4 +1,4 @@
-"""L1 - Index of air, dead path and material expansion: what a laser's compensation did, undone and done again.
+"""Index of air, dead path and material expansion: what a laser's compensation did, undone and done again.
 
 A linear interferometer counts half wavelengths. Its display multiplies them by the environment factor
 ``lambda_vac / (2 n (1 + alpha (T - 20 degC)))``: the wavelength in air of index n, and the scale of a material of
@@ -13,9 +13,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 import ref_index
 import xarray as xr
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from interferometry._typing import Array
 
 #: Vacuum wavelength of the stabilised HeNe laser in nm, as genuine files imply it (632.990616 .. 632.990634).
 VACUUM_WAVELENGTH_NM = 632.990625

@@ -1,4 +1,4 @@
-"""L0 - What a positioning test holds beside its deviations, in lines: what is missing, and what the instrument did with the air."""
+"""What a positioning test holds beside its deviations, in lines: what is missing, and what the instrument did with the air."""
 
 from __future__ import annotations
 

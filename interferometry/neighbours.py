@@ -1,4 +1,4 @@
-"""L3 - Differences of neighbouring positions, and the conventional evaluation beside them.
+"""Differences of neighbouring positions, and the conventional evaluation beside them.
 
 Equations (1) to (10) and the deviation charts of "Elimination of thermal drift in measuring the positioning
 accuracy of a three axis milling machine". What equations (5) and (6) call a sample standard deviation divides by

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.datasets import DatasetError, fetch
+from fusion.sample_data import DatasetError, fetch
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""L0 - What a FLIR file holds, in facts and in lines, with a warning for everything that looks wrong."""
+"""What a FLIR file holds, in facts and in lines, with a warning for everything that looks wrong."""
 
 from __future__ import annotations
 
@@ -9,16 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from thermography.flir import (
-    CameraParameters,
-    FlirFormatError,
-    Frame,
-    FrameReference,
-    Rejected,
-    index_frames,
-    read_frame,
-)
-from thermography.radiometry import (
+from thermography.io.flir import FrameReference, Rejected, index_frames, read_frame
+from thermography.io.frame import CameraParameters, FlirFormatError, Frame
+from thermography.radiometry.planck import (
     ZERO_CELSIUS_K,
     RadiometryError,
     calibrate,

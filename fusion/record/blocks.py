@@ -1,4 +1,4 @@
-"""L3 - A record of sensors and channels, reduced to blocks of time on which its displacements are modelled.
+"""A record of sensors and channels, reduced to blocks of time on which its displacements are modelled.
 
 A record holds thousands of samples in which a machine hardly moves. They are averaged over blocks that are short beside any thermal
 time constant; drivers are averaged after they are raised to a power, because heat follows a power of the speed.
@@ -14,8 +14,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from fusion.readings import Readings, Series, sample_noise
-from interferometry.statespace import Array
+from fusion._typing import Array
+from fusion.alignment.readings import Readings, Series, sample_noise
 
 #: Blocks that a record is averaged to at most: more cost time and hold no more of what is slow.
 MOST_BLOCKS = 600
@@ -141,7 +141,7 @@ def reduce_record(table: xr.Dataset) -> Record:
     Parameters
     ----------
     table : Dataset
-        As :func:`fusion.tables.read_record` returns it.
+        As :func:`fusion.campaign.logged_tables.read_record` returns it.
 
     Raises
     ------

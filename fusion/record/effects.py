@@ -1,4 +1,4 @@
-"""L4 - The library of effects for a record: the same physics as along an axis, every channel with coefficients of its own."""
+"""The library of effects for a record: the same physics as along an axis, every channel with coefficients of its own."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fusion.effects import LIBRARY, Effect, library
-from fusion.episodes import jumps
-from fusion.members import LAGS_MIN, Member, periods_min
-from fusion.readings import Series
+from fusion.alignment.readings import Series
+from fusion.effects.candidates import LAGS_MIN, Member, periods_min
+from fusion.effects.jumps import jumps
+from fusion.effects.library import LIBRARY, Effect, library
 from fusion.record.blocks import EXPONENTS, Record
 
 #: What a record is modelled with where nothing else is declared: every displacement a linear function of the temperatures.
@@ -42,7 +42,7 @@ class RecordEffect:
 
     Attributes
     ----------
-    name : as in the library of :mod:`fusion.effects`
+    name : as in the library of :mod:`fusion.effects.library`
     members : from the record (and a member near which to look closer) to columns (blocks, q) that every channel follows with its
         own coefficients
     needs : why it cannot be tried with this record, or None

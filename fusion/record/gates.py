@@ -1,17 +1,18 @@
-"""L4 - Reasons not to name an effect of a record although it fits: too little excitation, or a sensor too noisy to carry a lag.
+"""Reasons not to name an effect of a record although it fits: too little excitation, or a sensor too noisy to carry a lag.
 
-The same questions as along an axis (:mod:`fusion.gates`), asked of one sensor and of the load's own course.
+The same questions as along an axis (:mod:`fusion.loop.admissibility`), asked of one sensor and of the load's own course.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from fusion.members import Member
+from fusion._typing import Array
+from fusion.effects.candidates import Member
 from fusion.record.blocks import Record
 from fusion.record.effects import RecordEffect
 from fusion.record.model import RecordFit, gains
-from interferometry.statespace import Array, fit_fixed_effects
+from interferometry.drift.gls import fit_fixed_effects
 
 #: Temperature noise over range beyond which a lag is not believed (statistics study, section 3.4).
 _NOISE_SHARE = 0.01

@@ -1,4 +1,4 @@
-"""L4 - What the closed loop on a record has to tell: errors on the sealed part, steps, verdict, as results.json says it."""
+"""What the closed loop on a record has to tell: errors on the sealed part, steps, verdict, as results.json says it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.effects import Effect
-from fusion.model import Term, place_of
+from fusion._typing import Array
+from fusion.effects.library import Effect
+from fusion.loop.result import rivals
+from fusion.model.fit import Term, place_of
 from fusion.record.blocks import Record
 from fusion.record.model import RecordFit, columns_of, fit_record
 from fusion.record.prediction import Prediction, channel_rmse, persistence_rmse, predict
@@ -28,8 +30,6 @@ from fusion.record.search import (
     seal,
     search,
 )
-from fusion.story import rivals
-from interferometry.statespace import Array
 
 
 @dataclass(frozen=True)

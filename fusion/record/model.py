@@ -1,4 +1,4 @@
-"""L4 - A model of a record: tested under a drift that is free to wander, predicted with shrunken coefficients.
+"""A model of a record: tested under a drift that is free to wander, predicted with shrunken coefficients.
 
 Two fits serve two questions. Whether an effect is there is asked under a drift in every channel that may explain the same thing
 (generalised least squares; statistics study, section 1.5). What the model predicts for hours ahead is asked of coefficients that
@@ -14,12 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.members import Member
-from fusion.model import Term
-from fusion.nulls import least_ratio, plausible_ratios
-from fusion.projections import Group, by_width, reductions
+from fusion._typing import Array
+from fusion.effects.candidates import Member
+from fusion.model.fit import Term
+from fusion.model.least_squares import Group, by_width, reductions
+from fusion.model.null_simulation import least_ratio, plausible_ratios
 from fusion.record.blocks import Record, RecordError, independent
-from interferometry.statespace import Array, DriftFit, estimate
+from interferometry.drift.gls import DriftFit, estimate
 
 #: Drift variances that are tried for every member, as factors of the estimated one: from none to ten times as much.
 _DRIFT_FACTORS = (1e-6, 10**-2.5, 0.1, 1.0, 10**0.5, 10.0)

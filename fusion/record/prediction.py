@@ -1,4 +1,4 @@
-"""L4 - Predicting hours ahead: coefficients shrunk together, how strongly decided by forward chaining inside the training part.
+"""Predicting hours ahead: coefficients shrunk together, how strongly decided by forward chaining inside the training part.
 
 Nothing is learnt from the predicted part: no level, no drift, no re-zeroing. Ridge regression on standardised columns (Hoerl and
 Kennard 1970); its penalty is the one that predicts best when each chronological block of the training part is predicted from those
@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion._typing import Array
 from fusion.record.blocks import Record
-from interferometry.statespace import Array
 
 #: Shares of a column's variance that are added to it: from ordinary least squares to hardly any coefficient at all.
 PENALTIES = 10.0 ** np.arange(-5.0, 1.6, 0.5)

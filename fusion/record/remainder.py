@@ -1,4 +1,4 @@
-"""L4 - What a model of a record leaves: tests of its structure, and a description of it in words.
+"""What a model of a record leaves: tests of its structure, and a description of it in words.
 
 Two things can be left. A shape in the innovations of the fit: where only drift and noise act they are exchangeable in time, so that
 permuting them gives every statistic its null. And a drift that the fit lets wander freely and that no test of the innovations can see:
@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.adequacy import LEVEL
-from fusion.nulls import family_wise
+from fusion._typing import Array
+from fusion.diagnosis.remainder import LEVEL
+from fusion.model.null_simulation import family_wise
 from fusion.record.blocks import Record
 from fusion.record.model import RecordFit
-from interferometry.statespace import Array
 
 _PERMUTATIONS = 400
 #: Largest share of the displacements' variance that may be left without being called unexplained.

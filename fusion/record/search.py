@@ -1,7 +1,7 @@
-"""L4 - The closed loop on a record: what the quasi-static model of the temperatures lacks, and the error before and after.
+"""The closed loop on a record: what the quasi-static model of the temperatures lacks, and the error before and after.
 
-The same procedure as along an axis (:mod:`fusion.loop`), with what a record asks for: every channel has a drift and coefficients of
-its own, an effect enters only if it also predicts better the load cycles that follow, and the prediction is that of coefficients
+The same procedure as along an axis (:mod:`fusion.loop.closed_loop`), with what a record asks for: every channel has a drift and coefficients
+of its own, an effect enters only if it also predicts better the load cycles that follow, and the prediction is that of coefficients
 shrunk together. The last fifth of the time is sealed and touched once, at the end.
 """
 
@@ -14,17 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from fusion.effects import Effect
-from fusion.members import Member
-from fusion.model import Term
-from fusion.nulls import DRAWS, of_all, tail_probability
-from fusion.parameter_ranges import Range, parameter_ranges
+from fusion._typing import Array
+from fusion.effects.candidates import Member
+from fusion.effects.library import Effect
+from fusion.loop.scoring import Range, parameter_ranges
+from fusion.model.fit import Term
+from fusion.model.null_simulation import DRAWS, of_all, tail_probability
 from fusion.record.blocks import Record, RecordError
 from fusion.record.effects import QUASI_STATIC, RecordEffect, quasi_static_columns, record_library
 from fusion.record.gates import blocked_reason
 from fusion.record.model import RecordFit, columns_of, fit_record, gains, simulate_channels
 from fusion.record.prediction import Prediction, channel_rmse, persistence_rmse, predict
-from interferometry.statespace import Array
 
 SEALED_SHARE = 0.2
 #: Chance of adding an effect where only drift and noise act. A drift that wanders at random is a stand-in for what a real machine

@@ -1,4 +1,4 @@
-"""around - The twin's camera: pinhole and lens, low-emissivity discs, its own forward radiometry, noise, counts.
+"""The twin's camera: pinhole and lens, low-emissivity discs, its own forward radiometry, noise, counts.
 
 The forward formula is the vendor's measurement equation (FLIR user's manuals, "measurement formula"), written here by itself.
 """
@@ -14,10 +14,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from fusion.twin.effects import EFFECTS
-from fusion.twin.recipe import Camera, Plan
+from fusion.twin.machine.effects import EFFECTS
+from fusion.twin.machine.recipe import Camera, Plan
+from fusion.twin.machine.streams import stream
 from fusion.twin.simulate import Truth
-from fusion.twin.streams import stream
 
 Floats = NDArray[np.floating[Any]]
 Image = NDArray[np.floating[Any]]

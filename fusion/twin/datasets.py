@@ -1,4 +1,4 @@
-"""around - A simulated campaign in the form that perfect instruments and a perfect reduction would hand over, without files.
+"""A simulated campaign in the form that perfect instruments and a perfect reduction would hand over, without files.
 
 Studies by simulation run hundreds of campaigns; rendering and reading frames would be all of their time. These Datasets keep the
 same contracts as what the instruments hand to the fusion. The fields carry the noise that averaging a frame over a cell leaves.
@@ -13,9 +13,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.twin.camera import counts_of, make_view
-from fusion.twin.effects import EFFECTS
+from fusion.twin.machine.effects import EFFECTS
+from fusion.twin.machine.streams import stream
 from fusion.twin.simulate import Truth
-from fusion.twin.streams import stream
 
 Floats = NDArray[np.floating[Any]]
 KELVIN_RISE = {"units": "K", "units_metadata": "temperature: difference"}

@@ -1,4 +1,4 @@
-"""around - The twin's instruments: a campaign folder as a laboratory would leave it, and the truth in a folder beside it."""
+"""The twin's instruments: a campaign folder as a laboratory would leave it, and the truth in a folder beside it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ import numpy as np
 import xarray as xr
 
 from fusion.twin.camera import KELVIN, SC660, Renderer, fiducial_points, make_view
-from fusion.twin.recipe import RecipeError
+from fusion.twin.machine.recipe import RecipeError
+from fusion.twin.machine.streams import stream
 from fusion.twin.recipe_file import read_recipe
 from fusion.twin.record import simulate_record, write_record
 from fusion.twin.simulate import Truth, driver_log, environment_log, simulate, spread
-from fusion.twin.streams import stream
-from interferometry.writers import write_deviations_csv, write_environment_csv, write_rtl
-from thermography.flir import CalibratedRange, CameraIdentity, CameraParameters, Frame, write_jpeg, write_sequence
+from interferometry.io.writers import write_deviations_csv, write_environment_csv, write_rtl
+from thermography.io.flir_writer import write_jpeg, write_sequence
+from thermography.io.frame import CalibratedRange, CameraIdentity, CameraParameters, Frame
 
 Progress = Callable[[int, int, str], None]
 TRUTH_CELL_MM = 2.5

@@ -1,4 +1,4 @@
-"""around - RECIPE.toml to `Recipe`, refused with file, key, value and remedy where it says what no twin can do."""
+"""RECIPE.toml to `Recipe`, refused with file, key, value and remedy where it says what no twin can do."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from fusion.twin.effects import EFFECTS
-from fusion.twin.local import ANOMALIES
-from fusion.twin.recipe import EffectRecipe, Recipe, RecipeError, Record
+from fusion.twin.machine.effects import ANOMALIES, EFFECTS
+from fusion.twin.machine.recipe import EffectRecipe, Recipe, RecipeError, Record
 
 #: Directions and angles that a record can hold.
 CHANNELS = 6
@@ -227,7 +226,7 @@ def packaged_recipe(name: str) -> Path:
     RecipeError
         There is none of that name.
     """
-    folder = Path(__file__).parents[1] / "recipes"
+    folder = Path(__file__).parent / "recipes"
     path = folder / f"{name}.toml"
     if not path.is_file():
         raise RecipeError(

@@ -1,4 +1,4 @@
-"""around - The twin as a record: temperature sensors and displacement channels of a whole machine over hours, as in ISO 230-3.
+"""The twin as a record: temperature sensors and displacement channels of a whole machine over hours, as in ISO 230-3.
 
 Parts of the machine are lumps of heat joined by conductances; the spindle is one of them and carries no sensor. Every channel
 moves with the parts that do, and with what the recipe switches on without declaring it. A ``cycle`` in an effect's parameters is
@@ -17,11 +17,11 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from fusion.twin.effects import EFFECTS
-from fusion.twin.recipe import EffectRecipe, Recipe, RecipeError, Record
+from fusion.twin.machine.effects import EFFECTS
+from fusion.twin.machine.recipe import EffectRecipe, Recipe, RecipeError, Record
+from fusion.twin.machine.session import Session
+from fusion.twin.machine.streams import first_order, random_levels, stream
 from fusion.twin.recipe_file import check_recipe
-from fusion.twin.session import Session
-from fusion.twin.streams import first_order, random_levels, stream
 
 Floats = NDArray[np.floating[Any]]
 #: Heat capacity (J/K) and exchange with the air (W/K) of every part; the spindle is heated and carries no sensor.

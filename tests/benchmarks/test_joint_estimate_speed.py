@@ -10,9 +10,8 @@ from scipy import linalg
 
 from interferometry.anomalies import detect_anomalies
 from interferometry.deviations import sort_readings
-from interferometry.drift import estimate_drift
-from interferometry.jointfit import fit_joint
-from interferometry.statespace import fit_fixed_effects
+from interferometry.drift.estimate import estimate_drift, fit_joint
+from interferometry.drift.gls import fit_fixed_effects
 from tests.interferometry.simulated_campaigns import simulate
 
 pytestmark = pytest.mark.slow

@@ -9,9 +9,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from fusion.attribution import LAGS_S, Film
-from fusion.excitation import Excitation
-from fusion.screening import screen
+from fusion.attribution.family_wise import LAGS_S, Film
+from fusion.attribution.per_target import screen
+from fusion.attribution.warm_up import Excitation
 
 pytestmark = pytest.mark.slow
 

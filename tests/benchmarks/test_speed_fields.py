@@ -13,12 +13,15 @@ import numpy as np
 import pytest
 
 from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene
-from thermography.checkpoint import recalibrate
-from thermography.fields import RegisteredFrom, reduce_frames
-from thermography.flir import CameraIdentity, Frame, index_frames, write_sequence
-from thermography.moving import reduce_moving_frames
-from thermography.radiometry import counts_from_temperature, override
-from thermography.registration import register
+from thermography.fields.checkpoint import recalibrate
+from thermography.fields.moving import reduce_moving_frames
+from thermography.fields.still import reduce_frames
+from thermography.io.flir import index_frames
+from thermography.io.flir_writer import write_sequence
+from thermography.io.frame import CameraIdentity, Frame
+from thermography.radiometry.planck import counts_from_temperature, override
+from thermography.registration.displacement import RegisteredFrom
+from thermography.registration.register import register
 
 pytestmark = pytest.mark.slow
 
@@ -178,10 +181,10 @@ from pathlib import Path
 import numpy as np
 from tests.benchmarks.test_speed_fields import bounds_of
 from tests.thermography.plan_scene import DISCS, GRID
-from thermography.fields import reduce_frames
-from thermography.flir import index_frames
-from thermography.radiometry import calibrate
-from thermography.registration import register
+from thermography.fields.still import reduce_frames
+from thermography.io.flir import index_frames
+from thermography.radiometry.planck import calibrate
+from thermography.registration.register import register
 references, _ = index_frames([sys.argv[1]])
 registration = register(calibrate(references[0].read().counts, references[0].parameters), DISCS, grid=GRID)
 reduce_frames(references, registration, GRID, bounds_of(len(references), 5))

@@ -14,9 +14,10 @@ import xarray as xr
 from flirpy.io.seq import Seq
 
 from tests.thermography.flir_mutations import frame
-from thermography.backend import FlirBackendEntrypoint
-from thermography.flir import index_frames, read_frame, write_jpeg, write_sequence
-from thermography.radiometry import calibrate
+from thermography.io.flir import index_frames, read_frame
+from thermography.io.flir_writer import write_jpeg, write_sequence
+from thermography.io.xarray_backend import FlirBackendEntrypoint
+from thermography.radiometry.planck import calibrate
 
 pytestmark = pytest.mark.slow
 

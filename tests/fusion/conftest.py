@@ -34,7 +34,7 @@ amplitude_um = 1.5
 @pytest.fixture(scope="session")
 def campaign_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A campaign of 24 cycles and 6 targets with a reversal that drifts, undeclared; cells of 20 mm keep it quick."""
-    from fusion.twin import simulate_campaign
+    from fusion.twin.instruments import simulate_campaign
 
     folder = tmp_path_factory.mktemp("twin")
     (folder / "recipe.toml").write_text(RECIPE)
@@ -46,7 +46,7 @@ def campaign_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def results_folder(campaign_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The products of that campaign, complete."""
-    from fusion.pipeline import run_campaign
+    from fusion.pipeline.run import run_campaign
 
     out = tmp_path_factory.mktemp("run") / "results"
     run_campaign(campaign_folder / "campaign.toml", out)

@@ -11,14 +11,16 @@ from functools import cache
 
 import numpy as np
 
-from fusion.alignment import AxisGeometry, align
-from fusion.effects import library
-from fusion.loop import LoopResult, close_loop, seal
-from fusion.model import ModelFit, Term, fit_model
-from fusion.readings import Readings, read_fused
-from fusion.story import rmse
-from fusion.twin import Recipe, deviations_of, driver_log, environment_log, fields_of, simulate
-from fusion.twin.recipe import EffectRecipe
+from fusion.alignment.align import AxisGeometry, align
+from fusion.alignment.readings import Readings, read_fused
+from fusion.effects.library import library
+from fusion.loop.closed_loop import close_loop, seal
+from fusion.loop.result import LoopResult, rmse
+from fusion.model.fit import ModelFit, Term, fit_model
+from fusion.twin import simulate
+from fusion.twin.datasets import deviations_of, fields_of
+from fusion.twin.machine.recipe import EffectRecipe, Recipe
+from fusion.twin.simulate import driver_log, environment_log
 
 DECLARED = ("axis_expansion", "table_offset")
 CYCLES = 60

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from fusion.twin import Recipe, simulate_record
-from fusion.twin.recipe import EffectRecipe
+from fusion.twin.machine.recipe import EffectRecipe, Recipe
+from fusion.twin.record import simulate_record
 
 
 def table_of(

@@ -14,7 +14,7 @@ import xarray as xr
 from typer.testing import CliRunner, Result
 
 from fusion import cli
-from fusion.results import results_schema
+from fusion.products.results import results_schema
 
 
 def invoke(*arguments: str | Path) -> Result:
@@ -59,7 +59,7 @@ def test_a_fault_of_the_program_is_no_bad_input(monkeypatch: pytest.MonkeyPatch,
     def broken(*arguments: object, **options: object) -> None:
         raise ValueError("shapes do not match")
 
-    monkeypatch.setattr("fusion.pipeline.run_campaign", broken)
+    monkeypatch.setattr("fusion.pipeline.run.run_campaign", broken)
     result = invoke("run", tmp_path / "campaign.toml")
     assert result.exit_code == 1
     assert isinstance(result.exception, ValueError)
@@ -69,7 +69,7 @@ def test_stopping_tells_how_to_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     def stopped(*arguments: object, **options: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("fusion.pipeline.run_campaign", stopped)
+    monkeypatch.setattr("fusion.pipeline.run.run_campaign", stopped)
     result = invoke("run", tmp_path / "campaign.toml")
     assert result.exit_code == 130
     assert result.stderr == "thermofuse: stopped; finished stages are kept, add --resume to continue\n"

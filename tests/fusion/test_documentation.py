@@ -11,10 +11,10 @@ import pytest
 from typer.main import get_command
 
 from fusion import cli
-from fusion.config import EFFECT_NAMES, load_campaign
-from fusion.effects import LIBRARY, Effect
+from fusion.campaign.config import EFFECT_NAMES, load_campaign
+from fusion.effects.library import LIBRARY, Effect
 from fusion.record.effects import QUASI_STATIC
-from fusion.wording import CAUSES, EFFECTS
+from fusion.report.wording import CAUSES, EFFECTS
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -71,8 +71,8 @@ def test_every_effect_of_the_library_has_its_name_and_its_words(table: str) -> N
 
 
 def test_every_cause_has_its_words_and_checks() -> None:
-    from fusion.diagnosis import CHECKS
-    from fusion.results import CAUSES as NAMES
+    from fusion.diagnosis.diagnose import CHECKS
+    from fusion.products.results import CAUSES as NAMES
 
     assert set(CAUSES) == set(CHECKS) == set(NAMES)
 

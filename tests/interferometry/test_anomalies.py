@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from interferometry.anomalies import Anomaly, detect_anomalies, detectable_extra
-from interferometry.drift import estimate_drift
-from interferometry.outliers import generalised_esd
+from interferometry.anomalies import Anomaly, detect_anomalies, detectable_extra, generalised_esd
+from interferometry.drift.estimate import estimate_drift
 from tests.interferometry.simulated_campaigns import SIGMA_UM, simulate
 
 PERMUTATIONS = 249

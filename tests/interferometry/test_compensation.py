@@ -18,7 +18,7 @@ from interferometry.compensation import (
     environment_factor,
     implied_wavelength_nm,
 )
-from interferometry.readers import read_deviations
+from interferometry.io.readers import read_deviations
 from tests.interferometry.simulated_campaigns import START, simulate
 
 #: NIST Engineering Metrology Toolbox: degC, kPa, % relative humidity, nm, index.

@@ -11,9 +11,10 @@ import pytest
 import xarray as xr
 
 from interferometry.deviations import build_deviations
-from interferometry.ecmclog import read_ecmc_log
+from interferometry.io.delimited import LaserFormatError
+from interferometry.io.ecmc import read_ecmc_log
+from interferometry.io.readers import read_deviations
 from interferometry.iso230 import Iso230Budget, budget_table, evaluate, evaluate_windows
-from interferometry.readers import LaserFormatError, read_deviations
 from tests.interferometry.simulated_campaigns import simulate
 
 MOTION = "anderssandstrom__ecmc_target_muts_logger/b02"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from interferometry.drift import estimate_drift
+from interferometry.drift.estimate import estimate_drift
 from interferometry.neighbours import (
     build_chart,
     compare,

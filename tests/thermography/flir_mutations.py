@@ -7,15 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from thermography.flir import (
-    CalibratedRange,
-    CameraIdentity,
-    CameraParameters,
-    CameraSettings,
-    Frame,
-    write_jpeg,
-    write_sequence,
-)
+from thermography.io.flir_writer import write_jpeg, write_sequence
+from thermography.io.frame import CalibratedRange, CameraIdentity, CameraParameters, CameraSettings, Frame
 
 #: The constants of an SC660, as its files store them (float32).
 PARAMETERS = CameraParameters(

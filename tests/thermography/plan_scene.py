@@ -9,9 +9,11 @@ from functools import cache
 import cv2
 import numpy as np
 
-from thermography.flir import CameraParameters, Frame, index_frames, write_sequence
-from thermography.plan import Fiducial, PlanGrid
-from thermography.radiometry import counts_from_temperature
+from thermography.io.flir import index_frames
+from thermography.io.flir_writer import write_sequence
+from thermography.io.frame import CameraParameters, Frame
+from thermography.radiometry.planck import counts_from_temperature
+from thermography.registration.plan import Fiducial, PlanGrid
 
 GRID = PlanGrid(700, 180, 5)
 PLACES = [

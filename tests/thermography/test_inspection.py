@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from tests.thermography.flir_mutations import CAMERA, HOUSEKEEPING, LIMITS, PARAMETERS, TIME, frame, jpeg, sequence
-from thermography.flir import CalibratedRange, FlirFormatError, write_jpeg, write_sequence
 from thermography.inspection import inspect, inspect_file, is_flir_file, thumbnail
-from thermography.radiometry import override
+from thermography.io.flir_writer import write_jpeg, write_sequence
+from thermography.io.frame import CalibratedRange, FlirFormatError
+from thermography.radiometry.planck import override
 
 
 def _codes(path: Path) -> set[str]:

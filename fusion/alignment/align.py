@@ -1,0 +1,277 @@
+"""Both recordings on one clock: every reading gets the temperature field at its own time.
+
+The camera sees the table with the axis at position 0; the point of the table under the spindle at axis position ``X`` is
+``origin + X * direction``. Between two frames the field is interpolated linearly; a reading outside the frames' time gets none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from fusion._typing import Array
+from fusion.alignment.reflection_patch import find_switching_patch
+
+DIMS = ("cycle", "direction", "target")
+#: Half the width over which a line or point average is taken, in plan cells: enough to halve the noise of a single cell.
+_HALF_WIDTH_CELLS = 1.5
+
+
+class AlignmentError(ValueError):
+    """The two recordings cannot be brought together; the message names the times or places and what to do."""
+
+
+@dataclass(frozen=True)
+class AxisGeometry:
+    """Where the measured line lies on the table plan.
+
+    Attributes
+    ----------
+    origin_mm : plan point under the spindle at axis position 0
+    direction : how that point moves over the plan as the axis position grows; its length does not matter
+    """
+
+    origin_mm: tuple[float, float]
+    direction: tuple[float, float]
+
+    def points(self, position_mm: Array) -> tuple[Array, Array]:
+        """Plan coordinates x, y in mm of axis positions in mm."""
+        step = np.asarray(self.direction, float) / np.hypot(*self.direction)
+        return self.origin_mm[0] + step[0] * position_mm, self.origin_mm[1] + step[1] * position_mm
+
+    def across(self) -> tuple[float, float]:
+        """Unit vector on the plan at right angles to the measured line."""
+        step = np.asarray(self.direction, float) / np.hypot(*self.direction)
+        return float(-step[1]), float(step[0])
+
+
+def cycle_bounds(deviations: xr.Dataset) -> NDArray[np.datetime64]:
+    """Start and end of every cycle on the laser's clock, (cycle, 2) datetime64[ns].
+
+    A cycle lasts from its first reading to the first reading of the next one, so that a frame taken on the way back to the start
+    belongs to the cycle that has just been measured. The last cycle is as long as the median of the others.
+
+    Raises
+    ------
+    AlignmentError
+        if a cycle has no time at all, or cycles overlap.
+    """
+    times = deviations["time"].values.reshape(deviations.sizes["cycle"], -1)
+    empty = np.isnat(times).all(axis=1)
+    if empty.any():
+        named = deviations["cycle"].values[empty].tolist()
+        raise AlignmentError(f"cycles {named} hold no reading with a time; give the times or leave the cycles out")
+    stamps = times.astype("datetime64[ns]").astype(np.int64)
+    missing = np.isnat(times)
+    first = np.where(missing, np.iinfo(np.int64).max, stamps).min(axis=1)
+    last = np.where(missing, np.iinfo(np.int64).min, stamps).max(axis=1)
+    overlap = np.flatnonzero(first[1:] <= last[:-1])
+    if overlap.size:
+        before, after = deviations["cycle"].values[overlap[0] : overlap[0] + 2]
+        raise AlignmentError(
+            f"cycle {after} starts before cycle {before} has ended; check the cycle numbers and times of the laser file"
+        )
+    length = np.median(np.diff(first)) if first.size > 1 else last[0] - first[0]
+    end = np.append(first[1:], max(first[-1] + int(length), last[-1] + 1))
+    return np.stack([first, end], axis=1).astype("datetime64[ns]")
+
+
+def camera_on_laser_clock(time: NDArray[np.datetime64], clock_offset_s: float) -> NDArray[np.datetime64]:
+    """Frame times on the laser's clock; ``clock_offset_s`` is the camera's clock minus the laser's."""
+    return np.asarray(time.astype("datetime64[ns]") - np.timedelta64(round(clock_offset_s * 1e9), "ns"))
+
+
+def align(
+    deviations: xr.Dataset,
+    fields: xr.Dataset,
+    axis: AxisGeometry,
+    *,
+    environment: xr.Dataset | None = None,
+    drivers: xr.Dataset | None = None,
+) -> xr.Dataset:
+    """Bring readings, fields, environment and drivers together on the laser's clock.
+
+    Parameters
+    ----------
+    deviations : Dataset keeping ``interferometry.contract.DEVIATIONS``
+    fields : Dataset keeping ``thermography.contract.FIELDS``, its ``time`` already on the laser's clock
+    axis : where the measured line lies on the plan
+    environment, drivers : Datasets along ``time``
+
+    Returns
+    -------
+    Dataset
+        The deviations with, per reading, ``mean_rise`` (K, of the seen table), ``axis_integral`` (K mm, of the rise from axis
+        position 0 to the target), ``local_rise`` (K, at the target), ``inside_frames``, every environment quantity and driver;
+        and the same quantities as series on their own times (``frame_time``, ``environment_time``, ``driver_time``).
+
+    Raises
+    ------
+    AlignmentError
+        if frames and readings never meet in time, or the measured line leaves the seen plan.
+    """
+    frame_time = fields["time"].values.astype("datetime64[ns]")
+    reading_time = deviations["time"].values.astype("datetime64[ns]")
+    _check_overlap(reading_time, frame_time)
+    series = field_series(fields, axis, deviations["position"].values)
+    inside = ~np.isnat(reading_time) & (reading_time >= frame_time[0]) & (reading_time <= frame_time[-1])
+
+    fused = deviations[["deviation", "time", "position", "quality_flag"]].copy()
+    fused["inside_frames"] = (DIMS, inside, {"long_name": "the reading lies between the first and the last frame"})
+    for name, values in series.items():
+        at_readings = interpolate_series(reading_time, frame_time, values)
+        fused[name] = (DIMS, np.where(inside, at_readings, np.nan), _ATTRIBUTES[name])
+        dims = ("frame_time",) if values.ndim == 1 else ("frame_time", "target")
+        fused[f"{name}_series"] = (dims, values, _ATTRIBUTES[name])
+    fused = fused.assign_coords(frame_time=frame_time)
+    for table, dim in ((environment, "environment_time"), (drivers, "driver_time")):
+        if table is not None:
+            fused = _add_table(fused, table, dim)
+    return fused
+
+
+_DIFFERENCE = {"units_metadata": "temperature: difference"}
+_ATTRIBUTES: dict[str, dict[str, str]] = {
+    "mean_rise": {"units": "K", "long_name": "mean temperature rise of the seen table", **_DIFFERENCE},
+    "axis_integral": {"units": "K mm", "long_name": "integral of the seen rise from axis position 0 to the target"},
+    "local_rise": {"units": "K", "long_name": "temperature rise of the table at the target", **_DIFFERENCE},
+    "patch_mean_rise": {"units": "K", "long_name": "share of a switching patch in the mean rise", **_DIFFERENCE},
+    "patch_axis_integral": {"units": "K mm", "long_name": "share of a switching patch in the axis integral"},
+}
+
+
+def field_series(fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -> dict[str, Array]:
+    """Reduce the frames on the plan to what moves a reading: mean rise (time,), integral and local rise (time, target).
+
+    Where a patch of the field switches like a reflection, its shares in the mean rise and in the integral are given beside them.
+
+    The rise counts from the first frame; cells that frame does not see are left out of the mean.
+    """
+    temperature = fields["frame_temperature"].values.astype(float)
+    rise = temperature - temperature[0]
+    seen = np.isfinite(rise).all(axis=0)
+    if not seen.any():
+        raise AlignmentError("no plan cell is seen by every frame; check the registration and the plan's size")
+    mean_rise = rise[:, seen].mean(axis=1)
+    line = MeasuredLine(fields, axis, position_mm)
+    samples = line.sample(rise)
+    reach = line.reach
+    local = np.stack([samples[:, max(0, k - reach) : k + reach + 1].mean(axis=1) for k in line.nearest], axis=1)
+    series = {"mean_rise": mean_rise, "axis_integral": line.integrate(samples), "local_rise": local}
+    patch = find_switching_patch(rise)
+    if patch is not None:
+        pattern = line.integrate(line.sample(patch.pattern[None]))[0]
+        series["patch_mean_rise"] = patch.course * patch.pattern[seen].mean()
+        series["patch_axis_integral"] = patch.course[:, None] * pattern
+    return series
+
+
+def _cell_size(fields: xr.Dataset) -> float:
+    return float(np.median(np.diff(fields["x"].values)))
+
+
+class MeasuredLine:
+    """The measured line on the plan, sampled four times per cell, and averaged across its width.
+
+    Attributes
+    ----------
+    along_mm : (sample,) axis positions of the samples
+    nearest : (target,) sample at every target
+    reach : samples on either side that a point average takes
+    """
+
+    def __init__(self, fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -> None:
+        cell = _cell_size(fields)
+        low, high = min(0.0, float(position_mm.min())), max(0.0, float(position_mm.max()))
+        count = max(2, int(np.ceil((high - low) / (cell / 4.0))) + 1)
+        # Position 0 and every target are samples themselves, so that no interval has to be cut.
+        self.along_mm = np.unique(np.round(np.concatenate([np.linspace(low, high, count), position_mm, [0.0]]), 9))
+        self.nearest = np.abs(self.along_mm[None, :] - position_mm[:, None]).argmin(axis=1)
+        self.reach = max(1, round(_HALF_WIDTH_CELLS * cell / float(np.median(np.diff(self.along_mm)))))
+        x0, y0 = axis.points(self.along_mm)
+        sideways = np.linspace(-_HALF_WIDTH_CELLS, _HALF_WIDTH_CELLS, 5) * cell
+        across = axis.across()
+        x, y = fields["x"].values, fields["y"].values
+        self._column = (x0[None, :] + sideways[:, None] * across[0] - x[0]) / cell
+        self._row = (y0[None, :] + sideways[:, None] * across[1] - y[0]) / cell
+        beside = (self._column < -0.5) | (self._column > x.size - 0.5)
+        self._outside = beside | (self._row < -0.5) | (self._row > y.size - 0.5)
+        lost = np.flatnonzero(self._outside.all(axis=0))
+        if lost.size:
+            k = int(lost[0])
+            raise AlignmentError(
+                f"the measured line leaves the plan: axis position {self.along_mm[k]:.1f} mm lies at x = {x0[k]:.1f} mm, "
+                f"y = {y0[k]:.1f} mm; check [plan.axis] origin and direction, and [plan] size"
+            )
+
+    def sample(self, frames: Array) -> Array:
+        """Frames (time, y, x) along the line (time, sample); gaps are bridged along the line."""
+        place = [self._row, self._column]
+        samples = np.stack([ndimage.map_coordinates(frame, place, order=1, mode="nearest") for frame in frames])
+        samples[:, self._outside] = np.nan
+        valid = np.isfinite(samples)
+        number = valid.sum(axis=1)
+        line = np.where(valid, samples, 0.0).sum(axis=1) / np.maximum(number, 1)
+        for values, known in zip(line, number > 0, strict=True):
+            if not known.any():
+                raise AlignmentError(
+                    "no part of the measured line is seen by the camera; check [plan.axis] and the fiducials"
+                )
+            values[~known] = np.interp(self.along_mm[~known], self.along_mm[known], values[known])
+        return line
+
+    def integrate(self, samples: Array) -> Array:
+        """Integral from axis position 0 to every target, (time, target)."""
+        steps = 0.5 * (samples[:, 1:] + samples[:, :-1]) * np.diff(self.along_mm)
+        integral = np.concatenate([np.zeros((samples.shape[0], 1)), np.cumsum(steps, axis=1)], axis=1)
+        zero = int(np.argmin(np.abs(self.along_mm)))
+        return (integral - integral[:, [zero]])[:, self.nearest]
+
+
+def _check_overlap(reading_time: NDArray[np.datetime64], frame_time: NDArray[np.datetime64]) -> None:
+    known = reading_time[~np.isnat(reading_time)]
+    if known.size == 0:
+        raise AlignmentError("no reading has a time; readings and frames cannot be brought together")
+    first, last = known.min(), known.max()
+    if frame_time.size < 2 or frame_time[-1] < first or frame_time[0] > last:
+        raise AlignmentError(
+            f"frames ({_shown(frame_time[0])} .. {_shown(frame_time[-1])}) and readings ({_shown(first)} .. {_shown(last)}) never "
+            "meet; check the time zone of both clocks and [thermography] clock_offset (camera clock minus laser clock)"
+        )
+
+
+def _shown(time: np.datetime64) -> str:
+    return f"{np.datetime_as_string(time, unit='s')}Z"
+
+
+def interpolate_series(
+    reading_time: NDArray[np.datetime64], series_time: NDArray[np.datetime64], values: Array
+) -> Array:
+    """Linear interpolation of a series (time,) or (time, target) at readings (cycle, direction, target); ends are held."""
+    start = series_time[0]
+    at = (reading_time - start) / np.timedelta64(1, "s")
+    knots = (series_time - start) / np.timedelta64(1, "s")
+    if values.ndim == 1:
+        return np.interp(at, knots, values)
+    return np.stack([np.interp(at[..., k], knots, values[:, k]) for k in range(values.shape[1])], axis=-1)
+
+
+def _add_table(fused: xr.Dataset, table: xr.Dataset, dim: str) -> xr.Dataset:
+    """Every numeric column of a table along time: at the readings, and as a series on its own times; gaps stay NaN."""
+    added: dict[str, tuple[tuple[str, ...], NDArray[np.generic], dict[str, object]]] = {}
+    for name, column in table.data_vars.items():
+        if column.dims != ("time",) or column.dtype.kind not in "fiu":
+            continue
+        known = np.isfinite(column.values)
+        if known.sum() < 2:
+            continue
+        time = table["time"].values.astype("datetime64[ns]")[known]
+        at_readings = interpolate_series(fused["time"].values, time, column.values[known].astype(float))
+        outside = (fused["time"].values < time[0]) | (fused["time"].values > time[-1])
+        added[str(name)] = (DIMS, np.where(outside, np.nan, at_readings), dict(column.attrs))
+        added[f"{name}_series"] = ((dim,), column.values.astype(float), dict(column.attrs))
+    return fused.assign(added).assign_coords({dim: table["time"].values.astype("datetime64[ns]")})

@@ -1,0 +1,187 @@
+"""A duty schedule for a new test: which switching tells the machine's heat sources apart, in how much time, with what power.
+
+Power is computed, not promised: for schedules drawn from the law, the response of each source is whitened by the drift that the axis
+shows by itself; its size beside the noise decides whether the randomisation test will find it in one channel, and what of it the
+other sources' responses cannot imitate says whether it will be told from them. The proposed schedule is one plain draw from the law:
+a hand-picked one might separate better, but would no longer allow the exact test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy import stats
+
+from fusion._typing import Array
+from fusion.alignment.first_order_lag import respond
+from fusion.attribution.randomised_duty import GRID_S, LEVEL, DutyLaw
+from interferometry.drift.state_space import drift_system
+
+#: Candidate mean dwells, s, and test durations, h.
+DWELLS_S = (600.0, 1200.0, 1800.0, 3600.0, 5400.0)
+HOURS = (3.0, 5.0, 7.0, 10.0, 14.0, 20.0)
+_SCHEDULES = 24
+#: Searching the response bank costs about as much as this many independent tests per source.
+_EFFECTIVE_RESPONSES = 4.0
+
+
+class DutyPlanError(ValueError):
+    """No schedule can be proposed; the message says why."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What is known of the machine and the measurement before the test.
+
+    Attributes
+    ----------
+    sources : names of the heat sources that can be switched
+    time_constants_s : thermal time constant of each source
+    effect_um : drift that one source at full duty should at least cause to be found
+    drift_um_per_sqrt_h : random walk of the axis by itself (the report's unexplained drift)
+    noise_um : noise of one cycle's mean
+    cycle_s : length of one cycle
+    lag_s : mechanical lag behind the source's temperature
+    """
+
+    sources: tuple[str, ...]
+    time_constants_s: tuple[float, ...]
+    effect_um: float
+    drift_um_per_sqrt_h: float = 0.4
+    noise_um: float = 0.1
+    cycle_s: float = 252.0
+    lag_s: float = 1800.0
+
+    def __post_init__(self) -> None:
+        if len(self.sources) == 0 or len(self.sources) != len(self.time_constants_s):
+            raise DutyPlanError(
+                f"{len(self.sources)} sources and {len(self.time_constants_s)} time constants: name every source once, with one "
+                "time constant each"
+            )
+        if min(*self.time_constants_s, self.effect_um, self.noise_um, self.cycle_s, self.cycle_s) <= 0:
+            raise DutyPlanError("time constants, effect, noise and cycle length must be greater than 0")
+
+
+def plan_duty(
+    machine: Machine,
+    *,
+    power: float = 0.8,
+    hours: Sequence[float] = HOURS,
+    dwells_s: Sequence[float] = DWELLS_S,
+    least_dwell_s: float = 300.0,
+    seed: int = 0,
+) -> xr.Dataset:
+    """Propose a randomised duty schedule.
+
+    Parameters
+    ----------
+    power : float
+        Wanted probability to name the weakest source.
+    hours, dwells_s : candidates
+    least_dwell_s : float
+        Shortest time between two switchings that the machine tolerates.
+    seed : int
+        Seed of the schedule; another seed is another, equally valid schedule.
+
+    Returns
+    -------
+    Dataset
+        ``duty`` (time_s, source) of the shortest test whose power is enough (of the most powerful one if none is; attribute
+        ``enough``), ``power`` (hours, dwell) of the weakest source, ``separation`` (hours, dwell): share of each response's
+        information left beside the others, 0 (cannot be told apart) to 1; chosen ``test_hours``, ``mean_dwell`` (s).
+
+    Raises
+    ------
+    DutyPlanError
+        if no candidate dwell is longer than the least one.
+    """
+    usable = [dwell for dwell in dwells_s if dwell > least_dwell_s]
+    if not usable:
+        raise DutyPlanError(
+            f"no mean dwell of {list(dwells_s)} s is longer than the least dwell of {least_dwell_s:g} s; allow longer ones"
+        )
+    rng = np.random.default_rng(seed)
+    table = np.zeros((len(hours), len(usable)))
+    separation = np.zeros_like(table)
+    for i, duration in enumerate(hours):
+        for j, dwell in enumerate(usable):
+            table[i, j], separation[i, j] = _assess(machine, duration, DutyLaw(dwell, least_dwell_s), rng)
+    best_dwell = table.argmax(axis=1)
+    reached = np.flatnonzero(table.max(axis=1) >= power)
+    row = int(reached[0]) if reached.size else int(table.max(axis=1).argmax())
+    law = DutyLaw(usable[best_dwell[row]], least_dwell_s)
+    seconds = GRID_S * np.arange(int(hours[row] * 3600.0 / GRID_S), dtype=float)
+    fresh = np.random.default_rng([seed, 1])
+    duty = np.column_stack([law.course(seconds, fresh) for _ in machine.sources])
+    return xr.Dataset(
+        {
+            "duty": (("time_s", "source"), duty, {"units": "1", "long_name": "0 off, 1 on"}),
+            "power": (("hours", "dwell"), table, {"units": "1", "long_name": "power for the weakest source"}),
+            "separation": (("hours", "dwell"), separation, {"units": "1"}),
+            "test_hours": ((), hours[row], {"units": "h"}),
+            "mean_dwell": ((), law.mean_dwell_s, {"units": "s"}),
+            "least_dwell": ((), law.least_dwell_s, {"units": "s"}),
+        },
+        coords={
+            "time_s": ("time_s", seconds, {"units": "s"}),
+            "source": list(machine.sources),
+            "hours": list(hours),
+            "dwell": ("dwell", usable, {"units": "s"}),
+        },
+        attrs={"enough": int(reached.size > 0), "seed": seed},
+    )
+
+
+def switchings(plan: xr.Dataset) -> list[tuple[float, str, str]]:
+    """The proposed schedule as a list to work through: (minutes since the start, source, "on" or "off")."""
+    events = []
+    for name in plan["source"].values:
+        course = plan["duty"].sel(source=name).values
+        changes = np.flatnonzero(np.diff(course, prepend=1.0 - course[0]))
+        events += [(float(plan["time_s"][k]) / 60.0, str(name), "on" if course[k] else "off") for k in changes]
+    return sorted(events)
+
+
+def _assess(machine: Machine, hours: float, law: DutyLaw, rng: np.random.Generator) -> tuple[float, float]:
+    """Power for the weakest source, and separation of the least separable one, averaged over drawn schedules."""
+    cycles = machine.cycle_s * np.arange(int(hours * 3600.0 / machine.cycle_s), dtype=float)
+    fine = GRID_S * np.arange(int(hours * 3600.0 / GRID_S) + 1, dtype=float)
+    ratio = (machine.drift_um_per_sqrt_h / machine.noise_um) ** 2 / 3600.0
+    system = drift_system(cycles, np.ones((cycles.size, 1)), order=1, ratios=np.array([ratio]))
+    white, _ = system.whiten(np.eye(cycles.size))
+    trend = white @ np.column_stack([np.ones_like(cycles), cycles - cycles.mean()])
+    # Responses (cycles, schedules, sources): each source behind its own body, all behind the structure's lag.
+    columns = np.stack(
+        [_drift_responses(machine, tau, law, fine, cycles, rng) for tau in machine.time_constants_s], axis=2
+    )
+    threshold = stats.chi2.isf(LEVEL / (_EFFECTIVE_RESPONSES * len(machine.sources)), 1)
+    powers = np.zeros((_SCHEDULES, len(machine.sources)))
+    separations = np.zeros_like(powers)
+    for k in range(_SCHEDULES):
+        seen = white @ columns[:, k]
+        free = _left_over(seen, trend)
+        size = (free**2).sum(axis=0)
+        powers[k] = stats.norm.sf(np.sqrt(threshold) - machine.effect_um * np.sqrt(size) / machine.noise_um)
+        for j in range(size.size):
+            alone = _left_over(free[:, j], np.delete(free, j, axis=1)) if size.size > 1 else free[:, j]
+            separations[k, j] = (alone @ alone) / max(float(size[j]), 1e-30)
+    return float(powers.mean(axis=0).min()), float(separations.mean(axis=0).min())
+
+
+def _drift_responses(
+    machine: Machine, time_constant_s: float, law: DutyLaw, fine: Array, cycles: Array, rng: np.random.Generator
+) -> Array:
+    """Drift per unit effect at the cycles under many schedules of one source, (cycles, schedules)."""
+    courses = np.column_stack([law.course(fine, rng) for _ in range(_SCHEDULES)])
+    moved = respond(fine, machine.lag_s, respond(fine, time_constant_s, courses))
+    return moved[np.searchsorted(fine, cycles)]
+
+
+def _left_over(columns: Array, others: Array) -> NDArray[np.float64]:
+    """Columns with everything that the others explain taken out."""
+    basis, _ = np.linalg.qr(others)
+    return np.asarray(columns - basis @ (basis.T @ columns), float)

@@ -1,0 +1,163 @@
+"""The session's answer: which source goes with the drift, where it is, what else explains it as well, and what would tell.
+
+Thermal modes speak first: they have the power that single cells lack, and a mode is one place. Where no mode passes, the strongest
+cell or region does. Everything was tested under one family-wise error, so the order costs nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from fusion._typing import Array
+from fusion.attribution.family_wise import LEVEL
+
+#: A place explains the drift as well as the leading one if its likelihood ratio is lower by no more than this (chi-square, 1
+#: degree of freedom, 0.95).
+EQUAL_RATIO = 3.84
+#: Cells that take at least this share of a mode belong to its place.
+IN_MODE = 0.5
+#: Pieces of a mode that reach this share of its height apart from each other are places of their own.
+_PEAK = 0.7
+_QUANTITIES = ("p_value", "statistic", "sensitivity", "sensitivity_u", "lag", "detectable_sensitivity", "threshold")
+#: Kinds of candidates in the order in which they are asked.
+_SETS = (("modes", "mode"), ("cells", "cell"), ("regions", "region"))
+
+
+@dataclass(frozen=True)
+class Found:
+    """The candidate that leads, whether it passes or not.
+
+    Attributes
+    ----------
+    verdict : "attributable", "not attributable" or "not separable"
+    kind, name : "mode", "cell" or "region", and which one
+    channel : part of the drift that it goes with
+    x_mm, y_mm : place on the plan
+    p_value : family-wise over everything that was tested
+    sensitivity_um_per_K, sensitivity_u_um_per_K : drift per rise, at the far end of travel for common and growing drift together
+    lag_s : time constant between temperature and drift
+    detectable_um_per_K : what would have been found here with 80 % power
+    width_mm : how far the leading place reaches
+    others_mm : other places (x, y) that explain the drift as well: these data cannot tell them from the leading one
+    """
+
+    verdict: str
+    kind: str
+    name: str
+    channel: str
+    x_mm: float
+    y_mm: float
+    p_value: float
+    sensitivity_um_per_K: float
+    sensitivity_u_um_per_K: float
+    lag_s: float
+    detectable_um_per_K: float
+    width_mm: float
+    others_mm: tuple[tuple[float, float], ...]
+
+
+def find_source(maps: xr.Dataset) -> Found:
+    """Return the leading candidate of :func:`fusion.attribution.attribute.correlate` with the session's verdict."""
+    sets = {name: kind for name, kind in _SETS if name == "cells" or f"{name}_p_value" in maps}
+    leading = {name: _leader(maps, name) for name in sets}
+    smallest = {name: float(one["p_value"]) for name, one in leading.items()}
+    passed = [name for name, p in smallest.items() if p <= LEVEL]
+    chosen = passed[0] if passed else min(smallest, key=lambda name: smallest[name])
+    best, kind = leading[chosen], sets[chosen]
+    channel = str(best["channel"].values)
+    x_mm, y_mm = float(best["x"]), float(best["y"])
+    inside, others = _surroundings(maps, chosen, best)
+    y, x = np.meshgrid(maps["y"].values, maps["x"].values, indexing="ij")
+    name = "" if kind == "cell" else str(best[kind].values)
+    return Found(
+        verdict=str(maps.attrs["verdict"]),
+        kind=kind,
+        name=name,
+        channel=channel,
+        x_mm=x_mm,
+        y_mm=y_mm,
+        p_value=float(best["p_value"]),
+        sensitivity_um_per_K=float(best["sensitivity"]),
+        sensitivity_u_um_per_K=float(best["sensitivity_u"]),
+        lag_s=float(best["lag"]),
+        detectable_um_per_K=float(best["detectable_sensitivity"]),
+        width_mm=float(np.hypot(x[inside] - x_mm, y[inside] - y_mm).max(initial=0.0)),
+        others_mm=tuple(others),
+    )
+
+
+def _columns(maps: xr.Dataset, name: str) -> xr.Dataset:
+    """Findings of one set over channel and candidate, with the candidates' places as x and y."""
+    if name == "cells":
+        return maps[list(_QUANTITIES)].stack(candidate=("y", "x"))
+    few = xr.Dataset({quantity: maps[f"{name}_{quantity}"] for quantity in _QUANTITIES})
+    return few.assign_coords(x=maps[f"{name}_at_x"], y=maps[f"{name}_at_y"])
+
+
+def _leader(maps: xr.Dataset, name: str) -> xr.Dataset:
+    """The candidate of smallest p; equal ones (the resolution of the draws) are told apart by statistic over threshold."""
+    columns = _columns(maps, name)
+    p_value = columns["p_value"].fillna(1.0).values
+    ratio = (columns["statistic"] / columns["threshold"]).transpose(*columns["p_value"].dims).fillna(0.0).values
+    place = np.lexsort((-ratio.ravel(), p_value.ravel()))[0]
+    channel, column = np.unravel_index(int(place), p_value.shape)
+    return columns.isel({"channel": channel, columns["p_value"].dims[1]: column})
+
+
+def _surroundings(maps: xr.Dataset, name: str, best: xr.Dataset) -> tuple[NDArray[np.bool_], list[tuple[float, float]]]:
+    """Cells (y, x) of the leading place, and the other places that explain the drift as well."""
+    channel = best["channel"].values
+    if name == "cells":
+        statistic = np.nan_to_num(maps["statistic"].sel(channel=channel).values, nan=-np.inf)
+        return _split(statistic, statistic >= statistic.max() - EQUAL_RATIO, maps)
+    few = _columns(maps, name).sel(channel=channel)
+    kind = dict(_SETS)[name]
+    alike = (few["statistic"] >= best["statistic"] - EQUAL_RATIO).values & (few[kind] != best[kind]).values
+    others = [(float(x), float(y)) for x, y in zip(few["x"].values[alike], few["y"].values[alike], strict=True)]
+    if name == "regions":
+        return np.zeros((maps.sizes["y"], maps.sizes["x"]), bool), others
+    pattern = np.abs(np.nan_to_num(maps["modes_pattern"].sel(mode=int(best["mode"])).values))
+    _, elsewhere = _split(pattern, pattern >= _PEAK, maps)
+    inside, _ = _split(pattern, pattern >= IN_MODE, maps)
+    return inside, [*elsewhere, *others]
+
+
+def _split(
+    strength: Array, equal: NDArray[np.bool_], maps: xr.Dataset
+) -> tuple[NDArray[np.bool_], list[tuple[float, float]]]:
+    """The connected piece of equal cells that holds the strongest one, and the strongest cell (x, y in mm) of every other piece."""
+    labels, count = ndimage.label(equal, np.ones((3, 3)))
+    row, column = np.unravel_index(int(strength.argmax()), strength.shape)
+    own = int(labels[row, column])
+    others = []
+    for label in range(1, count + 1):
+        if label == own:
+            continue
+        at = np.unravel_index(int(np.where(labels == label, strength, -np.inf).argmax()), strength.shape)
+        others.append((float(maps["x"][at[1]]), float(maps["y"][at[0]])))
+    return labels == own, others
+
+
+def would_tell(maps: xr.Dataset, found: Found) -> str:
+    """What would decide what these data leave open, with the numbers of this session; empty where nothing is open."""
+    common = maps.sel(channel="common") if "common" in maps["channel"].values else maps.isel(channel=0)
+    plan = (
+        f"thermofuse plan --source NAME=TIME proposes when to switch each heat source at random; give it this session's noise and "
+        f'drift: --noise "{float(common["noise"]):.2g} um" --drift "{max(float(common["unexplained_drift"]), 0.01):.2g} um"'
+    )
+    if found.verdict == "not separable":
+        return f"Switch the heat sources at random times instead of letting all of them warm up once. {plan}."
+    if found.verdict == "not attributable":
+        return (
+            f"From {found.detectable_um_per_K:.2g} um/K on, a source at the best place would have been found in four sessions of five. For "
+            f"less: more cycles, or loads that switch more often. {plan}."
+        )
+    if found.others_mm:
+        places = "; ".join(f"x {x:.0f} mm, y {y:.0f} mm" for x, y in found.others_mm[:4])
+        return f"Other places explain the drift as well ({places}): switch the heat sources there separately. {plan}."
+    return "A second session that finds the same place, or randomised duty, makes a cause of it. " + plan + "."

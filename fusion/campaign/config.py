@@ -1,0 +1,399 @@
+"""The campaign file: what a user writes, checked whole before anything is computed."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    WithJsonSchema,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+from fusion.campaign.messages import Place, describe, find_line, key_lines, suggest
+from fusion.campaign.quantities import QuantityError, read_quantity
+
+#: Names of the effects that a campaign may declare; a user's own are added by the entry point of `fusion.effects.library`.
+EFFECT_NAMES = (
+    "axis_expansion", "table_offset", "thermal_lag", "unseen_heat_source", "dead_path", "air_index",
+    "material_compensation", "angular_growth", "reversal_drift", "step_event", "periodic_disturbance", "pitch_error",
+    "camera_offset", "reflected_source", "laser_warm_up", "sensor_fault",
+)  # fmt: skip
+
+
+class CampaignError(ValueError):
+    """A campaign that cannot be run; the message names file, line, key, value and remedy."""
+
+
+def _quantity(unit: str) -> BeforeValidator:
+    """Return a validator from text with unit to a number in `unit`."""
+
+    def validate(value: object) -> float:
+        try:
+            return read_quantity(value, unit)
+        except QuantityError as error:
+            raise PydanticCustomError("quantity", "{text}", {"text": str(error)}) from None
+
+    return BeforeValidator(validate)
+
+
+def _within(low: float, high: float, meaning: str) -> AfterValidator:
+    """Return a validator that accepts ``low < value <= high``."""
+
+    def validate(value: float) -> float:
+        if not low < value <= high:
+            text = f"{meaning} lies above {low:g} and up to {high:g}"
+            raise PydanticCustomError("range", "{text}", {"text": text})
+        return value
+
+    return AfterValidator(validate)
+
+
+def _fraction(value: object) -> object:
+    """Accept ``"45 %"`` beside ``0.45``."""
+    if isinstance(value, str) and (match := re.fullmatch(r"\s*([\d.]+)\s*%\s*", value)):
+        return float(match.group(1)) / 100.0
+    return value
+
+
+def _written(example: str) -> WithJsonSchema:
+    """How a quantity looks in the file, for the JSON Schema."""
+    return WithJsonSchema({"type": "string", "description": "number with unit", "examples": [example]})
+
+
+Millimetres = Annotated[float, _quantity("mm"), _written("5 mm")]
+PositiveMillimetres = Annotated[float, _quantity("mm"), _within(0.0, 1e5, "this length in mm"), _written("5 mm")]
+Metres = Annotated[float, _quantity("mm"), AfterValidator(lambda mm: mm / 1e3), _written("1.2 m")]
+Celsius = Annotated[float, _quantity("degC"), _within(-273.15, 3000.0, "a temperature in degC"), _written("22 degC")]
+Seconds = Annotated[float, _quantity("s"), _written("37 s")]
+PositiveSeconds = Annotated[float, _quantity("s"), _within(0.0, 1e6, "this time in s"), _written("2 s")]
+PartsPerMillion = Annotated[
+    float, _quantity("ppm/K"), _within(-10.0, 200.0, "an expansion coefficient in ppm/K"), _written("11.7 ppm/K")
+]
+Feed = Annotated[float, _quantity("mm/min"), _within(0.0, 1e6, "a feed rate in mm/min"), _written("300 mm/min")]
+Fraction = Annotated[float, BeforeValidator(_fraction), _within(0.0, 1.0, "this fraction")]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+
+
+class CampaignTable(_Table):
+    """``[campaign]``: what was measured."""
+
+    title: str = Field(min_length=1)
+    axis: str = Field(default="", max_length=20)
+
+
+class ThermographyTable(_Table):
+    """``[thermography]``: the frames and what the camera should have been told."""
+
+    frames: tuple[str, ...] = Field(min_length=1)
+    emissivity: Fraction | None = None
+    reflected_temperature_degC: Celsius | None = Field(default=None, alias="reflected_temperature")
+    atmospheric_temperature_degC: Celsius | None = Field(default=None, alias="atmospheric_temperature")
+    relative_humidity: Fraction | None = None
+    object_distance_m: Metres | None = Field(default=None, alias="object_distance")
+    clock_offset_s: Seconds | None = Field(default=None, alias="clock_offset")
+    table: Literal["still", "moving"] = "still"
+
+
+class AxisTable(_Table):
+    """``[plan.axis]``: where the measured line lies on the plan."""
+
+    origin_mm: tuple[Millimetres, Millimetres] = Field(alias="origin")
+    direction: tuple[float, float]
+
+    @model_validator(mode="after")
+    def _has_length(self) -> AxisTable:
+        if self.direction == (0.0, 0.0):
+            raise PydanticCustomError("direction", "the direction [0, 0] points nowhere; write for example [-1, 0]")
+        return self
+
+
+class PlanTable(_Table):
+    """``[plan]``: the table plan in millimetres and its fiducials."""
+
+    size_mm: tuple[PositiveMillimetres, PositiveMillimetres] = Field(alias="size")
+    cell_size_mm: PositiveMillimetres = Field(alias="cell_size")
+    fiducials: str
+    regions: str | None = None
+    axis: AxisTable
+
+    @model_validator(mode="after")
+    def _cells_fit(self) -> PlanTable:
+        along = [length / self.cell_size_mm for length in self.size_mm]
+        cells = along[0] * along[1]
+        if any(abs(count - round(count)) > 1e-6 for count in along):
+            text = (
+                f"cell_size {self.cell_size_mm:g} mm does not divide a plan of {self.size_mm[0]:g} x {self.size_mm[1]:g} mm; "
+                "choose one that divides both sides"
+            )
+            raise PydanticCustomError("cells", "{text}", {"text": text})
+        if min(self.size_mm) < 2 * self.cell_size_mm or cells > 4e6:
+            text = (
+                f"cell_size {self.cell_size_mm:g} mm on a plan of {self.size_mm[0]:g} x {self.size_mm[1]:g} mm "
+                f"makes {cells:.0f} cells; choose it for at least 2 cells per side and at most 4 million in all"
+            )
+            raise PydanticCustomError("cells", "{text}", {"text": text})
+        return self
+
+
+class InterferometryTable(_Table):
+    """``[interferometry]``: the readings and what the laser's compensation needs."""
+
+    deviations: str
+    environment: str | None = None
+    dead_path_mm: Millimetres = Field(default=0.0, alias="dead_path")
+    expansion_coefficient_ppm_per_K: PartsPerMillion = Field(default=11.7, alias="expansion_coefficient")
+    feed_mm_per_min: Feed | None = Field(default=None, alias="feed")
+    dwell_s: PositiveSeconds | None = Field(default=None, alias="dwell")
+    compensation: Literal["as recorded", "redo"] = "as recorded"
+    material_temperature: Literal["logged", "camera"] = "logged"
+    environment_factor_mm: tuple[Millimetres, Millimetres] | None = Field(default=None, alias="environment_factor")
+
+
+class DriversTable(_Table):
+    """``[drivers]``: anything else that was logged, and which of it was switched on and off at random by a stated law."""
+
+    file: str
+    randomised: tuple[str, ...] = ()
+    mean_dwell_s: PositiveSeconds | None = Field(default=None, alias="mean_dwell")
+    least_dwell_s: Seconds = Field(default=0.0, alias="least_dwell")
+
+    @model_validator(mode="after")
+    def _law_is_whole(self) -> DriversTable:
+        if bool(self.randomised) != (self.mean_dwell_s is not None):
+            text = "randomised and mean_dwell belong together: which columns were switched at random, and the mean time between"
+            raise PydanticCustomError("law", text)
+        if self.mean_dwell_s is not None and not 0.0 <= self.least_dwell_s < self.mean_dwell_s:
+            text = f"least_dwell {self.least_dwell_s:g} s must be shorter than mean_dwell {self.mean_dwell_s:g} s, and not negative"
+            raise PydanticCustomError("law", "{text}", {"text": text})
+        return self
+
+
+class RecordTable(_Table):
+    """``[record]``: temperature sensors and displacement channels over time, in one table (CSV or XLSX).
+
+    Columns are named as in the file's heading, ``"name [unit]"`` or ``"name (unit)"``; ``*`` stands for any text.
+    """
+
+    file: str
+    sheet: str | None = None
+    time: str
+    start: str | None = None
+    temperatures: tuple[str, ...] = Field(min_length=1)
+    displacements: tuple[str, ...] = Field(min_length=1)
+    drivers: tuple[str, ...] = ()
+
+
+class ModelTable(_Table):
+    """``[model]``: the effects that the user believes to act."""
+
+    declared: tuple[str, ...] = ("axis_expansion", "table_offset")
+
+
+class Campaign(_Table):
+    """A checked campaign file. Paths are absolute; every number is in the unit that its name states."""
+
+    path: Path = Field(exclude=True)
+    campaign: CampaignTable
+    thermography: ThermographyTable | None = None
+    plan: PlanTable | None = None
+    interferometry: InterferometryTable | None = None
+    drivers: DriversTable | None = None
+    record: RecordTable | None = None
+    model: ModelTable = ModelTable()
+
+    @property
+    def folder(self) -> Path:
+        """Folder that the relative paths of the campaign start from."""
+        return self.path.parent
+
+    def resolve(self, name: str) -> Path:
+        """Return the absolute path of a file named in the campaign."""
+        return (self.folder / name).resolve()
+
+    def frame_paths(self) -> tuple[Path, ...]:
+        """Return the thermal files that the glob patterns match, each once, sorted by name."""
+        if self.thermography is None:
+            return ()
+        found = {path for pattern in self.thermography.frames for path in _matches(self.folder, pattern)}
+        return tuple(sorted(found))
+
+    def input_files(self) -> dict[str, Path]:
+        """Return every file the campaign reads, keyed by its path relative to the campaign file."""
+        files = {relative_name(self.path, self.folder): self.path}
+        for table in ("thermography", "plan", "interferometry", "drivers", "record"):
+            files |= self.files_of(table)
+        return files
+
+    def files_of(self, table: str) -> dict[str, Path]:
+        """Return the files that one table of the campaign names, keyed by their path relative to the campaign file."""
+        names: list[str | None] = []
+        if table == "plan" and self.plan is not None:
+            names = [self.plan.fiducials, self.plan.regions]
+        elif table == "interferometry" and self.interferometry is not None:
+            names = [self.interferometry.deviations, self.interferometry.environment]
+        elif table == "drivers" and self.drivers is not None:
+            names = [self.drivers.file]
+        elif table == "record" and self.record is not None:
+            names = [self.record.file]
+        paths = list(self.frame_paths()) if table == "thermography" else []
+        paths += [self.resolve(name) for name in names if name is not None]
+        return {relative_name(path, self.folder): path for path in paths}
+
+
+def campaign_schema() -> dict[str, Any]:
+    """Return the JSON Schema of the campaign file, quantities as they are written there."""
+    schema = Campaign.model_json_schema()
+    del schema["properties"]["path"]
+    schema["required"] = [name for name in schema["required"] if name != "path"]
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "thermofuse campaign"}
+
+
+def relative_name(path: Path, folder: Path) -> str:
+    """Return `path` as seen from `folder`, with forward slashes, or its bare name where it lies elsewhere."""
+    try:
+        return path.relative_to(folder).as_posix()
+    except ValueError:
+        return path.name
+
+
+def load_campaign(path: str | Path, *, effect_names: Iterable[str] = EFFECT_NAMES) -> Campaign:
+    """Read and check a campaign file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The TOML file; relative paths inside it start from its folder.
+    effect_names : iterable of str
+        Names that ``[model] declared`` may hold.
+
+    Raises
+    ------
+    CampaignError
+        With every fault found, one per line: file, line, key, value, remedy.
+    """
+    path = Path(path).resolve()
+    if path.is_dir():
+        raise CampaignError(f"{path} is a folder; name the campaign file in it, for example {path / 'campaign.toml'}")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise CampaignError(f"{path}: no such campaign file; check the name or give its full path") from None
+    except UnicodeDecodeError as error:
+        raise CampaignError(f"{path}: byte {error.start} is not UTF-8; save the campaign file as UTF-8 text") from None
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise CampaignError(f"{path}: this is not TOML: {error}; see the campaign file in the README") from None
+    lines = key_lines(text)
+
+    def place(key: tuple[str, ...]) -> str:
+        return f"{path}, line {find_line(lines, key)}"
+
+    faults = _check_instruments(content, place)
+    content.pop("path", None)
+    try:
+        campaign = Campaign.model_validate({**content, "path": path})
+    except ValidationError as error:
+        found = sorted(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
+        details = [item for item in found if not (faults and item["type"] == "missing" and len(item["loc"]) == 1)]
+        raise CampaignError("\n".join([*faults, *(describe(item, Campaign, place) for item in details)])) from None
+    faults += _check_files(campaign, place)
+    faults += _check_effects(campaign, tuple(effect_names), place)
+    if faults:
+        raise CampaignError("\n".join(faults))
+    return campaign
+
+
+def _check_instruments(content: dict[str, Any], place: Place) -> list[str]:
+    """A campaign holds the two instruments with the plan, or a record, not both and not neither."""
+    instruments = [name for name in ("thermography", "plan", "interferometry") if name in content]
+    if "path" in content:
+        return [f"{place(('path',))}: unknown key path; remove it"]
+    if "record" in content:
+        if instruments:
+            return [
+                f"{place(('record',))}: [record] stands instead of [{'], ['.join(instruments)}]; "
+                "remove one or the other, a record is analysed on its own"
+            ]
+        return []
+    missing = [name for name in ("thermography", "plan", "interferometry") if name not in content]
+    if missing:
+        return [
+            f"{place(())}: the table [{'], ['.join(missing)}] is missing; "
+            "a campaign needs [thermography], [plan] and [interferometry], or a [record] instead"
+        ]
+    return []
+
+
+def _matches(folder: Path, pattern: str) -> list[Path]:
+    """Return the files that a glob pattern, relative or absolute, matches."""
+    given = Path(pattern)
+    if given.is_absolute():
+        return [path for path in Path(given.anchor).glob(str(given.relative_to(given.anchor))) if path.is_file()]
+    return [path.resolve() for path in folder.glob(pattern) if path.is_file()]
+
+
+def _check_files(campaign: Campaign, place: Place) -> list[str]:
+    """Every file that is named exists, every pattern matches something."""
+    faults = []
+    if campaign.thermography is not None:
+        for pattern in campaign.thermography.frames:
+            if not _matches(campaign.folder, pattern):
+                faults.append(
+                    f'{place(("thermography", "frames"))}: thermography.frames = "{pattern}" '
+                    f"matches no file in {campaign.folder}; paths are relative to the campaign file"
+                )
+    named: list[tuple[tuple[str, ...], str | None]] = []
+    if campaign.plan is not None:
+        named.append((("plan", "fiducials"), campaign.plan.fiducials))
+        named.append((("plan", "regions"), campaign.plan.regions))
+    if campaign.interferometry is not None:
+        named.append((("interferometry", "deviations"), campaign.interferometry.deviations))
+        named.append((("interferometry", "environment"), campaign.interferometry.environment))
+    if campaign.drivers is not None:
+        named.append((("drivers", "file"), campaign.drivers.file))
+    if campaign.record is not None:
+        named.append((("record", "file"), campaign.record.file))
+    for key, name in named:
+        if name is not None and not campaign.resolve(name).is_file():
+            faults.append(
+                f'{place(key)}: {".".join(key)} = "{name}": no such file {campaign.resolve(name)}; '
+                f"{_near_file(campaign.resolve(name))}paths are relative to the campaign file"
+            )
+    return faults
+
+
+def _near_file(path: Path) -> str:
+    if not path.parent.is_dir():
+        return ""
+    names = [item.name for item in path.parent.iterdir() if item.is_file()]
+    return suggest(path.name, names)
+
+
+def _check_effects(campaign: Campaign, known: tuple[str, ...], place: Place) -> list[str]:
+    """Every declared effect is one that the library knows, and is named once."""
+    where = place(("model", "declared"))
+    faults = []
+    for name in campaign.model.declared:
+        if name not in known:
+            faults.append(
+                f'{where}: model.declared holds the unknown effect "{name}"; '
+                f"{suggest(name, known)}known: {', '.join(known)}"
+            )
+    for name in sorted({name for name in campaign.model.declared if campaign.model.declared.count(name) > 1}):
+        faults.append(f'{where}: model.declared names "{name}" more than once; name each effect once')
+    return faults

@@ -1,0 +1,306 @@
+"""The inputs of a campaign, read and checked before the long work; everything left out is noted.
+
+Before the long work: do both recordings meet in time, and do their clocks seem to agree?
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from fusion.alignment.align import AlignmentError, AxisGeometry, camera_on_laser_clock, cycle_bounds
+from fusion.attribution.randomised_duty import DutyLaw, read_duty
+from fusion.attribution.thermal_modes import Region, read_regions
+from fusion.campaign.config import Campaign, InterferometryTable, PlanTable, ThermographyTable, relative_name
+from fusion.campaign.logged_tables import read_drivers, split_heading
+from fusion.campaign.recompensation import compensate_readings, see_material
+from fusion.products.contracts import check
+from fusion.products.results import Notice
+from interferometry.contract import DEVIATIONS
+from interferometry.io.readers import read_deviations, read_environment
+from interferometry.iso230 import Iso230Budget
+from thermography.io.flir import FrameReference, index_frames
+from thermography.registration.plan import Fiducial, PlanGrid, read_fiducials
+
+#: So many left-out things are named in a message; all of them are in the products.
+_NAMED = 5
+#: What the closed loop and the correlation need at least.
+_LEAST_CYCLES, _LEAST_TARGETS, _LEAST_FRAMES = 12, 3, 12
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a campaign with both instruments holds, before anything is calculated."""
+
+    campaign: Campaign
+    thermography: ThermographyTable
+    plan: PlanTable
+    interferometry: InterferometryTable
+    deviations: xr.Dataset
+    environment: xr.Dataset | None
+    drivers: xr.Dataset | None
+    fiducials: list[Fiducial]
+    frames: list[FrameReference]
+    frames_rejected: list[dict[str, Any]]
+    regions: list[Region] = field(default_factory=list)
+    duty: tuple[xr.DataArray, DutyLaw] | None = None
+    notices: list[Notice] = field(default_factory=list)
+    iso_budget: Iso230Budget | None = None
+
+    @property
+    def needs_camera(self) -> bool:
+        """Whether the readings are compensated again with what the camera saw."""
+        return self.interferometry.material_temperature == "camera"
+
+    @property
+    def grid(self) -> PlanGrid:
+        """The plan's cells."""
+        return PlanGrid(*self.plan.size_mm, self.plan.cell_size_mm)
+
+    @property
+    def axis(self) -> AxisGeometry:
+        """Where the measured line lies on the plan."""
+        return AxisGeometry(self.plan.axis.origin_mm, self.plan.axis.direction)
+
+    @property
+    def frame_times(self) -> np.ndarray:
+        """Times of the usable frames on the camera's clock, (n,) datetime64[ns]."""
+        return np.array([frame.time for frame in self.frames], dtype="datetime64[ns]")
+
+
+def read_source(campaign: Campaign) -> Source:
+    """Read readings, logs, fiducials and the frames' headers of a campaign, and refuse what cannot be run.
+
+    Raises
+    ------
+    ValueError
+        A subclass of the instruments' packages or of this one: a file that cannot be used, cycles that overlap, clocks that never meet.
+    """
+    thermography, plan, interferometry = campaign.thermography, campaign.plan, campaign.interferometry
+    assert thermography is not None and plan is not None and interferometry is not None
+    laser = campaign.resolve(interferometry.deviations)
+    deviations = read_deviations(laser, feed_mm_per_min=interferometry.feed_mm_per_min, dwell_s=interferometry.dwell_s)
+    check(deviations, DEVIATIONS, name=laser.name)
+    cycle_bounds(deviations)
+    environment = None
+    if interferometry.environment is not None:
+        environment = read_environment(campaign.resolve(interferometry.environment))
+    compensated = compensate_readings(deviations, environment, interferometry)
+    by_camera = interferometry.material_temperature == "camera"
+    drivers = read_drivers(campaign.resolve(campaign.drivers.file)) if campaign.drivers is not None else None
+    frames, rejected = index_frames(campaign.frame_paths())
+    listed = [
+        {
+            "file": relative_name(one.path, campaign.folder),
+            "index": one.index,
+            "reason": one.reason.replace(f"{campaign.folder}/", ""),
+        }
+        for one in rejected
+    ]
+    timed = [frame for frame in frames if not np.isnat(frame.time)]
+    listed += [
+        {"file": relative_name(frame.path, campaign.folder), "index": frame.index, "reason": "the frame has no time"}
+        for frame in frames
+        if np.isnat(frame.time)
+    ]
+    source = Source(
+        campaign, thermography, plan, interferometry, deviations if by_camera else compensated.deviations, environment, drivers,
+        read_fiducials(campaign.resolve(plan.fiducials)), timed, listed,
+        [] if plan.regions is None else read_regions(campaign.resolve(plan.regions)), _randomised(campaign, drivers),
+        [] if by_camera else compensated.notices, compensated.budget,
+    )  # fmt: skip
+    source.notices[:0] = _notices(source)
+    return source
+
+
+def compensate_by_camera(source: Source, fields: xr.Dataset) -> tuple[Source, list[Notice]]:
+    """Compensate the readings again with the temperature that the camera saw along the axis, where the campaign asks for it."""
+    if not source.needs_camera:
+        return source, []
+    seen = see_material(fields, source.axis, source.deviations)
+    redone = compensate_readings(source.deviations, source.environment, source.interferometry, seen=seen)
+    return replace(source, deviations=redone.deviations, iso_budget=redone.budget), redone.notices
+
+
+def _randomised(campaign: Campaign, drivers: xr.Dataset | None) -> tuple[xr.DataArray, DutyLaw] | None:
+    """The columns that were switched at random, and the law that they were drawn from; None where none was."""
+    table = campaign.drivers
+    if table is None or drivers is None or table.mean_dwell_s is None:
+        return None
+    law = DutyLaw(table.mean_dwell_s, table.least_dwell_s)
+    names = [split_heading(campaign.resolve(table.file), heading)[0] for heading in table.randomised]
+    return read_duty(drivers, names, law, source=table.file), law
+
+
+def _notices(source: Source) -> list[Notice]:
+    """Everything that is left out of the input or missing from it."""
+    notices = frames_notices(source.frames_rejected)
+    _refuse_too_few(source)
+    notices += check_clocks(
+        source.deviations,
+        source.frame_times,
+        clock_offset_s=source.thermography.clock_offset_s,
+        source=str(source.campaign.path),
+    )
+    notices += left_out_notices(source.deviations, "readings_left_out")
+    for table, code in ((source.environment, "environment_rows_left_out"), (source.drivers, "driver_rows_left_out")):
+        if table is not None:
+            notices += left_out_notices(table, code)
+    if source.environment is None:
+        notices.append(
+            Notice(
+                "no_environment",
+                "No environment was logged, so effects of the air and of the material compensation cannot be told apart from the drift.",
+                "Log air temperature, pressure, humidity and material temperature, and name the file as interferometry.environment.",
+            )
+        )
+    return notices
+
+
+def _refuse_too_few(source: Source) -> None:
+    """Refuse a campaign that is too small for what is made of it, before the long work."""
+    sizes = source.deviations.sizes
+    if sizes["cycle"] < _LEAST_CYCLES or sizes["target"] < _LEAST_TARGETS:
+        raise SourceError(
+            f"{source.interferometry.deviations}: {counted(sizes['cycle'], 'cycle')} at {counted(sizes['target'], 'target')}; "
+            f"a model of the drift needs at least {_LEAST_CYCLES} cycles (better 50) at {_LEAST_TARGETS} targets, "
+            "thermofuse iso230 evaluates shorter tests"
+        )
+    if len(source.frames) < _LEAST_FRAMES:
+        reasons = (
+            listed(_reason(item) for item in source.frames_rejected) if source.frames_rejected else "none rejected"
+        )
+        raise SourceError(
+            f"{source.campaign.path}: {counted(len(source.frames), 'usable frame')}, at least {_LEAST_FRAMES} are needed "
+            f"({reasons}); check thermography.frames"
+        )
+
+
+class SourceError(ValueError):
+    """The inputs of a campaign cannot be used together; the message says which and what to do."""
+
+
+def frames_notices(rejected: list[dict[str, Any]]) -> list[Notice]:
+    """Return one notice that counts the frames left out and names the first of them."""
+    if not rejected:
+        return []
+    named = [f"{item['file']} ({_reason(item)})" for item in rejected]
+    return [
+        Notice(
+            "frames_rejected",
+            f"{counted(len(rejected), 'frame')} left out: {listed(named)}.",
+            "Copy damaged files again from the camera; a gap in the frames only widens the interpolation between its neighbours.",
+        )
+    ]
+
+
+def _reason(item: dict[str, Any]) -> str:
+    """Return why a frame was left out without the absolute path that the reader's message starts with."""
+    text = str(item["reason"])
+    return text.split(f"{Path(item['file']).name}: ", 1)[-1]
+
+
+def left_out_notices(dataset: xr.Dataset, code: str) -> list[Notice]:
+    """Return one notice that counts the lines of a file that were left out and names the first of them."""
+    lines = json.loads(dataset.attrs.get("left_out", "[]"))
+    if not lines:
+        return []
+    named = [f"line {item['line']} ({item['value']!r} {item['reason']})" for item in lines]
+    return [
+        Notice(
+            code,
+            f"{counted(len(lines), 'line')} of {lines[0]['path']} left out: {listed(named)}.",
+            f"Correct these lines in {lines[0]['path']} and run again; the estimates allow for the gaps.",
+        )
+    ]
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun, in the plural where it has to be."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return the first few names, and how many more there are."""
+    names = list(names)
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return "; ".join(names[:_NAMED]) + more
+
+
+_QUARTER_HOUR_S = 900.0
+_DAY_S = 86_400.0
+#: A shift by whole quarter hours is taken for a wrong time zone where it lifts the share of readings covered from below the
+#: first to above the second.
+_COVERED_NOW, _COVERED_SHIFTED = 0.6, 0.95
+
+
+def check_clocks(
+    deviations: xr.Dataset, frame_time: NDArray[np.datetime64], *, clock_offset_s: float | None, source: str
+) -> list[Notice]:
+    """Return a notice for readings outside the frames' time; refuse recordings that never meet or differ by a time zone.
+
+    Parameters
+    ----------
+    deviations : Dataset
+        Keeps ``interferometry.contract.DEVIATIONS``.
+    frame_time : (n,) datetime64
+        Times of the frames on the camera's clock, sorted.
+    clock_offset_s : float or None
+        Camera clock minus laser clock from the campaign file, None where it is left out.
+    source : str
+        Campaign file, for the message.
+
+    Raises
+    ------
+    AlignmentError
+        If frames and readings never meet, or would meet after a shift by whole quarter hours.
+    """
+    readings = deviations["time"].values
+    readings = readings[~np.isnat(readings)]
+    if readings.size == 0:
+        raise AlignmentError(f"{source}: no reading has a time; readings and frames cannot be brought together")
+    frames = camera_on_laser_clock(frame_time, clock_offset_s or 0.0)
+    covered = _covered(readings, frames, 0.0)
+    shift = _likely_zone_shift(readings, frames)
+    span = (
+        f"frames {shown(frames[0])} to {shown(frames[-1])}, readings {shown(readings.min())} to {shown(readings.max())}"
+    )
+    if covered < _COVERED_NOW and shift is not None:
+        raise AlignmentError(
+            f"{source}: the clocks look {abs(shift) / 3600:g} h apart, as in two time zones ({span}, so {covered:.0%} of the readings lie "
+            f'between frames); write thermography.clock_offset = "{(clock_offset_s or 0.0) + shift:g} s" (camera clock minus laser '
+            "clock) if so, or give the times of both with their zone"
+        )
+    if covered == 0.0:
+        raise AlignmentError(
+            f"{source}: frames and readings never meet ({span}); set thermography.clock_offset (camera clock minus laser clock), "
+            "or check that both folders belong to the same test"
+        )
+    return []
+
+
+def _covered(readings: NDArray[np.datetime64], frames: NDArray[np.datetime64], shift_s: float) -> float:
+    """Return the share of readings between the first and the last frame, the frames being `shift_s` earlier than they say."""
+    shift = np.timedelta64(round(shift_s * 1e9), "ns")
+    return float(np.mean((readings >= frames[0] - shift) & (readings <= frames[-1] - shift)))
+
+
+def _likely_zone_shift(readings: NDArray[np.datetime64], frames: NDArray[np.datetime64]) -> float | None:
+    """Return the shift in s by whole quarter hours within a day that makes frames and readings meet best, if nearly all do."""
+    shifts = np.arange(-_DAY_S, _DAY_S + 1, _QUARTER_HOUR_S)
+    shares = np.array([_covered(readings, frames, float(shift)) for shift in shifts])
+    best = np.flatnonzero(shares == shares.max())
+    nearest = best[np.argmin(np.abs(shifts[best]))]
+    return float(shifts[nearest]) if shares[nearest] >= _COVERED_SHIFTED and shifts[nearest] != 0 else None
+
+
+def shown(time: np.datetime64) -> str:
+    """Return a time to the second with its zone."""
+    return f"{np.datetime_as_string(time, unit='s')}Z"

@@ -1,0 +1,238 @@
+"""Logged tables: the drivers of a campaign, and a record of sensors and channels over time."""
+
+from __future__ import annotations
+
+import fnmatch
+import json
+import re
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from fusion.campaign.config import Campaign, CampaignError, RecordTable
+from fusion.campaign.quantities import QuantityError, conversion, unit_name
+from interferometry.io.delimited import (
+    BadReading,
+    Rejected,
+    delimiter_of,
+    find_header,
+    parse_time,
+    read_table,
+    read_timed_rows,
+    refuse_hopeless,
+)
+
+#: What pandas says of a line that has more fields than the header.
+_SKIPPED = re.compile(r"Skipping line (\d+): expected (\d+) fields, saw (\d+)")
+_HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
+
+
+class TableError(CampaignError):
+    """A logged table that cannot be used; the message names file, column and remedy."""
+
+
+def split_heading(path: Path, heading: str) -> tuple[str, str]:
+    """Return name and unit of a heading such as ``"t1 [degC]"`` or ``"t1(°C)"``.
+
+    Raises
+    ------
+    TableError
+        If no unit stands in the heading.
+    """
+    match = _HEADING.fullmatch(heading)
+    if match is None:
+        raise TableError(
+            f'{path}: the column "{heading}" has no unit; write it in the heading, for example "{heading} [1]" for a pure number'
+        )
+    return match.group(1), unit_name(match.group(2))
+
+
+def match_columns(patterns: Iterable[str], headings: Iterable[str]) -> tuple[str, ...]:
+    """Return the headings that column names or patterns (``*`` for any text) select, in the order of the file.
+
+    Raises
+    ------
+    CampaignError
+        If a pattern selects nothing; the message lists the headings that there are.
+    """
+    headings = list(headings)
+    selected: set[str] = set()
+    for pattern in patterns:
+        escaped = pattern.replace("[", "[[]")
+        found = {heading for heading in headings if heading == pattern or fnmatch.fnmatchcase(heading, escaped)}
+        if not found:
+            raise CampaignError(f'no column is named "{pattern}"; the file has: {", ".join(headings)}')
+        selected |= found
+    return tuple(heading for heading in headings if heading in selected)
+
+
+def read_drivers(path: Path) -> xr.Dataset:
+    """Read what else was logged: a column ``time`` and columns named ``"name [unit]"``.
+
+    Returns
+    -------
+    Dataset
+        Dim ``time`` (UTC, increasing), one variable per column with its units; attrs ``left_out`` holds the rejected lines as JSON.
+
+    Raises
+    ------
+    TableError, LaserFormatError
+        If the file is no table, a heading has no unit, or most lines cannot be used.
+    """
+    table = read_table(path, ("time",))
+    headings = {column: split_heading(path, column) for column in table.columns if column != "time"}
+    if not headings:
+        raise TableError(f'{path}: there is no column beside time; add one named "name [unit]", or leave [drivers] out')
+    variables = {name: {"units": unit, "long_name": name} for name, unit in headings.values()}
+    if len(variables) < len(headings):
+        names = [name for name, _ in headings.values()]
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        raise TableError(f"{path}: more than one column is named {', '.join(repeated)}; give each its own name")
+    return read_timed_rows(table, variables, lambda fields: [table.number(fields[column]) for column in headings])
+
+
+def read_record(campaign: Campaign) -> xr.Dataset:
+    """Read a ``[record]``: temperatures, displacements and drivers over time.
+
+    Returns
+    -------
+    Dataset
+        ``temperature`` (time, sensor) in degC, ``displacement`` (time, channel) in um, ``driver`` (time, driver_name) with
+        ``driver_units``; ``time`` is UTC. attrs ``left_out`` lists rows without a usable time as JSON.
+
+    Raises
+    ------
+    TableError
+        If the file cannot be read, or a column is missing, has no unit, or holds no numbers.
+    """
+    record = campaign.record
+    if record is None:
+        raise TableError(f"{campaign.path}: there is no [record] in this campaign")
+    path = campaign.resolve(record.file)
+    frame, misfits = _read_frame(path, record)
+    columns = list(frame.columns)
+    if record.time not in columns:
+        raise TableError(f'{path}: no column is named "{record.time}"; the file has: {", ".join(columns)}')
+    others = [column for column in columns if column != record.time]
+    time, left_out = _times(path, frame[record.time], record)
+    left_out = [*misfits, *left_out]
+    keep = ~np.isnat(time)
+    order = np.argsort(time[keep], kind="stable")
+
+    def block(patterns: Iterable[str], unit: str | None) -> tuple[list[str], list[str], np.ndarray]:
+        names, units, values = [], [], []
+        for column in match_columns(patterns, others):
+            name, given = split_heading(path, column)
+            numbers = pd.to_numeric(frame[column], errors="coerce").to_numpy(dtype="f8")[keep][order]
+            if np.isnan(numbers).all():
+                raise TableError(
+                    f'{path}: the column "{column}" holds no number; name another one in the campaign file'
+                )
+            names.append(name)
+            units.append(given if unit is None else unit)
+            values.append(numbers if unit is None else _converted(path, column, given, unit)(numbers))
+        return names, units, np.array(values).reshape(len(names), int(keep.sum())).T
+
+    sensors, _, temperature = block(record.temperatures, "degC")
+    channels, _, displacement = block(record.displacements, "um")
+    drivers, driver_units, driver = block(record.drivers, None)
+    return xr.Dataset(
+        {
+            "temperature": (
+                ("time", "sensor"),
+                temperature,
+                {"units": "degC", "units_metadata": "temperature: on_scale"},
+            ),
+            "displacement": (("time", "channel"), displacement, {"units": "um"}),
+            "driver": (("time", "driver_name"), driver, {"long_name": "logged drivers, units in driver_units"}),
+            "driver_units": (("driver_name",), np.array(driver_units, dtype=object)),
+        },
+        coords={"time": time[keep][order], "sensor": sensors, "channel": channels, "driver_name": drivers},
+        attrs={"source": path.name, "left_out": json.dumps([asdict(one) for one in left_out])},
+    )
+
+
+def _read_frame(path: Path, record: RecordTable) -> tuple[pd.DataFrame, list[Rejected]]:
+    """Return the whole table as text and numbers, whatever the file's kind, and the lines that do not fit its header."""
+    left_out: list[Rejected] = []
+    try:
+        if path.suffix.lower() in {".xlsx", ".xlsm"}:
+            frame = pd.read_excel(path, sheet_name=record.sheet or 0)
+        else:
+            frame, left_out = _read_text(path)
+    except (ValueError, OSError, pd.errors.ParserError) as error:
+        raise TableError(f"{path}: cannot be read as a table: {error}; save it as CSV in UTF-8 or as XLSX") from None
+    return frame.rename(columns=lambda name: str(name).strip()), left_out
+
+
+def _read_text(path: Path) -> tuple[pd.DataFrame, list[Rejected]]:
+    """Read delimited text with the dialect that its header line shows."""
+    with path.open(encoding="utf-8-sig") as file:
+        before, header = find_header(file)
+    delimiter = delimiter_of(header)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", pd.errors.ParserWarning)
+        frame = pd.read_csv(
+            path,
+            sep=delimiter,
+            # Spreadsheets that part fields by semicolons write decimal commas.
+            decimal="," if delimiter == ";" else ".",
+            skiprows=before,
+            skipinitialspace=True,
+            index_col=False,
+            on_bad_lines="warn",
+            encoding="utf-8-sig",
+        )
+    if any("loss of data" in str(one.message) for one in told):
+        raise ValueError("the lines hold more fields than the header names; name every column")
+    # Lines are counted in the file.
+    frame.index += before
+    skipped = [found for one in told for found in _SKIPPED.findall(str(one.message))]
+    return frame, [
+        Rejected(path.name, int(line), f"{saw} fields", f"{due} were expected") for line, due, saw in skipped
+    ]
+
+
+def _times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarray, list[Rejected]]:
+    """Return UTC times, NaT where a row has none, and the list of those rows."""
+    seconds = pd.to_numeric(column, errors="coerce")
+    left_out: list[Rejected] = []
+    if seconds.notna().mean() > 0.5:
+        _, unit = split_heading(path, record.time)
+        factor = _converted(path, record.time, unit, "s")(np.array([0.0, 1.0]))
+        start = np.datetime64("1970-01-01", "ns") if record.start is None else _parse(path, record.start)
+        elapsed = seconds.to_numpy(dtype="f8") * (factor[1] - factor[0])
+        time = start + np.where(np.isfinite(elapsed), np.round(elapsed * 1e9), 0).astype("m8[ns]")
+        time[~np.isfinite(elapsed)] = np.datetime64("NaT")
+    else:
+        time = np.full(len(column), np.datetime64("NaT", "ns"))
+        for at, text in enumerate(column.astype(str)):
+            try:
+                time[at] = parse_time(text)[0]
+            except BadReading:
+                continue
+    for at in np.flatnonzero(np.isnat(time)):
+        left_out.append(Rejected(path.name, int(column.index[at]) + 2, str(column.iloc[at]), "is not a time"))
+    refuse_hopeless(path, int((~np.isnat(time)).sum()), left_out)
+    return time, left_out
+
+
+def _parse(path: Path, text: str) -> np.datetime64:
+    try:
+        return parse_time(text)[0]
+    except BadReading as fault:
+        raise TableError(f'record.start = "{text}": {fault.reason}, needed for {path}') from None
+
+
+def _converted(path: Path, column: str, unit: str, target: str) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the function that brings a column to its canonical unit."""
+    try:
+        factor, offset = conversion(unit, target)
+    except QuantityError as error:
+        raise TableError(f'{path}: the column "{column}": {error}') from None
+    return lambda values: values * factor + offset

@@ -1,0 +1,114 @@
+"""Faults of a campaign file as sentences: file, line, key, value, remedy.
+
+Where a key stands in a TOML file, so that an error can name the line.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic_core import ErrorDetails
+
+#: From the path of a key to ``"FILE, line N"``.
+Place = Callable[[tuple[str, ...]], str]
+
+#: What to write instead, where pydantic's own words only name a Python type.
+_REMEDIES = {
+    "tuple_type": 'this is a list; write for example ["a", "b"]',
+    "string_type": "this is text; write it in quotes",
+    "float_type": "this is a number without quotes",
+    "float_parsing": "this is a number without quotes",
+    "string_too_short": "this text is empty; fill it in",
+    "too_short": "this list is empty; fill it in",
+    "model_type": "this is a table; write it as [name] with its keys below",
+}
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
+    """Return ``"did you mean X? "`` for the nearest known name, or nothing where none is near."""
+    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
+    return f"did you mean {near[0]}? " if near else ""
+
+
+def describe(item: ErrorDetails, model: type[BaseModel], place: Place) -> str:
+    """Turn one pydantic error of a `model` into a sentence with place, key, value and remedy."""
+    names = tuple(
+        part for part in item["loc"] if isinstance(part, str) and not part.startswith(("function-", "tuple["))
+    )
+    dotted = ".".join(names)
+    where = place(names)
+    if item["type"] == "extra_forbidden":
+        return f"{where}: unknown key {dotted}; {_nearest(names, model)}"
+    if item["type"] == "missing":
+        table = ".".join(names[:-1])
+        if item["loc"] and isinstance(item["loc"][-1], int):
+            return f"{where}: {dotted} needs {int(item['loc'][-1]) + 1} values"
+        if not table:
+            return f"{where}: the table [{dotted}] is missing; add it, see the campaign file in the README"
+        return f"{where}: [{table}] lacks {names[-1]}; add it, see the campaign file in the README"
+    remedy = _REMEDIES.get(item["type"], item["msg"][0].lower() + item["msg"][1:])
+    if isinstance(item["input"], dict):
+        return f"{where}: [{dotted}]: {remedy}"
+    return f"{where}: {dotted} = {_shown(item['input'])}: {remedy}"
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, str):
+        return f'"{value}"'
+    text = str(value).lower() if isinstance(value, bool) else str(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _nearest(names: tuple[str, ...], model: type[BaseModel]) -> str:
+    """Return the hint that follows an unknown key: the nearest known one, and all that its table knows."""
+    for name in names[:-1]:
+        model = next(
+            _table_in(field.annotation) for key, field in model.model_fields.items() if (field.alias or key) == name
+        )
+    known = sorted(field.alias or key for key, field in model.model_fields.items() if not field.exclude)
+    return f"{suggest(names[-1], known)}known here: {', '.join(known)}"
+
+
+def _table_in(annotation: Any) -> type[BaseModel]:
+    """Return the table class inside an annotation such as ``PlanTable | None``."""
+    candidates = getattr(annotation, "__args__", (annotation,))
+    return next(item for item in candidates if isinstance(item, type) and issubclass(item, BaseModel))
+
+
+_HEADER = re.compile(r"\s*\[+\s*([^\[\]]+?)\s*\]+\s*(?:#.*)?")
+_KEY = re.compile(r"""\s*((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")
+_PART = re.compile(r"""[\w-]+|"[^"]*"|'[^']*'""")
+
+
+def key_lines(text: str) -> dict[tuple[str, ...], int]:
+    """Return the line number (from 1) of every key and table header of a TOML text.
+
+    Keys inside inline tables have no line of their own; `find_line` answers with that of the key that holds them.
+    """
+    lines: dict[tuple[str, ...], int] = {}
+    table: tuple[str, ...] = ()
+    for number, line in enumerate(text.splitlines(), start=1):
+        if header := _HEADER.fullmatch(line):
+            table = _parts(header.group(1))
+            lines.setdefault(table, number)
+        elif key := _KEY.match(line):
+            path = table + _parts(key.group(1))
+            for depth in range(len(table) + 1, len(path) + 1):
+                lines.setdefault(path[:depth], number)
+    return lines
+
+
+def find_line(lines: dict[tuple[str, ...], int], path: tuple[str, ...]) -> int:
+    """Return the line of a key, else that of the nearest table or key that would hold it, else 1."""
+    for depth in range(len(path), 0, -1):
+        if path[:depth] in lines:
+            return lines[path[:depth]]
+    return 1
+
+
+def _parts(dotted: str) -> tuple[str, ...]:
+    return tuple(part.strip("\"'") for part in _PART.findall(dotted))

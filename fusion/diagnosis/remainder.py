@@ -1,0 +1,281 @@
+"""Does a shape remain? Tests of what a model leaves, and a description of it in words a metrologist can check.
+
+The noise that the fit estimates for every reading is laid out as a matrix of cycles and sites (target and direction). Where the
+model is complete, cycles are exchangeable within a site; permuting them gives every statistic its null, whatever the tails or the
+scatter of the single site. The shape is described from the readings minus the fixed effects, freed of offset and stretch per cycle,
+not from the whitened noise: the drift swallows a part of slow patterns (statistics study, section 3.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion._typing import Array
+from fusion.alignment.readings import Readings
+from fusion.model.fit import unexplained_drift
+from fusion.model.null_simulation import family_wise
+from interferometry.drift.gls import DriftFit
+
+_PERMUTATIONS = 400
+_BLOCK = 5
+#: Chance at which "a shape remains" is said though nothing does, over all statistics together.
+LEVEL = 0.02
+#: A drift without a name counts as a remainder from this share of a reading's noise on.
+_DRIFT_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """What a model leaves.
+
+    Attributes
+    ----------
+    p_value : chance of so much structure where nothing is missing, over all statistics
+    p_values : the same for each statistic alone
+    shape : in words, empty where nothing remains
+    rms_um : root mean square of the described shape over the readings
+    along_time, along_sites : the leading pattern (cycles,) in um and its weight per site, at most 1
+    series : what is left at every reading (n,), um
+    free : takes from columns (n, q) what could not have been left
+    """
+
+    p_value: float
+    p_values: dict[str, float]
+    shape: str
+    rms_um: float
+    cycles: NDArray[np.int64]
+    along_time: Array
+    sites: list[tuple[int, str]]
+    along_sites: Array
+    series: Array
+    free: Callable[[Array], Array]
+
+    def share_of(self, columns: Array) -> float:
+        """Share of the remainder's variance that columns (n, q) explain beside what the model has already."""
+        beside = self.free(columns)
+        left = self.series - beside @ np.linalg.lstsq(beside, self.series, rcond=None)[0]
+        return float(1.0 - left @ left / max(float(self.series @ self.series), 1e-300))
+
+
+def examine(
+    readings: Readings, fit: DriftFit, rng: np.random.Generator, *, set_aside: Collection[tuple[int, str]] = ()
+) -> Remainder:
+    """Test what the fit leaves for structure and describe the largest of it.
+
+    Parameters
+    ----------
+    readings, fit : the readings and the model fitted to them
+    set_aside : sites (target, direction) whose own anomaly has been diagnosed already; they are not tested again.
+    """
+    noise, share = fit.noise()
+    standard = noise / (fit.sigma * np.sqrt(np.maximum(share, 1e-12)))
+    cycles, sites, matrix = _matrix(readings, np.clip(standard, -4.0, 4.0))
+    kept = [k for k, site in enumerate(sites) if site not in set(set_aside)]
+    tested = matrix[:, kept]
+    tested = (tested - np.nanmean(tested, axis=0)) / np.maximum(np.nanstd(tested, axis=0), 1e-9)
+    signs = np.array([1.0 if sites[k][1] == "positive" else -1.0 for k in kept])
+    share_of = readings.positions_mm / readings.span_mm
+    place = np.array([share_of[np.flatnonzero(readings.targets == sites[k][0])[0]] for k in kept])
+
+    observed = _statistics(tested, signs, place)
+    null = np.array([_statistics(_permuted(tested, rng), signs, place) for _ in range(_PERMUTATIONS)])
+    names = ("pattern", "slow pattern", "one place", "direction", "direction along the axis", "curvature")
+    each, p_value, _ = family_wise(observed, null)
+    p_values = dict(zip(names, each.tolist(), strict=True))
+    unwhitened = _freed(readings, fit.residual()[:, None])[:, 0]
+    _, _, residual = _matrix(readings, unwhitened)
+    along_time, along_sites, rms = _leading(residual[:, kept])
+    named_sites = [sites[k] for k in kept]
+    shape = _describe(cycles, along_time, named_sites, along_sites, readings) if p_value < LEVEL else ""
+    free = partial(_freed, readings)
+    series = free(_at_readings(readings, cycles, along_time, named_sites, along_sites)[:, None])[:, 0]
+    rms = rms if shape else 0.0
+    return Remainder(p_value, p_values, shape, rms, cycles, along_time, named_sites, along_sites, series, free)
+
+
+def with_drift(found: Remainder, fit: DriftFit) -> Remainder:
+    """Count a common drift or a stretch as a remainder where it is larger than half the noise of a reading.
+
+    The fit lets both wander freely, so no test of the residual can see them; their size is what the model leaves unexplained.
+    """
+    drift, basis = unexplained_drift(fit)
+    sizes = np.sqrt(np.mean(drift**2, axis=0))
+    largest = int(np.argmax(sizes))
+    if sizes[largest] <= _DRIFT_SHARE * fit.sigma:
+        return found
+    course = "smooth" if fit.system.order == 2 else "irregular"
+    where = ("all positions alike", "growing along the axis")[largest] if sizes.size == 2 else f"channel {largest + 1}"
+    return replace(
+        found,
+        shape=f"a slow, {course} drift that no effect of the library follows; {where}, both directions",
+        rms_um=float(sizes[largest]),
+        series=drift[:, largest],
+        free=lambda columns: columns - basis @ (basis.T @ columns),
+    )
+
+
+def _at_readings(
+    readings: Readings, cycles: NDArray[np.int64], along_time: Array, sites: list[tuple[int, str]], along_sites: Array
+) -> Array:
+    """The leading pattern at every reading, (n,); zero at sites that were set aside."""
+    by_site = dict(zip(sites, along_sites, strict=True))
+    direction = np.where(readings.sign > 0, "positive", "negative")
+    weight = [by_site.get((int(t), str(d)), 0.0) for t, d in zip(readings.target, direction, strict=True)]
+    return np.asarray(along_time[np.searchsorted(cycles, readings.cycle)] * np.array(weight))
+
+
+def _matrix(readings: Readings, values: Array) -> tuple[NDArray[np.int64], list[tuple[int, str]], Array]:
+    """Values per cycle and site (cycles, sites); NaN where a reading is missing."""
+    cycles = np.unique(readings.cycle)
+    index = readings.target_index * 2 + (readings.sign < 0)
+    present = np.unique(index)
+    matrix = np.full((cycles.size, present.size), np.nan)
+    matrix[np.searchsorted(cycles, readings.cycle), np.searchsorted(present, index)] = values
+    sites = [(int(readings.targets[k // 2]), "negative" if k % 2 else "positive") for k in present]
+    return cycles, sites, matrix
+
+
+def _permuted(matrix: Array, rng: np.random.Generator) -> Array:
+    """Cycles shuffled within each site; missing readings move along."""
+    return rng.permuted(matrix, axis=0)
+
+
+def _statistics(matrix: Array, signs: Array, place: Array) -> Array:
+    """Six statistics that grow with structure: two of rank one, one of a single place, three of given shape over time."""
+    filled = np.nan_to_num(matrix)
+    blocks = filled[: filled.shape[0] // _BLOCK * _BLOCK].reshape(-1, _BLOCK, filled.shape[1]).mean(axis=1)
+    curved = (place - place.mean()) ** 2
+    basis = np.column_stack([np.ones_like(place), place])
+    curved = curved - basis @ np.linalg.lstsq(basis, curved, rcond=None)[0]
+    stretch = signs * (place - place.mean())
+    contrasts = [filled @ signs, filled @ stretch, filled @ curved]
+    return np.array(
+        [
+            _largest(filled),
+            _largest(blocks) if blocks.shape[0] > 1 else 0.0,
+            (blocks**2).sum(axis=0).max() if blocks.shape[0] > 1 else 0.0,
+            *(_slowness(contrast) for contrast in contrasts),
+        ]
+    )
+
+
+def _largest(matrix: Array) -> float:
+    """Largest singular value, from the products of its columns: the sites are few, the cycles may be many."""
+    return float(np.sqrt(np.linalg.eigvalsh(matrix.T @ matrix)[-1]))
+
+
+def _slowness(series: Array) -> float:
+    """Share of a series' variance that its first differences lack (von Neumann): 0 for white, 1 for very slow."""
+    centred = series - series.mean()
+    total = float(centred @ centred)
+    if total <= 0.0 or series.size < 4:
+        return 0.0
+    return 1.0 - 0.5 * float(np.diff(series) @ np.diff(series)) / total * series.size / (series.size - 1)
+
+
+def _freed(readings: Readings, columns: Array) -> Array:
+    """Columns (n, q) freed of an offset and a stretch per cycle, which the drift would take."""
+    _, cycle = np.unique(readings.cycle, return_inverse=True)
+    number = np.bincount(cycle)
+
+    def mean(values: Array) -> Array:
+        """Mean over each cycle, at every reading."""
+        return np.asarray((np.bincount(cycle, values) / number)[cycle])
+
+    place = readings.share - mean(readings.share)
+    # A cycle of a single target has no stretch.
+    square = np.maximum(mean(place**2), 1e-12)
+    free = [column - mean(column) - place * mean(place * column) / square for column in columns.T]
+    return np.column_stack(free)
+
+
+def _leading(matrix: Array) -> tuple[Array, Array, float]:
+    """Leading pattern over time (um) and sites (largest weight 1) of a matrix with gaps, and its rms (um)."""
+    filled = np.nan_to_num(matrix - np.nanmean(matrix, axis=0))
+    # Runs of three cycles are averaged, so that a pattern is preferred that lasts over a single outlier.
+    kernel = np.ones(3) / 3.0
+    smooth = np.apply_along_axis(lambda column: np.convolve(column, kernel, mode="same"), 0, filled)
+    u, s, vt = np.linalg.svd(smooth, full_matrices=False)
+    weight = np.abs(vt[0]).max()
+    sign = np.sign(vt[0][np.argmax(np.abs(vt[0]))])
+    along_sites = vt[0] / weight * sign
+    along_time = u[:, 0] * s[0] * weight * sign
+    return along_time, along_sites, float(np.sqrt(np.mean(np.outer(along_time, along_sites) ** 2)))
+
+
+def _describe(
+    cycles: NDArray[np.int64], along_time: Array, sites: list[tuple[int, str]], along_sites: Array, readings: Readings
+) -> str:
+    return f"{_time_words(cycles, along_time, readings)}; {_place_words(sites, along_sites)}"
+
+
+def _time_words(cycles: NDArray[np.int64], series: Array, readings: Readings) -> str:
+    """Course in time: one step, a rhythm, switching, or slow growth, whichever explains most of the series."""
+    centred = series - series.mean()
+    total = float(centred @ centred)
+    if total <= 0.0 or series.size < 8:
+        return "course in time not determined"
+    steps = [
+        (k * (series.size - k) / series.size) * (series[k:].mean() - series[:k].mean()) ** 2
+        for k in range(2, series.size - 1)
+    ]
+    at = int(np.argmax(steps)) + 2
+    spectrum = np.abs(np.fft.rfft(centred)) ** 2
+    line = int(np.argmax(spectrum[1:])) + 1
+    around = spectrum[max(1, line - 1) : line + 2].sum() / spectrum[1:].sum()
+    ramp = np.corrcoef(np.arange(series.size), series)[0, 1] ** 2
+    period = (readings.seconds[-1] - readings.seconds[0]) / 60.0 / line
+    candidates = {
+        f"one step at cycle {cycles[at]}": max(steps) / total,
+        f"a rhythm of about {period:.0f} min": float(around) if line > 2 else 0.0,
+        "slow growth or decay": float(ramp),
+    }
+    best = max(candidates, key=lambda words: candidates[words])
+    if candidates[best] > 0.6:
+        return best
+    high = centred > 0
+    changes = int((np.diff(high.astype(int)) != 0).sum())
+    return f"irregular, {changes} changes of side over {series.size} cycles (switching or wandering)"
+
+
+def _place_words(sites: list[tuple[int, str]], weights: Array) -> str:
+    """Where along the axis and in which direction of approach the pattern acts."""
+    strong = [site for site, weight in zip(sites, weights, strict=True) if abs(weight) > 0.5]
+    targets = sorted({target for target, _ in strong})
+    directions = {direction for _, direction in strong}
+    signs = {np.sign(weight) for weight in weights if abs(weight) > 0.5}
+    by_site = dict(zip(sites, weights, strict=True))
+    pairs = [
+        (by_site[(t, "positive")], by_site[(t, "negative")])
+        for t, d in sites
+        if d == "positive" and (t, "negative") in by_site
+    ]
+    even = sum((a + b) ** 2 for a, b in pairs)
+    odd = sum((a - b) ** 2 for a, b in pairs)
+    where = f"target {targets[0]}" if len(targets) == 1 else f"targets {_runs(targets)}"
+    if len(directions) == 1:
+        way = f"{next(iter(directions))} direction only"
+    elif odd > 4 * even:
+        way = "opposite in both directions"
+    else:
+        way = "both directions"
+    opposed = (
+        ", with opposite signs along the axis" if len(signs) == 2 and len(directions) == 2 and odd <= 4 * even else ""
+    )
+    return f"{where}, {way}{opposed}"
+
+
+def _runs(numbers: list[int]) -> str:
+    """Numbers as ranges: 1-3, 7."""
+    parts: list[list[int]] = []
+    for number in numbers:
+        if parts and number == parts[-1][-1] + 1:
+            parts[-1].append(number)
+        else:
+            parts.append([number])
+    return ", ".join(str(part[0]) if len(part) == 1 else f"{part[0]}-{part[-1]}" for part in parts)

@@ -1,0 +1,117 @@
+"""Does an effect act along the axis as its physics says? If the same course in time fits better with another pattern, it has no name.
+
+An effect that is not in the library is fitted by the nearest that is: a scale that differs by direction by a reversal drift, a creep of
+one stretch of the guide by a bending. The course in time is then right and the pattern along the axis wrong. So the named pattern is
+held against a free one: the same course in time, with a size of its own at every site.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+from scipy import stats
+
+from fusion._typing import Array
+from fusion.model.fit import ModelFit, Term
+from fusion.model.least_squares import residual_squares
+
+#: Chance at which a right effect is denied its name.
+LEVEL = 1e-3
+#: Share of a column that must lie outside the model for a site to have a say.
+_SEPARABLE = 1e-6
+#: Effects that have nothing but their pattern to be told by.
+_PATTERNED = frozenset({"angular_growth", "pitch_error", "reversal_drift"})
+
+
+def wrong_patterns(model: ModelFit, terms: Sequence[Term]) -> dict[int, str]:
+    """Places of the terms that do not deserve their names, each with the reason.
+
+    An effect is wrong where a free pattern fits its course in time better; and two patterns of which one course would do are more likely
+    one pattern that the library does not have.
+    """
+    wrong = {}
+    courses = {k: _course(model, term) for k, term in enumerate(terms) if term.member.event_s is None}
+    for k in courses:
+        p_value = pattern_p_value(model, terms[k])
+        if p_value < LEVEL:
+            wrong[k] = (
+                "something with its course in time is there, but along the axis and by direction it is not its pattern "
+                f"(p = {p_value:.1g})"
+            )
+    patterned = [k for k in courses if terms[k].effect in _PATTERNED]
+    for first, second in combinations(patterned, 2):
+        if _one_pattern(model, (terms[first], terms[second]), (courses[first], courses[second])):
+            names = f"{terms[first].effect} and {terms[second].effect}"
+            reason = f"{names} fit no better than one course in time with a free pattern: together they are one pattern without a name"
+            wrong[first] = wrong[second] = reason
+    return wrong
+
+
+def _one_pattern(model: ModelFit, terms: tuple[Term, Term], courses: tuple[Array, Array]) -> bool:
+    """Whether one of two courses in time, with a size of its own at every site, fits as well as both terms.
+
+    What so many free sizes gain by chance, half a unit of log-likelihood each, is taken off.
+    """
+    own = [place for term in terms for place in range(*model.place(term).indices(model.fit.design.shape[1]))]
+    design = np.delete(model.fit.design, own, axis=1)
+    both = _left(model, model.fit.design)
+    for course in courses:
+        free = _free_pattern(model, course)
+        alone = _left(model, np.column_stack([design, free]))
+        more = free.shape[1] - len(own)
+        if 0.5 * model.fit.response.size * np.log(both / alone) >= 0.5 * more:
+            return True
+    return False
+
+
+def _left(model: ModelFit, design: Array) -> float:
+    """Whitened residual sum of squares beside a design whose columns may depend on each other."""
+    whitened, _ = model.fit.system.whiten(np.column_stack([model.fit.response, design]))
+    return residual_squares(whitened[:, 0], whitened[:, 1:])
+
+
+def _free_pattern(model: ModelFit, course: Array) -> Array:
+    """A course in time (n,) with a size of its own at every site, (n, sites)."""
+    readings = model.readings.subset(model.used)
+    site = readings.target_index * 2 + (readings.sign < 0)
+    return (site[:, None] == np.unique(site)[None, :]) * course[:, None]
+
+
+def pattern_p_value(model: ModelFit, term: Term) -> float:
+    """Chance that sites deviate so much from the term's own pattern along the axis where that pattern is right.
+
+    The one target that deviates most is left out: a single position may have an anomaly of its own.
+    """
+    readings = model.readings.subset(model.used)
+    site = readings.target_index * 2 + (readings.sign < 0)
+    course = _course(model, term)
+    sites = np.unique(site)
+    free = _free_pattern(model, course)
+    whitened, _ = model.fit.system.whiten(np.column_stack([model.fit.response, model.fit.design, free]))
+    p = model.fit.design.shape[1]
+    q, _ = np.linalg.qr(whitened[:, 1 : p + 1])
+    y, columns = (part - q @ (q.T @ part) for part in (whitened[:, :1], whitened[:, p + 1 :]))
+    own = np.linalg.norm(whitened[:, p + 1 :], axis=0)
+    u, s, vt = np.linalg.svd(columns / np.maximum(own, 1e-12), full_matrices=False)
+    kept = s**2 > _SEPARABLE
+    score = (u[:, kept].T @ y)[:, 0] / model.fit.sigma
+    # Each site's share of the statistic, from its smallest-norm size.
+    size = vt[kept].T @ (score / s[kept])
+    share = size * (vt[kept].T @ (score * s[kept]))
+    per_target = np.bincount(sites // 2, share)
+    freedom = int(kept.sum())
+    left = float(score @ score) - max(0.0, float(per_target.max()))
+    return float(stats.chi2.sf(left, max(1, freedom - 2)))
+
+
+def _course(model: ModelFit, term: Term) -> Array:
+    """Course in time of a term's largest column, read at the site where it moves most, at all used readings (n,)."""
+    readings = model.readings.subset(model.used)
+    site = readings.target_index * 2 + (readings.sign < 0)
+    columns = term.member.columns[model.used]
+    largest = int(np.argmax(columns.std(axis=0) * np.abs(model.fit.coefficients[model.place(term)])))
+    column = columns[:, largest]
+    most = site == max(np.unique(site), key=lambda number: column[site == number].std())
+    return np.asarray(np.interp(readings.seconds, readings.seconds[most], column[most]))

@@ -1,0 +1,157 @@
+"""Fields put right: where the loop finds that the camera erred, the error is taken out of the fields and all is computed again.
+
+A step of the camera's zero is uniform from one frame on; a reflection is a patch that switches. Both were found as what they do to the
+prediction of the drift; here they become what is to be added to every cell of every frame. The field itself shows their size far more
+sharply than the drift does, so its size is taken where both agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from fusion._typing import Array
+from fusion.alignment.align import cycle_bounds
+from fusion.alignment.reflection_patch import find_switching_patch
+from fusion.loop.result import LoopResult
+from fusion.model.fit import CAMERA_ERRORS
+
+#: Standard uncertainties within which the sizes from the drift and from the field agree.
+_AGREEMENT = 3.0
+
+
+@dataclass(frozen=True)
+class FieldError:
+    """One error of the camera, as the loop found it.
+
+    Attributes
+    ----------
+    effect : ``camera_offset`` or ``reflected_source``
+    text : what was wrong, in one sentence
+    size_K, size_u_K : largest size of the error and its standard uncertainty
+    first_cycle : the first cycle whose field it touches
+    correction : (time, y, x) K, to be added to every frame
+    """
+
+    effect: str
+    text: str
+    size_K: float
+    size_u_K: float
+    first_cycle: int
+    correction: Array
+
+    def as_json(self) -> dict[str, float | int | str]:
+        """The entry of ``loop.field_corrections`` in results.json."""
+        return {
+            "effect": self.effect,
+            "text": self.text,
+            "size_K": self.size_K,
+            "size_u_K": self.size_u_K,
+            "first_cycle": self.first_cycle,
+        }
+
+
+def find_field_errors(found: LoopResult, fields: xr.Dataset, fused: xr.Dataset) -> list[FieldError]:
+    """Return every error of the camera that entered the model, with the correction of the frames.
+
+    Parameters
+    ----------
+    found : what the loop found on these fields
+    fields : keeps ``thermography.contract.FIELDS``
+    fused : both recordings on one clock, from these fields
+    """
+    errors = []
+    time = fields["time"].values.astype("datetime64[ns]")
+    start = _start(fused)
+    frame_cycle = _cycle_of(time, fused)
+    for step in found.steps:
+        if step.effect not in CAMERA_ERRORS:
+            continue
+        size, u = float(step.coefficients[0]["value"]), float(step.coefficients[0]["u"])
+        if step.effect == "camera_offset":
+            size = _agreed(size, u, float(step.parameters["jump_of_the_field_K"]))
+            # A microsecond of slack: the instant went through seconds in floating point.
+            late = (time - start) / np.timedelta64(1, "s") >= float(step.parameters["time_s"]) - 1e-6
+            error = size * np.broadcast_to(late[:, None, None], fields["frame_temperature"].shape)
+            text = f"the camera read {size:+.3f} +- {u:.3f} K too high"
+        else:
+            temperature = fields["frame_temperature"].values.astype(float)
+            patch = find_switching_patch(temperature - temperature[0])
+            if patch is None:
+                continue
+            # A warm body adds to what the camera sees: the lowest state is the one without it.
+            course = patch.course - patch.course.min()
+            size = _agreed(size, u, 1.0)
+            error = size * course[:, None, None] * patch.pattern
+            height = float(course.max())
+            text = f"a reflected source added up to {size * height:.2f} +- {u * height:.2f} K over a patch"
+            size, u = size * height, u * height
+        touched = np.flatnonzero(np.abs(error).max(axis=(1, 2)) > 0.0)
+        first = int(frame_cycle[touched[0]]) if touched.size else int(frame_cycle[-1])
+        errors.append(
+            FieldError(step.effect, f"{text} from cycle {first} on", size, u, first, -np.asarray(error, float))
+        )
+    return errors
+
+
+def _agreed(fitted: float, u: float, seen: float) -> float:
+    """The size that the field shows, or that fitted to the drift where both disagree."""
+    return seen if abs(seen - fitted) <= _AGREEMENT * u else fitted
+
+
+def correct_fields(fields: xr.Dataset, errors: list[FieldError]) -> xr.Dataset:
+    """Return the fields with the frames put right; everything per cycle stays, see :func:`corrected_variables`."""
+    total = np.sum([one.correction for one in errors], axis=0)
+    frames = fields["frame_temperature"]
+    return fields.assign(frame_temperature=frames.copy(data=frames.values + total))
+
+
+def corrected_variables(fields: xr.Dataset, fused: xr.Dataset, errors: list[FieldError]) -> dict[str, xr.Variable]:
+    """Return what was added to every frame, and temperature and rise per cycle with it, for fusion.nc.
+
+    A cycle's field is a mean of its frames, so its correction is the mean of theirs; one without frames takes that of the frame before.
+    """
+    total = np.sum([one.correction for one in errors], axis=0)
+    frame_cycle = _cycle_of(fields["time"].values.astype("datetime64[ns]"), fused)
+    per_cycle = np.zeros((fields.sizes["cycle"], *total.shape[1:]))
+    for place, cycle in enumerate(fields["cycle"].values):
+        own = frame_cycle == cycle
+        before = np.flatnonzero(frame_cycle < cycle)
+        if own.any():
+            per_cycle[place] = total[own].mean(axis=0)
+        elif before.size:
+            per_cycle[place] = total[before[-1]]
+    plan = ("plan_y", "plan_x")
+    kelvin = {"units": "K", "units_metadata": "temperature: difference"}
+    why = "; ".join(one.text for one in errors)
+    temperature = fields["temperature"].values + per_cycle
+    rise = fields["temperature_rise"].values + per_cycle - per_cycle[0]
+    return {
+        "field_correction": xr.Variable(
+            ("frame_time", *plan),
+            total.astype("f4"),
+            {**kelvin, "long_name": "to be added to frame_temperature of fields.nc", "comment": why},
+        ),
+        "temperature_corrected": xr.Variable(
+            ("cycle", *plan),
+            temperature.astype("f4"),
+            {"units": "degC", "units_metadata": "temperature: on_scale", "comment": why},
+        ),
+        "temperature_rise_corrected": xr.Variable(("cycle", *plan), rise.astype("f4"), {**kelvin, "comment": why}),
+    }
+
+
+def _start(fused: xr.Dataset) -> np.datetime64:
+    """Time of the first reading, from which the loop counts its seconds."""
+    time = fused["time"].values.astype("datetime64[ns]")
+    present = np.isfinite(fused["deviation"].values) & ~np.isnat(time)
+    return np.datetime64(time[present].min())
+
+
+def _cycle_of(frame_time: Array, fused: xr.Dataset) -> Array:
+    """Cycle of every frame; those outside all cycles count to the nearest before, or to the first."""
+    bounds = cycle_bounds(fused)
+    place = np.clip(np.searchsorted(bounds[:, 0], frame_time, side="right") - 1, 0, None)
+    return np.asarray(fused["cycle"].values[place])

@@ -1,0 +1,182 @@
+"""What a campaign could tell at all: how large an effect must be to be found, and which effects look alike in it.
+
+Nothing here looks at what the readings say, only at when, where and under which load they were taken, and at how much noise and drift
+they hold. An effect is found where its expected gain in log-likelihood exceeds, with 80 % power, what the whole search finds by chance.
+The drift is as free here as in the search: what it can stand in for does not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion._typing import Array
+from fusion.effects.candidates import Member, hidden_leads_mm
+from fusion.effects.library import Effect
+from fusion.loop.admissibility import WARM_UP_SHARE, warm_up_share
+from fusion.loop.scoring import FamilyScore, Judge
+from fusion.model.fit import ModelFit
+from fusion.model.least_squares import by_width, reductions
+
+#: Standard normal quantile of the power: an effect of the stated size is found in 80 % of such campaigns.
+_POWER_QUANTILE = 0.84
+#: Share of an effect's visible variance from which on another effect is said to look alike.
+_ALIKE_SHARE = 0.9
+#: Largest size that is looked for, um per reading, and simulated campaigns that suffice for the scatter that a drift leaves.
+_LARGEST_UM = 1e3
+_DRAWS = 20
+
+
+@dataclass(frozen=True)
+class Identifiable:
+    """What this campaign could tell about one effect.
+
+    Attributes
+    ----------
+    effect : its name
+    detectable_um : rms that is found with 80 % power, um: median over the effect's members; None where none can be told from the model
+    best_um, worst_um : the same for the members that show best and worst
+    visible_share : share of the effect's rms that is left beside static profile and declared effects (median)
+    looks_like : other effects of which a member explains at least 90 % of its visible variance
+    note : what stands in the way, empty where nothing does
+    """
+
+    effect: str
+    detectable_um: float | None
+    best_um: float | None
+    worst_um: float | None
+    visible_share: float
+    looks_like: list[str]
+    note: str
+
+
+def identify(
+    judge: Judge,
+    model: ModelFit,
+    families: Mapping[str, Sequence[Member]],
+    scores: Sequence[FamilyScore],
+    effects: Mapping[str, Effect],
+) -> list[Identifiable]:
+    """Say for every effect how large it must be to be found and what it looks like.
+
+    Parameters
+    ----------
+    judge, model : the declared model on the training readings, with simulated campaigns in which it is complete
+    families : members of every effect that can be tried
+    scores : of the first round of the search; only the gain that chance makes is used
+    effects : the library
+    """
+    named = [(name, member) for name, members in families.items() for member in members]
+    first = np.column_stack([member.columns[judge.used, 0] for _, member in named])
+    names = np.array([name for name, _ in named])
+    critical = {score.name: score.critical for score in scores}
+    wanted = np.array([0.5 * (np.sqrt(2.0 * critical[name]) + _POWER_QUANTILE) ** 2 for name in names])
+    own, left = _beside(model, first)
+    smallest = _smallest(judge, first, wanted)
+    # A column that never moves has no size.
+    sizes = np.where(own > 0.0, own, np.inf) * smallest
+    share = left / np.maximum(own, 1e-300)
+    typical = {name: _typical(sizes, names == name) for name in families}
+    alike = _alike(judge, first, [member for _, member in named], names, list(typical.values()))
+    found = []
+    for row, name in enumerate(families):
+        here = sizes[names == name]
+        seen = here[np.isfinite(here)]
+        found.append(
+            Identifiable(
+                effect=name,
+                detectable_um=float(np.median(seen)) if seen.size else None,
+                best_um=float(seen.min()) if seen.size else None,
+                worst_um=float(seen.max()) if seen.size else None,
+                visible_share=float(np.median(share[names == name])),
+                looks_like=sorted(alike[row] - {name}),
+                note=_note(
+                    effects[name], named[int(np.flatnonzero(names == name)[np.argmin(here)])][1], model, seen.size
+                ),
+            )
+        )
+    return found
+
+
+def _typical(sizes: Array, of_effect: NDArray[np.bool_]) -> int:
+    """Place of the member that shows like the median of its effect."""
+    places = np.flatnonzero(of_effect)
+    return int(places[np.argsort(sizes[places])[places.size // 2]])
+
+
+def _beside(model: ModelFit, columns: Array) -> tuple[Array, Array]:
+    """Rms of columns freed of their mean at every site, and of what is left of them beside the model's columns, (members,) each."""
+    readings = model.readings.subset(model.used)
+    site = readings.target_index * 2 + (readings.sign < 0)
+    number = np.maximum(np.bincount(site), 1)
+    means = np.column_stack([np.bincount(site, column) / number for column in columns.T])
+    q, _ = np.linalg.qr(model.fit.design)
+    left = columns - q @ (q.T @ columns)
+    return np.sqrt(np.mean((columns - means[site]) ** 2, axis=0)), np.sqrt(np.mean(left**2, axis=0))
+
+
+def _smallest(judge: Judge, columns: Array, wanted: Array) -> Array:
+    """Coefficient of every column at which its expected gain is as wanted, the drift being free with it and without it, (members,)."""
+    n, draws = columns.shape[0], judge.draws[:, :_DRAWS]
+    energy, noise, penalty = [], [], []
+    for system in judge.systems():
+        errors, spread = system.innovations(np.column_stack([draws, judge.fit.design, columns]))
+        errors /= np.sqrt(spread)[:, None]
+        count, p = draws.shape[1], judge.fit.design.shape[1]
+        q, _ = np.linalg.qr(errors[:, count : count + p])
+        free = errors - q @ (q.T @ errors)
+        noise.append(np.mean((free[:, :count] ** 2).sum(axis=0)))
+        energy.append((free[:, count + p :] ** 2).sum(axis=0))
+        penalty.append(np.log(spread).sum())
+    scatter, without_name = np.array(noise)[:, None], np.array(penalty)[:, None]
+    nothing = np.max(-0.5 * (n * np.log(scatter) + without_name), axis=0)
+    low, high = (
+        np.zeros(columns.shape[1]),
+        np.full(columns.shape[1], _LARGEST_UM / np.maximum(columns.std(axis=0), 1e-12)),
+    )
+
+    def gain(size: Array) -> Array:
+        swallowed = -0.5 * (n * np.log(scatter + size**2 * np.array(energy)) + without_name)
+        return np.asarray(nothing - swallowed.max(axis=0))
+
+    never = gain(high) < wanted
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        enough = gain(middle) >= wanted
+        low, high = np.where(enough, low, middle), np.where(enough, middle, high)
+    return np.where(never, np.inf, high)
+
+
+def _alike(
+    judge: Judge, first: Array, members: Sequence[Member], names: NDArray[np.str_], typical: Sequence[int]
+) -> list[set[str]]:
+    """For every effect's typical member the effects of which some member explains nearly all that is visible of it."""
+    groups = by_width(members, judge.used)
+    columns = np.concatenate([group.columns for group in groups], axis=1)
+    system = judge.fit.system
+    errors, spread = system.innovations(np.column_stack([first[:, list(typical)], judge.fit.design, columns]))
+    errors /= np.sqrt(spread)[:, None]
+    count, p = len(typical), judge.fit.design.shape[1]
+    q, _ = np.linalg.qr(errors[:, count : count + p])
+    y = errors[:, :count] - q @ (q.T @ errors[:, :count])
+    reduced, given, _ = reductions(errors[:, count + p :], y, q, groups)
+    alike = reduced - given > _ALIKE_SHARE * np.maximum((y**2).sum(axis=0), 1e-300)[:, None]
+    return [set(names[row].tolist()) for row in alike]
+
+
+def _note(effect: Effect, member: Member, model: ModelFit, seen: int) -> str:
+    """What stands in the way of an effect in this campaign."""
+    part = model.readings.subset(model.used)
+    if not seen:
+        return "the declared model contains it, or nothing excites it"
+    on_used = Member(member.columns[model.used], member.parameters, member.units, member.event_s)
+    if effect.excited_by and warm_up_share(part, on_used) > WARM_UP_SHARE:
+        return "one warm-up is all that excites it; switch the load on purpose to tell it from others"
+    if effect.name == "pitch_error":
+        hidden = hidden_leads_mm(part)
+        if hidden:
+            return f"evenly spaced targets hide leads of {hidden}; space them unevenly to see all"
+    return ""

@@ -1,0 +1,254 @@
+"""A model of the drift: static profile, named terms, and the drift that nobody explains, fitted to readings.
+
+Terms that depend on more than the readings: on the model's other coefficients, or on fields that have been put right since.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion._typing import Array
+from fusion.alignment.readings import Readings
+from fusion.effects.candidates import Member, Prior
+from fusion.effects.library import Effect
+from interferometry.drift.gls import DriftFit, estimate, fit_fixed_effects
+from interferometry.drift.state_space import DriftSystem
+
+#: The scatter of a site is trusted like this many further readings with the scatter of all sites.
+_SHRINKAGE_READINGS = 20
+
+
+@dataclass(frozen=True)
+class Term:
+    """One effect of the model with the member that was chosen."""
+
+    effect: str
+    member: Member
+
+    @property
+    def width(self) -> int:
+        """Number of coefficients."""
+        return self.member.columns.shape[1]
+
+
+def place_of(terms: Sequence[Term], term: Term, start: int = 0) -> slice:
+    """Where the columns of a term stand among those of all terms, the first of which begins at `start`."""
+    for other in terms:
+        if other is term:
+            return slice(start, start + term.width)
+        start += other.width
+    raise KeyError(term.effect)
+
+
+@dataclass(frozen=True)
+class ModelFit:
+    """A model fitted to a part of the readings.
+
+    Attributes
+    ----------
+    readings : all readings
+    used : (n,) readings that the fit was made from
+    terms : the named effects
+    fit : the generalised least-squares fit to the used readings
+    profile : (n, k) static columns that the used readings determine
+    """
+
+    readings: Readings
+    used: NDArray[np.bool_]
+    terms: tuple[Term, ...]
+    fit: DriftFit
+    profile: Array
+
+    def place(self, term: Term) -> slice:
+        """Where the coefficients of a term stand in the fit."""
+        return place_of(self.terms, term, self.profile.shape[1])
+
+    def priors(self) -> list[tuple[int, Prior]]:
+        """Places of the coefficients that something is known of beforehand, and what."""
+        known = [(self.place(term).start, term.member.prior) for term in self.terms]
+        return [(place, prior) for place, prior in known if prior is not None]
+
+    def coefficients(self) -> dict[str, float]:
+        """First coefficient of every term by effect name; the first term counts where an effect enters twice."""
+        found: dict[str, float] = {}
+        for term in self.terms:
+            found.setdefault(term.effect, float(self.fit.coefficients[self.place(term)][0]))
+        return found
+
+    def series(self, term: Term) -> tuple[Array, Array]:
+        """Predicted contribution of a term to every reading, um, and its standard uncertainty (n,), (n,)."""
+        place = self.place(term)
+        columns = term.member.columns
+        covariance = self.fit.covariance[place, place]
+        return columns @ self.fit.coefficients[place], np.sqrt(np.einsum("ni,ij,nj->n", columns, covariance, columns))
+
+    def whole_design(self) -> Array:
+        """Columns of the fit for all readings, (n, p)."""
+        columns = [self.profile, *(term.member.columns for term in self.terms)]
+        design = np.column_stack(columns)
+        if self.fit.system.order == 2:
+            hours = (self.readings.seconds / 3600.0)[:, None]
+            design = np.column_stack([design, self.readings.loadings * hours])
+        return design
+
+    def whole_system(self) -> DriftSystem:
+        """All readings under the fitted drift, those that were used marked as observed."""
+        variance = np.ones(self.used.size)
+        variance[self.used] = self.fit.system.variance
+        return DriftSystem(
+            self.readings.seconds,
+            self.readings.loadings,
+            self.fit.system.order,
+            self.fit.system.ratios,
+            variance,
+            self.used,
+        )
+
+    def open_loop_errors(self) -> tuple[Array, Array]:
+        """Errors of predicting the readings that were not used, um, and the predicted standard deviation, both (n_unused,).
+
+        Coefficients are frozen; the drift keeps the value it had at the last used reading. Readings of a site that the fit has
+        never seen are NaN.
+        """
+        seen = self.whole_system()
+        design = self.whole_design()
+        errors, spread = seen.innovations(np.column_stack([self.readings.response, design]))
+        through = errors[:, 1:]
+        missed = errors[:, 0] - through @ self.fit.coefficients
+        own = np.einsum("ni,ij,nj->n", through, self.fit.covariance, through)
+        missed = np.where(self._known_site(), missed, np.nan)
+        return missed[~self.used], np.sqrt(self.fit.sigma**2 * spread + own)[~self.used]
+
+    def _known_site(self) -> NDArray[np.bool_]:
+        site = self.readings.target_index * 2 + (self.readings.sign < 0)
+        return np.isin(site, np.unique(site[self.used]))
+
+
+def fit_model(
+    readings: Readings,
+    terms: Sequence[Term],
+    *,
+    used: NDArray[np.bool_] | None = None,
+) -> ModelFit:
+    """Fit profile, terms and drift to the used readings; outliers and noisy sites count less."""
+    used = np.ones(readings.seconds.size, bool) if used is None else used
+    profile = readings.profile
+    profile = profile[:, _determined(profile[used])]
+    design = np.column_stack([profile, *(term.member.columns for term in terms)])[used]
+    seconds, loadings, response = readings.seconds[used], readings.loadings[used], readings.response[used]
+    first = estimate(seconds, loadings, response, design, robust=True)
+    variance = _site_variance(readings.subset(used), first) * first.system.variance
+    fit = estimate(
+        seconds, loadings, response, design, order=first.system.order, start=first.system.ratios, variance=variance
+    )
+    model = ModelFit(readings, used, tuple(terms), fit, profile)
+    for place, prior in model.priors():
+        fit = condition(fit, place, prior)
+    return replace(model, fit=fit)
+
+
+def unexplained_drift(fit: DriftFit) -> tuple[Array, Array]:
+    """Drift of each component at every reading, um, that no static profile and no effect of the model could make (n, components).
+
+    Beside it an orthonormal basis (n, k) of profile and effects.
+
+    A drift that wanders smoothly, its start rate and a slowly growing effect can stand in for one another, so their single sizes are
+    badly determined; what is left of the drift beside profile and effects is not.
+    """
+    levels, _ = fit.drift()
+    loadings = fit.system.loadings
+    named = fit.design
+    drift = levels * loadings
+    if fit.system.order == 2:
+        components = loadings.shape[1]
+        named, rates = fit.design[:, :-components], fit.design[:, -components:]
+        drift = drift + rates * fit.coefficients[-components:]
+    q, _ = np.linalg.qr(named)
+    return np.asarray(drift - q @ (q.T @ drift)), np.asarray(q)
+
+
+def condition(fit: DriftFit, place: int, prior: Prior) -> DriftFit:
+    """The fit with one coefficient observed once more, as its prior says; the variances are kept."""
+    gain = fit.covariance[:, place] / (fit.covariance[place, place] + prior.u**2)
+    return replace(
+        fit,
+        coefficients=fit.coefficients + gain * (prior.mean - fit.coefficients[place]),
+        covariance=fit.covariance - np.outer(gain, fit.covariance[place]),
+    )
+
+
+def refit_fixed(model: ModelFit, terms: Sequence[Term]) -> DriftFit:
+    """Fit another set of terms with the drift's variances kept (for comparing likelihoods of nested models)."""
+    design = np.column_stack([model.profile, *(term.member.columns for term in terms)])[model.used]
+    if model.fit.system.order == 2:
+        hours = (model.readings.seconds[model.used] / 3600.0)[:, None]
+        design = np.column_stack([design, model.readings.loadings[model.used] * hours])
+    return fit_fixed_effects(replace(model.fit.system), model.fit.response, design)
+
+
+def _determined(columns: Array) -> NDArray[np.bool_]:
+    """Columns that are not constant zero and, for reversals, not equal to half their target's column."""
+    present = np.abs(columns).max(axis=0, initial=0.0) > 0.0
+    kept = np.zeros(columns.shape[1], bool)
+    seen: set[bytes] = set()
+    for k in np.flatnonzero(present):
+        key = (columns[:, k] / columns[np.argmax(np.abs(columns[:, k])), k]).tobytes()
+        kept[k] = key not in seen
+        seen.add(key)
+    return kept
+
+
+def _site_variance(readings: Readings, fit: DriftFit) -> Array:
+    """Relative variance of each reading from the scatter of its site (target and direction), (n,), mean 1."""
+    noise, share = fit.noise()
+    # Readings that were given a larger variance as outliers tell nothing about their site's ordinary scatter.
+    ordinary = fit.system.variance == 1.0
+    site = readings.target_index * 2 + (readings.sign < 0)
+    relative = np.ones(noise.size)
+    for number in np.unique(site):
+        here = (site == number) & ordinary
+        squares = float((noise[here] ** 2).sum()) / fit.sigma**2 + _SHRINKAGE_READINGS
+        relative[site == number] = squares / (float(share[here].sum()) + _SHRINKAGE_READINGS)
+    return relative / np.mean(relative)
+
+
+#: Effects that make the field wrong, not the drift; and how often their size and the declared coefficients are fitted in turn.
+CAMERA_ERRORS = frozenset({"camera_offset", "reflected_source"})
+_SETTLING_ROUNDS = 2
+
+
+def settled(model: ModelFit, effects: Mapping[str, Effect]) -> ModelFit:
+    """The model with errors of the camera sized by the coefficients that hold beside them.
+
+    While such an error was unknown it bent the declared coefficients, by which it is weighed.
+    """
+    if not any(term.effect in CAMERA_ERRORS for term in model.terms):
+        return model
+    for _ in range(_SETTLING_ROUNDS):
+        known = model.coefficients()
+        terms = [
+            again(term, model.readings, known, effects) if term.effect in CAMERA_ERRORS else term
+            for term in model.terms
+        ]
+        model = fit_model(model.readings, terms, used=model.used)
+    return model
+
+
+def again(term: Term, readings: Readings, coefficients: Mapping[str, float], effects: Mapping[str, Effect]) -> Term:
+    """A term with the columns that the same parameters give now; one that does not offer them again stays."""
+    near = term.member if term.member.parameters else None
+    offered = effects[term.effect].members(readings, coefficients, near)
+    same = (member for member in offered if _same_parameters(member.parameters, term.member.parameters))
+    member = next(same, term.member)
+    return Term(term.effect, replace(member, prior=term.member.prior))
+
+
+def _same_parameters(one: Mapping[str, float | str], other: Mapping[str, float | str]) -> bool:
+    return one.keys() == other.keys() and all(
+        one[name] == value if isinstance(value, str) else np.isclose(float(one[name]), float(value), rtol=1e-9)
+        for name, value in other.items()
+    )

@@ -1,0 +1,124 @@
+"""The stages after the thermal one: deviations evaluated, both recordings joined, correlated, modelled."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from fusion.alignment.align import align
+from fusion.campaign.inputs import Source, counted, listed
+from fusion.products.grouped import joined
+from fusion.products.results import Notice, Outcome
+from interferometry import iso230, neighbours
+from interferometry.deviations import OUTLIER
+from interferometry.drift.estimate import estimate_drift, flag_outliers
+
+#: What each stage is called in progress and provenance.
+LABELS = {
+    "fields": "thermal fields",
+    "deviations": "deviations",
+    "correlation": "correlation",
+    "model": "anomalies and closed loop",
+    "record": "closed loop on the record",
+}
+
+
+def evaluate_interferometry(source: Source) -> Outcome:
+    """Evaluate the readings conventionally, by the paper's differences, by ISO 230-2 and by the joint estimate."""
+    deviations = source.deviations
+    drift = estimate_drift(deviations)
+    deviations = flag_outliers(deviations, drift)
+    comparison = neighbours.compare(deviations, drift)
+    windows = iso230.evaluate_windows(deviations, budget=source.iso_budget)
+    dataset = joined(
+        deviations,
+        conventional=neighbours.evaluate_conventional(deviations),
+        neighbours=neighbours.evaluate_neighbours(deviations),
+        comparison=comparison,
+        chart=neighbours.build_chart(deviations),
+        iso=windows,
+        drift=drift,
+    )
+    parts = {
+        "iso230": iso_part(windows),
+        "neighbours": {
+            "conventional_s_um": by_direction(comparison["conventional"]),
+            "pair_s_um": by_direction(comparison["differenced"]),
+            "ratio": by_direction(comparison["ratio"]),
+        },
+        "drift": {
+            "profile_um": by_direction(drift["profile"]),
+            "profile_u_um": by_direction(drift["profile_u"]),
+            "scatter_um": by_direction(drift["scatter"]),
+        },
+    }
+    return Outcome(dataset, parts, tuple(reading_notices(deviations, drift)))
+
+
+def reading_notices(deviations: xr.Dataset, drift: xr.Dataset) -> list[Notice]:
+    """Return notices for missing readings, with what they cost the profile, and for readings that were given little weight."""
+    notices = []
+    gaps = np.isnan(deviations["deviation"].values)
+    if gaps.any():
+        cycles = [str(cycle) for cycle in deviations["cycle"].values[gaps.any(axis=(1, 2))]]
+        share = np.sqrt(1.0 - gaps.mean(axis=0))
+        wider = float(np.nanmax(drift["profile_u"].values * (1.0 - share)))
+        notices.append(
+            Notice(
+                "readings_missing",
+                f"{counted(int(gaps.sum()), 'reading')} of {gaps.size} missing, in {counted(len(cycles), 'cycle')}: {listed(cycles)}. "
+                f"This widens the profile's standard uncertainty by up to {wider:.3f} µm.",
+                "Nothing has to be done: the joint estimate allows for gaps; conventional values use the readings that are there.",
+                effect_um=wider,
+            )
+        )
+    outliers = (deviations["quality_flag"].values & OUTLIER.mask) > 0
+    if outliers.any():
+        named = [
+            f"cycle {deviations['cycle'].values[c]} {deviations['direction'].values[d]} target {deviations['target'].values[t]}"
+            for c, d, t in np.argwhere(outliers)
+        ]
+        notices.append(
+            Notice(
+                "outliers",
+                f"{counted(len(named), 'reading')} far from the joint estimate given little weight: {listed(named)}.",
+                "Look at what happened there; flagged in deviations.nc, still in the conventional values.",
+            )
+        )
+    return notices
+
+
+def iso_part(windows: xr.Dataset) -> dict[str, Any]:
+    """Return the axis values of the first window, as the standard's test would have found them."""
+    first = windows.isel(window=0)
+    values = {f"{name}_um": {"value": float(first[name]), "u": float(first[f"{name}_u"])} for name in iso230.QUANTITIES}
+    return {"window": str(first["window"].values), **values}
+
+
+def by_direction(values: xr.DataArray) -> dict[str, list[float]]:
+    """Return an array over direction and target as lists per direction."""
+    return {str(name): np.asarray(values.sel(direction=name), float).tolist() for name in values["direction"].values}
+
+
+def align_recordings(source: Source, fields: xr.Dataset, deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
+    """Give every reading the field, the environment and the drivers at its own time; note readings outside the frames' time."""
+    fused = align(deviations, fields, source.axis, environment=source.environment, drivers=source.drivers)
+    return fused, outside_notices(fused)
+
+
+def outside_notices(fused: xr.Dataset) -> list[Notice]:
+    """Return a notice for readings that lie outside the frames' time."""
+    outside = (fused["deviation"].notnull() & ~fused["inside_frames"]).values
+    if not outside.any():
+        return []
+    cycles = [str(cycle) for cycle in fused["cycle"].values[outside.any(axis=(1, 2))]]
+    return [
+        Notice(
+            "readings_outside_frames",
+            f"{counted(int(outside.sum()), 'reading')} outside the frames' time, in {counted(len(cycles), 'cycle')} ({listed(cycles)}); "
+            "evaluated, but without a part in what joins drift and field.",
+            "Start the camera before the first cycle and stop it after the last one.",
+        )
+    ]

@@ -1,0 +1,171 @@
+"""The main job on a record: read, reduced to blocks, its loop closed, described for results.json and report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from fusion.campaign.config import Campaign
+from fusion.campaign.inputs import counted, left_out_notices, listed
+from fusion.campaign.logged_tables import read_record
+from fusion.products.progress import Report
+from fusion.products.results import Notice, Outcome
+from fusion.record.blocks import Record, reduce_record
+from fusion.record.effects import QUASI_STATIC
+from fusion.record.loop import RecordResult, close_record
+from fusion.record.search import declare
+from fusion.report.wording import duration
+
+
+@dataclass(frozen=True)
+class RecordSource:
+    """A record as it was read, before anything is modelled: on its blocks, with what is declared and what was left out."""
+
+    record: Record
+    declared: list[str]
+    notices: list[Notice]
+
+
+def read_source(campaign: Campaign) -> RecordSource:
+    """Read a record and refuse what cannot be modelled.
+
+    Raises
+    ------
+    TableError, RecordError
+        If the table cannot be read or is too short, or a declared effect has no meaning for a record.
+    """
+    table = read_record(campaign)
+    record = reduce_record(table)
+    declared, notices = declared_effects(campaign)
+    declare(declared, record)
+    return RecordSource(
+        record, declared, [*notices, *left_out_notices(table, "record_rows_left_out"), *record_notices(record)]
+    )
+
+
+def model_record(source: RecordSource, *, report: Report) -> Outcome:
+    """Close the loop on a record."""
+    found = close_record(
+        source.record, source.declared, progress=lambda done, total, what: report("closed loop", done, total)
+    )
+    return Outcome(record_variables(source.record, found), {"loop": found.as_json()}, tuple(source.notices))
+
+
+def declared_effects(campaign: Campaign) -> tuple[list[str], list[Notice]]:
+    """Return what a record is declared with: `quasi_static`, and what of the campaign's declaration means nothing without positions."""
+    if "model" not in campaign.model_fields_set:
+        return [QUASI_STATIC], []
+    declared = campaign.model.declared
+    dropped = [name for name in declared if name in {"axis_expansion", "table_offset"}]
+    if not dropped:
+        return list(declared), []
+    message = (
+        f"{listed(dropped)} need positions along an axis, which a record does not have; its declared model is {QUASI_STATIC}: "
+        "every displacement linear in the temperatures."
+    )
+    remedy = f'Write declared = ["{QUASI_STATIC}"] under [model], or leave [model] out.'
+    kept = [name for name in declared if name not in dropped]
+    return [QUASI_STATIC, *(name for name in kept if name != QUASI_STATIC)], [
+        Notice("declared_without_axis", message, remedy)
+    ]
+
+
+def record_notices(record: Record) -> list[Notice]:
+    """Return notices for gaps, sensors that tell nothing of their own, and drivers that were not logged."""
+    notices = []
+    if record.gaps:
+        named = [f"{name} ({number} blocks)" for name, number in record.gaps.items()]
+        notices.append(
+            Notice(
+                "record_gaps",
+                f"Blocks of {record.block_s:g} s without a value were interpolated: {listed(named)}.",
+                "Look at the logger; effects that act within the gaps cannot be seen.",
+            )
+        )
+    pauses = np.diff(record.seconds)
+    pauses = pauses[pauses > 1.5 * record.block_s]
+    if pauses.size:
+        notices.append(
+            Notice(
+                "record_pauses",
+                f"Nothing was logged in {counted(pauses.size, 'pause')}, the longest {duration(float(pauses.max()))}.",
+                "Nothing has to be done: pauses are left out; what a heat source did meanwhile is taken as a straight line.",
+            )
+        )
+    missing = int(np.isnan(record.displacement).sum())
+    if missing:
+        notices.append(
+            Notice(
+                "record_displacements_missing",
+                f"{counted(missing, 'block mean')} of {record.displacement.size} of the displacements missing; left out of every fit.",
+                "Nothing has to be done: the estimates allow for gaps.",
+            )
+        )
+    if record.duplicates:
+        notices.append(
+            Notice(
+                "record_sensors_dependent",
+                f"Left out because the other sensors tell the same: {listed(record.duplicates)}.",
+                "Name each sensor once under record.temperatures.",
+            )
+        )
+    if not record.drivers:
+        notices.append(
+            Notice(
+                "no_drivers",
+                "No driver was logged, so a heat source that no sensor sees cannot be told from a drift.",
+                "Log spindle speed, load or duty in the same table, and name the column under record.drivers.",
+            )
+        )
+    return notices
+
+
+def record_variables(record: Record, found: RecordResult) -> xr.Dataset:
+    """Return the record on its blocks with predictions, contributions and the sealed part."""
+    terms = found.found.terms
+    names = [term.effect for term in terms]
+    unique = [name if names.count(name) == 1 else f"{name} {at + 1}" for at, name in enumerate(names)]
+    drivers = np.array([powers[1] for powers in record.drivers.values()]).reshape(-1, record.seconds.size).T
+    um: dict[str, Any] = {"units": "um"}
+    dims = ("time", "channel")
+    final = found.predictions[-1]
+    # What forward chaining has shown the model to miss by, where it can be known: not smaller than on the sealed part.
+    chained = np.array([one.rmse_final_um for one in found.chained]).reshape(-1, len(record.channels))
+    spread = np.fmax(found.errors[-1], np.sqrt(np.nanmean(chained**2, axis=0)) if len(chained) else 0.0)
+    return xr.Dataset(
+        {
+            "displacement": (dims, record.displacement, {**um, "long_name": "mean displacement over the block"}),
+            "temperature": (
+                ("time", "sensor"),
+                record.temperature,
+                {"units": "degC", "units_metadata": "temperature: on_scale"},
+            ),
+            "driver": (("time", "driver_name"), drivers, {"units": "1", "long_name": "driver over its largest size"}),
+            "predicted_declared": (dims, found.predictions[0].predicted, um),
+            "predicted_final": (dims, final.predicted, um),
+            "predicted_u": (
+                "channel",
+                spread,
+                {**um, "long_name": "standard uncertainty of a prediction, from parts that the model had not seen"},
+            ),
+            "contribution": (
+                ("effect", *dims),
+                np.array([found.contribution(term) for term in terms]).reshape(len(terms), *record.displacement.shape),
+                um,
+            ),
+            "noise": ("channel", found.whole.sigma, {**um, "long_name": "noise of a block mean"}),
+            "sealed": ("time", found.sealed, {"long_name": "block that took no part in any choice"}),
+            "part": ("time", record.chained + 1, {"long_name": "part of the record for forward chaining"}),
+        },
+        coords={
+            "time": record.start + np.round(record.seconds * 1e9).astype("m8[ns]"),
+            "channel": list(record.channels),
+            "sensor": list(record.sensors),
+            "driver_name": list(record.drivers),
+            "effect": unique,
+        },
+        attrs={"block_s": record.block_s},
+    )

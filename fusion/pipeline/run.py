@@ -1,0 +1,219 @@
+"""The main job: reads, checks contracts, calls the steps, writes products, records where everything comes from."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from fusion.campaign.config import Campaign, load_campaign
+from fusion.campaign.inputs import Source, compensate_by_camera, read_source
+from fusion.pipeline import attribution, drift_model, interferometry, thermal
+from fusion.pipeline import record as record_stage
+from fusion.pipeline.provenance import describe_run, hash_inputs, versions
+from fusion.products.progress import Report, silent
+from fusion.products.results import Notice, Outcome, assemble
+from fusion.products.store import (
+    StageStamps,
+    annotate,
+    digest,
+    open_folder,
+    plain,
+    read_dataset,
+    write_dataset,
+    write_json,
+    write_text,
+)
+from fusion.report.html import render_report
+
+#: Where each stage keeps its Dataset; what ends up in fusion.nc is kept apart while it may have to be resumed.
+FILES = {
+    "fields": "fields.nc",
+    "deviations": "deviations.nc",
+    "correlation": ".stages/correlation.nc",
+    "model": ".stages/model.nc",
+    "record": "fusion.nc",
+}
+
+
+@dataclass
+class Run:
+    """One run of a campaign into one folder: what it was asked, what it found, how long each stage took."""
+
+    campaign: Campaign
+    folder: Path
+    report: Report
+    stamps: StageStamps
+    inputs: Mapping[str, Mapping[str, Any]]
+    started: datetime
+    parts: dict[str, Any] = field(default_factory=dict)
+    notices: list[Notice] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+    keys: dict[str, str] = field(default_factory=dict)
+
+    def stage(
+        self, name: str, tables: tuple[str, ...], after: tuple[str, ...], compute: Callable[[], Outcome]
+    ) -> xr.Dataset:
+        """Return the Dataset of a stage: computed and stamped, or taken over where the stamp says nothing has changed.
+
+        Parameters
+        ----------
+        name : str
+            Name of the stage.
+        tables : tuple of str
+            Tables of the campaign file that decide its result, with the files that they name.
+        after : tuple of str
+            Stages it builds on; it is done again whenever one of them is.
+        compute : callable
+            Does the work.
+        """
+        key = self.key_of(name, tables, after)
+        path = self.folder / FILES[name]
+        begun = time.monotonic()
+        if self.stamps.done(name, key):
+            note = self.stamps.note(name)
+            outcome = Outcome(read_dataset(path), note["parts"], tuple(Notice(**item) for item in note["notices"]))
+            self.report(f"{interferometry.LABELS[name]} (kept)", 1, 1)
+        else:
+            computed = compute()
+            outcome = replace(computed, dataset=self.described(computed.dataset))
+            write_dataset(path, outcome.dataset)
+            self.stamps.record(
+                name, key, [path], {"parts": outcome.parts, "notices": [vars(item) for item in outcome.notices]}
+            )
+        self.keys[name] = key
+        self.parts.update(outcome.parts)
+        self.notices.extend(outcome.notices)
+        self.seconds[name] = time.monotonic() - begun
+        return outcome.dataset
+
+    def key_of(self, name: str, tables: tuple[str, ...], after: tuple[str, ...]) -> str:
+        """Return a digest of everything that decides the result of a stage."""
+        asked = self.campaign.model_dump(mode="json", include=set(tables))
+        files = {file: self.inputs[file] for table in tables for file in self.campaign.files_of(table)}
+        return digest(name, versions(), asked, files, [self.keys[earlier] for earlier in after])
+
+    def checkpoint(self, key: str) -> Path:
+        """Return the folder in which the cycles of a long recording are kept as they are finished; those of other input go."""
+        chosen = self.folder / ".stages" / f"cycles_{key[:16]}"
+        for stale in chosen.parent.glob("cycles_*"):
+            if stale != chosen:
+                shutil.rmtree(stale)
+        return chosen
+
+    def described(self, dataset: xr.Dataset) -> xr.Dataset:
+        """Return a product's Dataset with what NetCDF files have to say of themselves."""
+        history = f"{self.started.isoformat(timespec='seconds')} thermofuse run {self.campaign.path.name}"
+        origin = {"software": "thermofuse", "versions": versions(), "inputs": dict(self.inputs)}
+        return annotate(dataset, title=self.campaign.campaign.title, history=history, provenance=origin)
+
+
+def run_campaign(
+    path: str | Path, out: str | Path, *, resume: bool = False, scheduler: str | None = None, report: Report = silent
+) -> dict[str, Any]:
+    """Run the whole pipeline on a campaign file and write its products.
+
+    Parameters
+    ----------
+    path : str or Path
+        The campaign file.
+    out : str or Path
+        Results folder; must be empty or absent unless `resume`.
+    resume : bool
+        Keep the stages that were finished from the same input, do the rest.
+    scheduler : str, optional
+        Address of a dask scheduler for the per-frame work.
+    report : callable
+        ``report(label, done, total)``, for progress.
+
+    Returns
+    -------
+    dict
+        The content of ``results.json``.
+
+    Raises
+    ------
+    ValueError
+        A subclass of this package or of the instruments', when the input cannot be used; nothing is written then.
+    """
+    campaign = load_campaign(path, effect_names=drift_model.effect_names())
+    folder = Path(out)
+    if campaign.record is not None:
+        record = record_stage.read_source(campaign)
+        return _run_record(_open_run(campaign, folder, resume=resume, report=report), record)
+    source = read_source(campaign)
+    run = _open_run(campaign, folder, resume=resume, report=report)
+    return _run_instruments(run, source, scheduler=scheduler)
+
+
+def _open_run(campaign: Campaign, folder: Path, *, resume: bool, report: Report) -> Run:
+    """Open the results folder of a campaign whose input has been read, and note what it was made from."""
+    open_folder(folder, resume=resume)
+    started = datetime.now(UTC)
+    inputs = hash_inputs(campaign.input_files(), report=report)
+    return Run(campaign, folder, report, StageStamps(folder), inputs, started)
+
+
+def _run_instruments(run: Run, source: Source, *, scheduler: str | None) -> dict[str, Any]:
+    """Run the main job on camera and laser, stage after stage."""
+    folder, report = run.folder, run.report
+    run.notices.extend(source.notices)
+    seen = ("thermography", "plan", "interferometry")
+    checkpoint = run.checkpoint(run.key_of("fields", seen, ()))
+    fields = run.stage(
+        "fields",
+        seen,
+        (),
+        lambda: thermal.reduce_thermography(source, checkpoint=checkpoint, scheduler=scheduler, report=report),
+    )
+    source, redone = compensate_by_camera(source, fields)
+    run.notices.extend(redone)
+    deviations = run.stage(
+        "deviations",
+        ("interferometry",),
+        ("fields",) if source.needs_camera else (),
+        lambda: interferometry.evaluate_interferometry(source),
+    )
+    fused, outside = interferometry.align_recordings(source, fields, deviations)
+    run.notices.extend(outside)
+    joint = ("plan", "interferometry", "drivers")
+    maps = run.stage(
+        "correlation",
+        joint,
+        ("fields", "deviations"),
+        lambda: attribution.correlate_field(source, fields, fused, report=report),
+    )
+    model = run.stage(
+        "model",
+        (*joint, "model"),
+        ("fields", "deviations"),
+        lambda: drift_model.model_drift(source, fields, fused, deviations, report=report),
+    )
+    fusion = run.described(drift_model.join_fusion(fused, maps, model))
+    write_dataset(folder / "fusion.nc", fusion)
+    thermal.write_exr(folder / "maps", fields, report=report)
+    return _finish(run, {"fields": fields, "deviations": deviations, "fusion": fusion})
+
+
+def _run_record(run: Run, source: record_stage.RecordSource) -> dict[str, Any]:
+    """Run the main job on a record: one table, one stage."""
+    record = run.stage("record", ("record", "model"), (), lambda: record_stage.model_record(source, report=run.report))
+    return _finish(run, {"record": record})
+
+
+def _finish(run: Run, datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:
+    """Write results, provenance and report from what the stages found."""
+    results = plain(assemble(run.campaign.campaign.title, run.parts, run.notices))
+    provenance = describe_run(run.campaign, run.inputs, started=run.started, seconds=run.seconds)
+    run.report("report", 0, 1)
+    write_json(run.folder / "results.json", results)
+    write_json(run.folder / "provenance.json", provenance)
+    write_text(run.folder / "report.html", render_report(results, provenance, datasets))
+    run.report("report", 1, 1)
+    return results

@@ -1,0 +1,315 @@
+"""The thermal stage: camera checked, plan registered, frames reduced to one field per cycle, everything left out told."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from fusion.alignment.align import camera_on_laser_clock, cycle_bounds
+from fusion.campaign.inputs import Source, counted, listed
+from fusion.products.contracts import check
+from fusion.products.progress import Report
+from fusion.products.results import Notice, Outcome
+from fusion.products.store import write_atomically
+from thermography.contract import FIELDS
+from thermography.fields.moving import reduce_moving_frames
+from thermography.fields.still import reduce_frames
+from thermography.io.openexr import write_maps
+from thermography.radiometry.camera_artefacts import (
+    DEAD,
+    NOISY,
+    OFFSET,
+    find_bad_pixels,
+    find_repeats,
+    find_steps,
+    read_levels,
+)
+from thermography.radiometry.overrides import Overrides
+from thermography.radiometry.planck import calibrate
+from thermography.registration.clock_offset import estimate_clock_offset
+from thermography.registration.register import Registration, register
+
+#: The plan is registered on the mean of so many first frames: noise falls, and the table has hardly warmed yet.
+_REGISTRATION_FRAMES = 5
+#: Of a video, so many frames at most are looked at for steps of the camera's zero: a step stays.
+_CHECKED_FRAMES = 1000
+#: Longer recordings keep what is finished on disk while they are reduced; for shorter ones that would cost more than it saves.
+_CHECKPOINT_FRAMES = 2000
+#: Frames in which bad pixels are looked for: enough to tell a noisy pixel, over a time in which the table hardly changes.
+_PIXEL_FRAMES = 24
+_KELVIN = 273.15
+
+
+def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | None, report: Report) -> Outcome:
+    """Check the camera, register the plan on the first frames, and reduce all frames to one field per cycle.
+
+    A long recording keeps what is finished of it in the folder `checkpoint`, so that a run that is stopped goes on from there.
+    """
+    override = Overrides(campaign_constants(source))
+    notices = camera_notices(source, override, report=report)
+    if source.thermography.table == "still":
+        notices += pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:_PIXEL_FRAMES]]))
+    report("registration", 0, 1)
+    # A moving table is somewhere else in the next frame, so its plan is registered on one frame alone.
+    first = source.frames[: 1 if source.thermography.table == "moving" else _REGISTRATION_FRAMES]
+    reference = np.mean([calibrate(frame.read_counts(), override(frame)) for frame in first], axis=0)
+    registration = register(reference, source.fiducials, grid=source.grid)
+    report("registration", 1, 1)
+    fields, clock, found = _reduce_on_clock(
+        source, registration, override, checkpoint=checkpoint, scheduler=scheduler, report=report
+    )
+    check(fields, FIELDS, name="the fields")
+    notices += [*found, *registration_notices(registration), *frame_notices(fields)]
+    fields = fields.assign_coords(cycle=source.deviations["cycle"].values)
+    for name in ("time", "cycle_time", "frame_time"):
+        if name in fields.variables:
+            moved = camera_on_laser_clock(fields[name].values, clock["value"])
+            fields[name] = (fields[name].dims, moved, fields[name].attrs)
+    fields = fields.assign(registration_variables(registration, reference)).assign(target_places(source))
+    parts = {
+        "registration": {
+            "rms_mm": registration.rms_mm,
+            "leave_one_out_mm": registration.leave_one_out_mm,
+            "frames_rejected": source.frames_rejected,
+        },
+        "alignment": {"clock_offset_s": clock},
+    }
+    return Outcome(fields, parts, tuple(notices))
+
+
+def _reduce_on_clock(
+    source: Source,
+    registration: Registration,
+    override: Overrides,
+    *,
+    checkpoint: Path,
+    scheduler: str | None,
+    report: Report,
+) -> tuple[xr.Dataset, dict[str, Any], list[Notice]]:
+    """Reduce the frames with the clock offset that the campaign gives, that the moving table shows, or that is assumed."""
+    given = source.thermography.clock_offset_s
+    how: dict[str, Any] = {"scheduler": scheduler, "report": report}
+    if given is not None:
+        fields = _reduce(source, registration, override, given, checkpoint=checkpoint, **how)
+        return fields, {"value": given, "u": 0.0}, []
+    if source.thermography.table == "still":
+        fields = _reduce(source, registration, override, 0.0, checkpoint=checkpoint, **how)
+        return fields, {"value": 0.0, "u": None}, [_ASSUMED_CLOCK]
+    fields = _reduce(source, registration, override, 0.0, checkpoint=checkpoint / "before_alignment", **how)
+    report("clock offset", 0, 1)
+    clock = estimate_clock_offset(
+        fields["frame_time"].values,
+        fields["table_position"].values,
+        fields["table_position_u"].values,
+        source.deviations["time"].values,
+        source.deviations["position"].broadcast_like(source.deviations["time"]).values.ravel(),
+        feed_mm_per_min=source.interferometry.feed_mm_per_min,
+    )
+    report("clock offset", 1, 1)
+    # Frames belong to cycles by the laser's clock, so they are sorted into them again.
+    fields = _reduce(source, registration, override, clock.offset_s, checkpoint=checkpoint, **how)
+    return fields, {"value": clock.offset_s, "u": clock.offset_u_s}, []
+
+
+_ASSUMED_CLOCK = Notice(
+    "clock_offset_assumed",
+    "The clock offset is not given and frames of a still table cannot show it: 0 s was taken.",
+    'Write thermography.clock_offset = "0 s" if both clocks were set by the same time server, or the offset that was noted.',
+)
+
+
+def _reduce(
+    source: Source,
+    registration: Registration,
+    override: Overrides,
+    offset_s: float,
+    *,
+    checkpoint: Path,
+    scheduler: str | None,
+    report: Report,
+) -> xr.Dataset:
+    """Reduce the frames of a still or moving table, its cycles brought to the camera's clock."""
+    bounds = cycle_bounds(source.deviations) + np.timedelta64(round(offset_s * 1e9), "ns")
+    total, done = len(source.frames), 0
+
+    def count(more: int) -> None:
+        nonlocal done
+        done += more
+        report("frames", done, total)
+
+    report("frames", 0, total)
+    kept = checkpoint if total > _CHECKPOINT_FRAMES else None
+    common: dict[str, Any] = {"override": override, "scheduler": scheduler, "checkpoint": kept, "progress": count}
+    if source.thermography.table == "moving":
+        direction = source.plan.axis.direction
+        return reduce_moving_frames(source.frames, registration, source.grid, bounds, direction=direction, **common)
+    return reduce_frames(source.frames, registration, source.grid, bounds, **common)
+
+
+def campaign_constants(source: Source) -> dict[str, float]:
+    """Return the camera parameters that the campaign file overrides, in the units of the parameters."""
+    table = source.thermography
+    given = {
+        "emissivity": table.emissivity,
+        "relative_humidity": table.relative_humidity,
+        "object_distance_m": table.object_distance_m,
+        "reflected_temperature_K": _kelvin(table.reflected_temperature_degC),
+        "atmospheric_temperature_K": _kelvin(table.atmospheric_temperature_degC),
+    }
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def _kelvin(celsius: float | None) -> float | None:
+    return None if celsius is None else celsius + _KELVIN
+
+
+def camera_notices(source: Source, override: Overrides, *, report: Report) -> list[Notice]:
+    """Return a notice for jumps of the whole picture and for frames that the camera wrote twice."""
+    every = -(-len(source.frames) // _CHECKED_FRAMES)
+    report("camera check", 0, 1)
+    levels = read_levels(source.frames[::every], override)
+    report("camera check", 1, 1)
+    flags = find_steps(levels) + (find_repeats(levels) if every == 1 else [])
+    if not flags:
+        return []
+    named = [f"{np.datetime_as_string(flag.time, unit='s')}Z: {flag.message}" for flag in flags]
+    return [
+        Notice(
+            "camera_artefacts",
+            f"{counted(len(flags), 'camera artefact')} found, not corrected here: {listed(named)}.",
+            "Compare with the effect camera_offset of the model; let the camera warm up before the test.",
+        )
+    ]
+
+
+def pixel_notices(counts: np.ndarray) -> list[Notice]:
+    """Return a notice for pixels that do not follow their neighbours in the first frames, (time, row, column)."""
+    flags = find_bad_pixels(counts)
+    found = int(np.count_nonzero(flags))
+    if not found:
+        return []
+    kinds = {"dead": DEAD, "off its neighbours": OFFSET, "noisy": NOISY}
+    named = ", ".join(
+        f"{int(np.count_nonzero(flags & flag))} {name}" for name, flag in kinds.items() if (flags & flag).any()
+    )
+    return [
+        Notice(
+            "bad_pixels",
+            f"{counted(found, 'pixel')} do not follow their neighbours ({named}); they count in their cells like others.",
+            "Have the camera replace them (a one-point correction, or its maker's service); single cells may be off by their error.",
+        )
+    ]
+
+
+def registration_variables(registration: Registration, reference: np.ndarray) -> xr.Dataset:
+    """Return the registration as variables: the fiducials with their errors, the homography, and the frame it was made on."""
+    names = list(registration.located)
+    places = [registration.located[name] for name in names]
+    known = [registration.fiducials[name] for name in names]
+    along = {
+        "fiducial_x": ([one.x_mm for one in known], "mm"),
+        "fiducial_y": ([one.y_mm for one in known], "mm"),
+        "fiducial_column": ([one.column_px for one in places], "1"),
+        "fiducial_row": ([one.row_px for one in places], "1"),
+        "fiducial_residual": ([registration.residual_mm[name] for name in names], "mm"),
+        "fiducial_leave_one_out": ([registration.leave_one_out_mm[name] for name in names], "mm"),
+    }
+    variables: dict[str, Any] = {name: ("fiducial", values, {"units": unit}) for name, (values, unit) in along.items()}
+    variables["homography"] = (("plan_axis", "sensor_axis"), registration.homography, {"units": "1"})
+    degrees = {"units": "degC", "units_metadata": "temperature: on_scale"}
+    variables["reference_frame"] = (("row", "column"), reference.astype("f4"), degrees)
+    variables["fiducial_name"] = ("fiducial", names)
+    return xr.Dataset(variables)
+
+
+def registration_notices(registration: Registration) -> list[Notice]:
+    """Return one notice for all fiducials that were not used."""
+    if not registration.left_out:
+        return []
+    named = "; ".join(f"{name}: {reason}" for name, reason in registration.left_out.items())
+    return [
+        Notice(
+            "fiducials_left_out",
+            f"{counted(len(registration.left_out), 'fiducial')} or hints not used: {named}.",
+            "Correct the list of fiducials, or clean and repaint the discs; the others carry the registration.",
+        )
+    ]
+
+
+#: What the reduction tells of frames, as attribute: code, sentence that follows the count, remedy.
+_FRAME_ATTRIBUTES = {
+    "frames_outside_cycles": (
+        "belong to no cycle; they count for the field at a reading's own time, not for a cycle's mean",
+        "Nothing has to be done, unless the clocks disagree.",
+    ),
+    "knocks": (
+        "show the table moved for good; the plan was registered anew from there on",
+        "Fasten camera and table, and check what happened at that time.",
+    ),
+    "frames_shaken": ("were shaken for this one frame", "Shield the camera from vibration."),
+    "frames_unplaced": (
+        "do not show where the table is and were left out",
+        "Keep at least three fiducials in view at every axis position.",
+    ),
+    "frames_unchecked": (
+        "have too little contrast to check the registration",
+        "Nothing has to be done while neither camera nor table are touched.",
+    ),
+}
+
+
+def frame_notices(fields: xr.Dataset) -> list[Notice]:
+    """Return one notice for each kind of frame that the reduction reports."""
+    notices = []
+    for name, (text, remedy) in _FRAME_ATTRIBUTES.items():
+        found = json.loads(fields.attrs.get(name, "[]"))
+        if found:
+            named = listed([str(one) if isinstance(one, str) else _words(one) for one in found])
+            notices.append(Notice(name, f"{counted(len(found), 'frame')} {text}: {named}.", remedy))
+    return notices
+
+
+def _words(found: Any) -> str:
+    """Return a record such as ``{"frame": "a.jpg", "shift_px": [3, 0]}`` as words; folders stay out of it."""
+    if isinstance(found, Mapping):
+        return ", ".join(f"{name.replace('_', ' ')} {_words(value)}" for name, value in found.items())
+    if isinstance(found, list):
+        return "(" + ", ".join(_words(value) for value in found) + ")"
+    return f"{found:.3g}" if isinstance(found, float) else Path(str(found)).name
+
+
+def target_places(source: Source) -> xr.Dataset:
+    """Return the plan points of the targets, along ``target``."""
+    x, y = source.axis.points(source.deviations["position"].values)
+    targets = source.deviations["target"].values
+    places = {"target_x": ("target", x, {"units": "mm"}), "target_y": ("target", y, {"units": "mm"})}
+    return xr.Dataset(places, coords={"target": targets})
+
+
+def write_exr(folder: Path, fields: xr.Dataset, *, report: Report) -> list[Path]:
+    """Write the fields of every cycle as OpenEXR maps and return the files."""
+    total = fields.sizes["cycle"]
+    paths = []
+    for done, cycle in enumerate(fields["cycle"].values):
+        report("OpenEXR maps", done, total)
+        maps = exr_maps(fields.sel(cycle=cycle))
+        path = folder / f"cycle_{cycle:04d}.exr"
+        paths.append(write_atomically(path, lambda temporary, maps=maps: write_maps(temporary, maps)))  # type: ignore[misc]
+    report("OpenEXR maps", total, total)
+    return paths
+
+
+def exr_maps(field: xr.Dataset) -> dict[str, np.ndarray]:
+    """Return the maps of one cycle for OpenEXR; the mask is 1 where the table was seen."""
+    maps = {
+        "temperature": field["temperature"],
+        "rise": field["temperature_rise"],
+        "uncertainty": field["temperature_u"],
+        "mask": np.isfinite(field["temperature"]),
+    }
+    return {name: np.ascontiguousarray(values, dtype="f4") for name, values in maps.items()}

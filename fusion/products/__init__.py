@@ -1,0 +1,1 @@
+"""What a run leaves behind (level 5): products on disk, typed results, progress."""

@@ -1,0 +1,79 @@
+"""What a long step tells while it works: a bar on a terminal, plain lines elsewhere, silence in a library."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+#: ``report(label, done, total)``; called first with done = 0 and last with done = total.
+Report = Callable[[str, int, int], None]
+
+_SECONDS_BETWEEN_LINES = 10.0
+
+
+def silent(label: str, done: int, total: int) -> None:
+    """Report nothing."""
+
+
+class Reporter(AbstractContextManager["Reporter"]):
+    """Shows the progress of a run on `console`: bars on a terminal, otherwise one line at each start, end and every ten seconds."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._bars: Progress | None = None
+        self._tasks: dict[str, object] = {}
+        self._started: dict[str, float] = {}
+        self._spoken: dict[str, float] = {}
+        self._finished: set[str] = set()
+
+    def __enter__(self) -> Reporter:
+        if self._console.is_terminal:
+            columns = (
+                SpinnerColumn(),
+                TextColumn("{task.description:<34}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+            )
+            self._bars = Progress(*columns, console=self._console)
+            self._bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bars is not None:
+            self._bars.stop()
+
+    def __call__(self, label: str, done: int, total: int) -> None:
+        """Show that `done` of `total` parts of the step `label` are finished."""
+        if self._bars is None:
+            self._write(label, done, total)
+            return
+        if label not in self._tasks:
+            self._tasks[label] = self._bars.add_task(label, total=max(total, 1))
+        self._bars.update(self._tasks[label], completed=done if total else 1, total=max(total, 1))  # type: ignore[arg-type]
+
+    def _write(self, label: str, done: int, total: int) -> None:
+        if label in self._finished:
+            if done >= total:
+                return
+            self._finished.remove(label)
+            del self._started[label]
+        now = time.monotonic()
+        if label not in self._started:
+            self._started[label] = self._spoken[label] = now
+            if done < total:
+                self._console.print(f"{label} ...", highlight=False)
+                return
+        if done >= total:
+            self._finished.add(label)
+            self._console.print(f"{label}: done in {now - self._started[label]:.1f} s", highlight=False)
+        elif now - self._spoken[label] > _SECONDS_BETWEEN_LINES:
+            self._spoken[label] = now
+            self._console.print(f"{label}: {done} of {total}", highlight=False)

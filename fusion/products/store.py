@@ -1,0 +1,185 @@
+"""Products on disk: written whole or not at all, and stamped so that a finished stage is not done twice.
+
+What a NetCDF product says of itself: CF conventions, title, history, provenance, a long name for every variable.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+STAMPS = ".stages/stamps.json"
+_PARTIAL = ".partial"
+
+
+class OutputError(ValueError):
+    """A results folder that cannot be written to as asked; the message says what to do."""
+
+
+def open_folder(folder: Path, *, resume: bool) -> Path:
+    """Create the results folder, or accept an existing one only if it is empty or the run is resumed.
+
+    Raises
+    ------
+    OutputError
+        If the folder holds something and `resume` is false, or if it is a file.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder} is a file; name a folder for the results with --out")
+    if folder.is_dir() and any(folder.iterdir()) and not resume:
+        raise OutputError(
+            f"{folder} is not empty; add --resume to continue the run that is in it, name another folder with --out, "
+            "or remove it first"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    for leftover in folder.rglob(f"*{_PARTIAL}*"):
+        leftover.unlink()
+    return folder
+
+
+def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
+    """Let `write` fill a temporary file beside `path`, then put it in place in one step.
+
+    A run that is killed leaves the old file or none, never half of the new one.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{path.stem}{_PARTIAL}{path.suffix}")
+    try:
+        write(temporary)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write UTF-8 text whole or not at all."""
+    return write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def write_json(path: Path, content: object) -> Path:
+    """Write JSON whole or not at all; numbers that are not finite become null, as JSON has no word for them."""
+    return write_text(path, json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def write_dataset(path: Path, dataset: xr.Dataset) -> Path:
+    """Write a Dataset as NetCDF 4 whole or not at all; floating-point maps are compressed without loss."""
+    encoding: dict[Any, dict[str, object]] = {name: {"_FillValue": None} for name in dataset.coords}
+    for name, array in dataset.data_vars.items():
+        if array.dtype.kind == "f" and array.size > 10_000:
+            encoding[name] = {"zlib": True, "complevel": 1}
+    return write_atomically(path, lambda temporary: dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding))
+
+
+def read_dataset(path: Path) -> xr.Dataset:
+    """Read a Dataset written by `write_dataset` into memory."""
+    with xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as dataset:
+        return dataset.load()
+
+
+def plain(value: Any) -> Any:
+    """Return `value` in JSON's own types: arrays as lists, NumPy scalars as numbers, times as ISO text, NaN as None."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.datetime64):
+        return None if np.isnat(value) else f"{np.datetime_as_string(value, unit='ms')}Z"
+    if isinstance(value, np.ndarray):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Path):
+        return value.as_posix()
+    return value
+
+
+def file_sha256(path: Path) -> str:
+    """Return the SHA-256 of a file as hexadecimal text."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def digest(*parts: object) -> str:
+    """Return one SHA-256 over anything that `plain` can express; equal input gives equal text on every machine."""
+    text = json.dumps(plain(parts), sort_keys=True, ensure_ascii=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+class StageStamps:
+    """Which stages of a run are done, from which input, with which files; kept in the results folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._path = folder / STAMPS
+        self._stamps: dict[str, dict[str, Any]] = {}
+        if self._path.exists():
+            self._stamps = json.loads(self._path.read_text(encoding="utf-8"))
+
+    def done(self, stage: str, key: str) -> bool:
+        """Tell whether `stage` was finished from input `key` and its files are still as they were written."""
+        stamp = self._stamps.get(stage)
+        if stamp is None or stamp["key"] != key:
+            return False
+        return all(
+            (self._folder / name).is_file() and file_sha256(self._folder / name) == sha
+            for name, sha in stamp["files"].items()
+        )
+
+    def note(self, stage: str) -> Any:
+        """Return what was noted when `stage` was recorded."""
+        return self._stamps[stage]["note"]
+
+    def record(self, stage: str, key: str, files: Iterable[Path], note: object) -> None:
+        """Stamp that `stage` is done from input `key` and wrote `files`; `note` is its share of results.json."""
+        names = {path.relative_to(self._folder).as_posix(): file_sha256(path) for path in files}
+        self._stamps[stage] = {"key": key, "files": names, "note": plain(note)}
+        write_json(self._path, self._stamps)
+
+
+CONVENTIONS = "CF-1.11"
+#: What `annotate` writes for the whole file.
+GLOBAL_ATTRIBUTES = ("Conventions", "title", "history", "provenance")
+
+
+def annotate(dataset: xr.Dataset, *, title: str, history: str, provenance: Mapping[str, Any]) -> xr.Dataset:
+    """Return `dataset` with the global attributes of the CF conventions and a long name wherever none was given.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    title : str
+        What the campaign is called.
+    history : str
+        When and by which command the file was made.
+    provenance : mapping
+        Stored as one JSON text, since NetCDF attributes hold neither mappings nor None.
+    """
+    described = dataset.copy()
+    for name in described.variables:
+        attrs = described[name].attrs
+        if "long_name" not in attrs and "standard_name" not in attrs:
+            attrs["long_name"] = name_in_words(str(name))
+    described.attrs = {
+        **dataset.attrs,
+        "Conventions": CONVENTIONS,
+        "title": title,
+        "history": history,
+        "provenance": json.dumps(provenance, sort_keys=True),
+    }
+    return described
+
+
+def name_in_words(name: str) -> str:
+    """Return a variable's name as words: ``"drift_profile_u"`` -> ``"standard uncertainty of drift profile"``."""
+    words = name.removesuffix("_u").replace("_", " ")
+    return f"standard uncertainty of {words}" if name.endswith("_u") else words

@@ -1,0 +1,158 @@
+"""Maps and charts of the correlation: sensitivity and significance of cells, thermal modes, clusters, regions by target."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from fusion.attribution.family_wise import CHECKS
+from fusion.report.wording import duration, number, p_value
+from interferometry.figures import ARROWS, COLOURS, INK, MARKERS, MUTED, STYLE, new_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+LEVEL = 0.05
+#: Parts of the drift as the correlation names them, in plain words.
+CHANNELS = {
+    "common": "drift common to all positions",
+    "proportional": "drift that grows with position",
+    "reversal": "drift of the reversal",
+    "joint": "common and growing drift together",
+}
+
+
+def extent_of(maps: xr.Dataset) -> tuple[float, float, float, float]:
+    """Return left, right, bottom and top of the plan's cells in mm."""
+    x, y = maps["x"].values, maps["y"].values
+    half = float(np.median(np.diff(x))) / 2
+    return float(x[0] - half), float(x[-1] + half), float(y[0] - half), float(y[-1] + half)
+
+
+def plot_cells(maps: xr.Dataset, name: str, channel: str, *, label: str, ax: Axes | None = None) -> Axes:
+    """Draw a map over the plan cells of one channel; cells with a family-wise p up to 0.05 are outlined.
+
+    A sensitivity is shown in full colour, with its scale, in those cells; elsewhere it is mostly noise and pale.
+    """
+    ax = new_axes(ax, height=2.55)
+    chosen = maps.sel(channel=channel)
+    values, p = chosen[name].values, chosen["p_value"].fillna(1.0).values
+    found = p <= LEVEL
+    if name == "p_value":
+        colours: dict[str, Any] = {"cmap": "viridis_r", "vmin": 0.0, "vmax": 1.0}
+    else:
+        limit = float(np.nanmax(np.abs(values[found]))) if found.any() else float(np.nanpercentile(np.abs(values), 90))
+        colours = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
+    if found.any() and name != "p_value":
+        colours["alpha"] = np.where(found, 1.0, 0.25)
+    picture = ax.imshow(values, origin="lower", extent=extent_of(maps), interpolation="nearest", **colours)
+    ax.figure.colorbar(picture, ax=ax, label=label, orientation="horizontal", aspect=40).outline.set_visible(False)
+    if found.any():
+        ax.contour(maps["x"], maps["y"], found.astype(float), levels=[0.5], colors=[INK], linewidths=1.2)
+    ax.set(xlabel="x / mm", ylabel="y / mm", title=CHANNELS.get(channel, channel))
+    ax.grid(visible=False)
+    return ax
+
+
+def plot_modes(maps: xr.Dataset, channel: str) -> Axes:
+    """Draw the pattern of every thermal mode with its p value and lag in one channel; significant ones have a bold frame."""
+    import matplotlib.pyplot as plt
+
+    modes = maps["mode"].values
+    columns = min(2, modes.size)
+    rows = -(-modes.size // columns)
+    left, right, bottom, top = extent_of(maps)
+    height = 0.5 + 5.2 / columns * min((top - bottom) / (right - left), 1.2)
+    with plt.rc_context(STYLE):
+        _, axes = plt.subplots(rows, columns, figsize=(5.2, rows * height), squeeze=False, sharex=True, sharey=True)
+    for ax in axes.ravel()[modes.size :]:
+        ax.set_visible(False)
+    for ax, mode in zip(axes.ravel(), modes, strict=False):
+        one = {"mode": mode, "channel": channel}
+        p = float(maps["modes_p_value"].sel(one))
+        ax.imshow(
+            maps["modes_pattern"].sel(mode=mode), origin="lower", extent=extent_of(maps), interpolation="nearest",
+            cmap="PuOr_r", vmin=-1.0, vmax=1.0,
+        )  # fmt: skip
+        ax.plot(float(maps["modes_at_x"].sel(mode=mode)), float(maps["modes_at_y"].sel(mode=mode)), "+", color="white")
+        text = f"mode {mode}: p {p_value(p)}, lag {duration(float(maps['modes_lag'].sel(one)))}"
+        ax.set_title(text, fontsize=8.5, fontweight="bold" if p <= LEVEL else "normal")
+        ax.grid(visible=False)
+        for spine in ax.spines.values():
+            spine.set(visible=True, linewidth=1.8 if p <= LEVEL else 0.5, color=INK if p <= LEVEL else MUTED)
+    first: Axes = axes[0, 0]
+    return first
+
+
+def plot_clusters(maps: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Draw which cells take one course of temperature; inside a colour no analysis of this session can tell places apart."""
+    import matplotlib as mpl
+
+    ax = new_axes(ax, height=2.2)
+    cluster = maps["clusters_cluster"].values
+    count = int(cluster.max())
+    shown = np.ma.masked_equal(cluster, 0)
+    ax.imshow(
+        shown,
+        origin="lower",
+        extent=extent_of(maps),
+        interpolation="nearest",
+        cmap=mpl.colormaps["tab20"],
+        vmin=0.5,
+        vmax=20.5,
+    )
+    for label in range(1, count + 1):
+        row, column = np.nonzero(cluster == label)
+        at = np.argmin((row - row.mean()) ** 2 + (column - column.mean()) ** 2)
+        ax.text(
+            float(maps["x"][column[at]]), float(maps["y"][row[at]]), str(label), ha="center", va="center", fontsize=8, color=INK
+        )  # fmt: skip
+    ax.set(xlabel="x / mm", ylabel="y / mm")
+    ax.grid(visible=False)
+    return ax
+
+
+def plot_region_targets(maps: xr.Dataset, region: str, position: xr.DataArray, *, ax: Axes | None = None) -> Axes:
+    """Plot the sensitivity of every target and direction to one region, by itself, with its 95 % interval; filled where p is up to 0.05."""
+    ax = new_axes(ax)
+    one = maps.sel(region=region)
+    names = [str(name).split() for name in one["series"].values]
+    place = {int(target): float(mm) for target, mm in zip(position["target"].values, position.values, strict=True)}
+    step = float(np.median(np.diff(np.sort(position.values)))) if position.size > 1 else 1.0
+    for shift, direction in ((-0.1, "positive"), (0.1, "negative")):
+        rows = [k for k, (side, _) in enumerate(names) if side == direction]
+        if not rows:
+            continue
+        x = np.array([place[int(names[k][1])] for k in rows]) + shift * step
+        value, u = one["target_regions_sensitivity"].values[rows], one["target_regions_sensitivity_u"].values[rows]
+        passed = one["target_regions_p_value"].values[rows] <= LEVEL
+        colour = COLOURS[direction]
+        ax.errorbar(x, value, 2 * u, fmt="none", ecolor=colour, capsize=2, linewidth=0.9)
+        ax.plot(x, value, MARKERS[direction], color=colour, markerfacecolor="white", label=ARROWS[direction])
+        ax.plot(x[passed], value[passed], MARKERS[direction], color=colour)
+    ax.axhline(0.0, color=MUTED, linewidth=0.8)
+    ax.set(xlabel="position / mm", ylabel="sensitivity / (µm/K)", title=region)
+    ax.legend()
+    return ax
+
+
+def caption_of(maps: xr.Dataset, channel: str, name: str = "") -> str:
+    """Return what every map has to say of itself: false alarms, drift that nothing explains, what it could have found, collinearity."""
+    prefix = f"{name}_" if name else ""
+    rate = float(maps[f"{name or 'cells'}_false_alarm_rate"])
+    detectable = maps[f"{prefix}detectable_sensitivity"].sel(channel=channel)
+    smallest = float(detectable.where(np.isfinite(detectable)).median())
+    drift = float(maps["unexplained_drift"].sel(channel=channel))
+    return (
+        f"False alarms of this map, on nulls fitted to this session: {rate_text(rate)}. Drift that nothing explains: "
+        f"{number(drift, 2)} µm in one hour. Found with 80 % power: from {number(smallest, 2)} µm/K on (median over the map). "
+        f"The field shows {int(maps['clusters_cluster'].max())} courses of temperature; places that share one cannot be told apart."
+    )
+
+
+def rate_text(rate: float, checks: int = CHECKS) -> str:
+    """Return a measured rate of false alarms in per cent with its expanded uncertainty (k = 2)."""
+    u = np.sqrt(max(rate, 1.0 / checks) * (1.0 - rate) / checks)
+    return f"{100 * rate:.1f} ± {200 * u:.1f} %"

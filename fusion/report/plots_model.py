@@ -1,0 +1,229 @@
+"""Charts of the joint estimate and the closed loop.
+
+ISO 230-2 windows along the test; the house style of every chart, which the paper's figures share.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from interferometry.figures import (
+    ACCENT,
+    ARROWS,
+    COLOURS,
+    GRID,
+    INK,
+    MARKERS,
+    MUTED,
+    STYLE,
+    TIME_MAP,
+    hours_since_start,
+    new_axes,
+    time_span,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+BEFORE = "#9aa7ad"
+
+
+def plot_profile(drift: xr.Dataset, position: xr.DataArray, *, ax: Axes | None = None) -> Axes:
+    """Plot the drift-free profile of both approaches with its 95 % band."""
+    ax = new_axes(ax)
+    for direction in drift["direction"].values:
+        row = drift.sel(direction=direction)
+        value, band = row["profile"], 2 * row["profile_u"]
+        ax.plot(position, value, MARKERS[direction], linestyle="-", color=COLOURS[direction], label=ARROWS[direction])
+        ax.fill_between(position, value - band, value + band, color=COLOURS[direction], alpha=0.18, linewidth=0)
+    ax.set(xlabel="position / mm", ylabel="profile / µm")
+    ax.legend()
+    return ax
+
+
+def plot_drift(drift: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot the drift of every position over time, mean of both approaches, coloured by position."""
+    import matplotlib as mpl
+
+    ax = new_axes(ax)
+    hours = hours_since_start(deviations).mean("direction")
+    lines = drift["drift"].mean("direction")
+    position = deviations["position"].values
+    low, high = float(position.min()), float(position.max())
+    colour = mpl.colormaps[TIME_MAP]
+    for target, place in zip(deviations["target"].values, position, strict=True):
+        ax.plot(
+            hours.sel(target=target),
+            lines.sel(target=target),
+            color=colour(0.95 * (place - low) / (high - low)),
+            linewidth=0.9,
+        )
+    scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(low, high), TIME_MAP)
+    ax.figure.colorbar(scale, ax=ax, label="position / mm", pad=0.02, aspect=30).outline.set_visible(False)
+    ax.set(xlabel="time since first reading / h", ylabel="drift / µm")
+    return ax
+
+
+def plot_reversal(drift: xr.Dataset, position: xr.DataArray, *, ax: Axes | None = None) -> Axes:
+    """Plot the reversal (positive minus negative approach) of every position with its 95 % interval."""
+    ax = new_axes(ax)
+    ax.errorbar(position, drift["reversal"], 2 * drift["reversal_u"], fmt="o", color=INK, capsize=2, linewidth=1.0)
+    ax.axhline(0.0, color=MUTED, linewidth=0.8)
+    ax.set(xlabel="position / mm", ylabel="reversal / µm")
+    return ax
+
+
+def plot_position_scatter(drift: xr.Dataset, flagged: set[int], *, ax: Axes | None = None) -> Axes:
+    """Plot the random scatter of every position and approach with its 95 % interval; flagged positions are shaded."""
+    ax = new_axes(ax)
+    for target in sorted(flagged):
+        ax.axvspan(target - 0.4, target + 0.4, color=ACCENT, alpha=0.12, linewidth=0)
+    for shift, direction in zip((-0.12, 0.12), drift["direction"].values, strict=False):
+        row = drift.sel(direction=direction)
+        ax.errorbar(
+            row["target"] + shift, row["scatter"], 2 * row["scatter_u"], fmt=MARKERS[direction], color=COLOURS[direction],
+            capsize=2, linewidth=1.0, label=ARROWS[direction],
+        )  # fmt: skip
+    ax.set(xlabel="position", ylabel="scatter s / µm", ylim=(0, None))
+    ax.legend()
+    return ax
+
+
+def _stages(loop: xr.Dataset) -> list[tuple[str, str, str]]:
+    """Return variable, colour and label of the residuals to draw: before and after, or one of them where nothing was added."""
+    before, after = loop["residual_declared"], loop["residual_final"]
+    if np.allclose(before, after, atol=1e-9, equal_nan=True):
+        return [("residual_final", COLOURS["positive"], "declared model, nothing added")]
+    return [("residual_declared", BEFORE, "declared model"), ("residual_final", COLOURS["positive"], "after the loop")]
+
+
+def plot_residual_time(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot the residual over time before and after the loop: every reading as a dot, the mean per cycle as a line."""
+    ax = new_axes(ax)
+    hours = hours_since_start(deviations)
+    for name, colour, text in _stages(loop):
+        residual = loop[name]
+        ax.plot(hours.values.ravel(), residual.values.ravel(), ".", color=colour, markersize=1.4, alpha=0.5)
+        middle = residual.mean(["direction", "target"])
+        ax.plot(hours.mean(["direction", "target"]), middle, color=colour, linewidth=1.8, label=text)
+    ax.axhline(0.0, color=MUTED, linewidth=0.8)
+    ax.set(xlabel="time since first reading / h", ylabel="residual / µm")
+    ax.legend()
+    return ax
+
+
+def plot_residual_position(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot the change of the residual from the first to the second half of the test, per position and approach, before and after.
+
+    The mean of a residual over all cycles is zero by construction, so the change shows what a mean would hide.
+    """
+    ax = new_axes(ax)
+    half = loop.sizes["cycle"] // 2
+    for name, _, text in _stages(loop):
+        after = name == "residual_final"
+        change = loop[name][half:].mean("cycle") - loop[name][:half].mean("cycle")
+        for direction in loop["direction"].values:
+            ax.plot(
+                deviations["position"], change.sel(direction=direction), MARKERS[direction], linestyle="-" if after else ":",
+                color=COLOURS[direction] if after else BEFORE, label=f"{ARROWS[direction]}, {text}",
+            )  # fmt: skip
+    ax.axhline(0.0, color=MUTED, linewidth=0.8)
+    ax.set(xlabel="position / mm", ylabel="residual, second minus first half / µm")
+    ax.legend(fontsize=7.5)
+    return ax
+
+
+def plot_residual_direction(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot half the difference of the residuals of both approaches over time, before and after the loop."""
+    ax = new_axes(ax)
+    hours = hours_since_start(deviations).mean(["direction", "target"])
+    for name, colour, text in _stages(loop):
+        odd = (loop[name].sel(direction="positive") - loop[name].sel(direction="negative")).mean("target") / 2
+        ax.plot(hours, odd, color=colour, label=text)
+    ax.axhline(0.0, color=MUTED, linewidth=0.8)
+    ax.set(xlabel="time since first reading / h", ylabel="odd residual / µm")
+    ax.legend()
+    return ax
+
+
+def plot_residual_spectrum(loop: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot the power of the innovations over period, before and after the loop, with the limit that noise alone hardly exceeds."""
+    ax = new_axes(ax)
+    for name, colour, text in _stages(loop):
+        power = loop[name.replace("residual", "periodogram")]
+        ax.plot(power["period"], power, color=colour, label=text)
+    ax.axhline(power.attrs["limit"], color=MUTED, linewidth=0.8, linestyle="--", label="strongest of noise, 95 %")
+    ax.set(xlabel="period / min", ylabel="power over that of noise", xscale="log", ylim=(0, None))
+    ax.legend()
+    return ax
+
+
+def plot_residual_events(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot the sum of all innovations up to every reading: a walk without preference where nothing happens, a kink at an event."""
+    ax = new_axes(ax)
+    hours = hours_since_start(deviations).values.ravel()
+    for name, colour, text in _stages(loop):
+        values = loop[name.replace("residual", "innovation")].transpose("cycle", "direction", "target").values.ravel()
+        known = np.flatnonzero(np.isfinite(values) & np.isfinite(hours))
+        order = known[np.argsort(hours[known], kind="stable")]
+        ax.plot(hours[order], np.cumsum(values[order]) / np.sqrt(order.size), color=colour, label=text)
+    ax.axhline(0.0, color=MUTED, linewidth=0.8)
+    ax.set(xlabel="time since first reading / h", ylabel="sum of innovations / √n")
+    ax.legend()
+    return ax
+
+
+def plot_contributions(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot what each effect of the final model contributes over time at the far end of the axis, positive approach."""
+    ax = new_axes(ax)
+    far = int(deviations["target"][int(np.argmax(np.abs(deviations["position"].values)))])
+    at: dict[str, Any] = {"target": far, "direction": "positive"}
+    hours = hours_since_start(deviations).sel(at)
+    colours = (INK, ACCENT, COLOURS["positive"], COLOURS["negative"])
+    measured = np.isfinite(hours.values)
+    for place, effect in enumerate(loop["effect"].values):
+        style: dict[str, Any] = {"linestyle": ("-", "--", "-.", ":")[place % 4], "color": colours[place % 4]}
+        line = loop["contribution"].sel(effect=effect, **at).values
+        seen = measured & np.isfinite(line)
+        ax.plot(hours.values[seen], line[seen], label=str(effect).replace("_", " "), **style)
+    ax.set(xlabel="time since first reading / h", ylabel=f"contribution at position {far} / µm")
+    ax.legend()
+    return ax
+
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = [
+    "ACCENT",
+    "ARROWS",
+    "COLOURS",
+    "GRID",
+    "INK",
+    "MARKERS",
+    "MUTED",
+    "STYLE",
+    "TIME_MAP",
+    "hours_since_start",
+    "new_axes",
+    "plot_windows",
+    "time_span",
+]
+
+
+def plot_windows(windows: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+    """Plot accuracy A and repeatability R of five-cycle windows along the test; the last entry is the whole test."""
+    ax = new_axes(ax)
+    short, whole = windows.isel(window=slice(None, -1)), windows.isel(window=-1)
+    for name, colour, text in (("A", INK, "accuracy A"), ("R", ACCENT, "repeatability R"), ("B", MUTED, "reversal B")):
+        ax.errorbar(
+            short["middle_cycle"], short[name], 2 * short[f"{name}_u"], fmt="o-", color=colour, markersize=3, capsize=1.5,
+            linewidth=1.0, label=f"{text}, windows",
+        )  # fmt: skip
+        ax.axhline(float(whole[name]), color=colour, linestyle=":", linewidth=1.0)
+    ax.set(xlabel="middle cycle of the window", ylabel="µm", ylim=(0, None))
+    ax.legend(title="dotted: all cycles as one window", title_fontsize=8)
+    return ax

@@ -1,0 +1,1 @@
+"""The simulated machine: schedule, heat, air, drift and effects, known exactly."""

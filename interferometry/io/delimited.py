@@ -1,0 +1,252 @@
+"""Delimited text with a header line: columns by name, faults by line."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+#: Values that instruments write for "no reading"; Renishaw's is -1e20.
+SENTINEL_MAGNITUDE = 1e19
+
+
+class LaserFormatError(ValueError):
+    """A laser or environment file that cannot be used; the message names file, place, value and remedy."""
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """One line of a file that was left out: where, what stood there, why."""
+
+    path: str
+    line: int
+    value: str
+    reason: str
+
+
+class BadReading(ValueError):
+    """One line that cannot be used; carries the value and the reason that the list of readings left out shows."""
+
+    def __init__(self, value: str, reason: str) -> None:
+        super().__init__(f"{value!r}: {reason}")
+        self.value = value
+        self.reason = reason
+
+
+@dataclass(frozen=True)
+class Table:
+    """A delimited file: its column names and its rows with their line numbers.
+
+    Attributes
+    ----------
+    path : pathlib.Path
+    columns : tuple of str
+        Names of the header line, stripped.
+    rows : list of (int, list of str)
+        Line number (the header is on line 1 unless comments precede it) and the fields.
+    decimal_comma : bool
+        Whether numbers may be written "0,64", as spreadsheets do where fields are parted by semicolons.
+    """
+
+    path: Path
+    columns: tuple[str, ...]
+    rows: list[tuple[int, list[str]]]
+    decimal_comma: bool
+
+    def records(self) -> Iterator[tuple[int, dict[str, str] | None]]:
+        """Yield line number and fields by column name; None where the number of fields is wrong."""
+        for line, fields in self.rows:
+            yield line, dict(zip(self.columns, fields, strict=True)) if len(fields) == len(self.columns) else None
+
+    def number(self, text: str) -> float:
+        """Return a finite number, or raise `BadReading`."""
+        cleaned = text.strip().replace(",", ".") if self.decimal_comma else text.strip()
+        try:
+            value = float(cleaned)
+        except ValueError:
+            raise BadReading(text, "is not a number") from None
+        if not math.isfinite(value) or abs(value) >= SENTINEL_MAGNITUDE:
+            raise BadReading(text, "is not a finite number")
+        return value
+
+    def count(self, text: str) -> int:
+        """Return a whole number from 1, or raise `BadReading`."""
+        value = self.number(text)
+        if value != int(value) or value < 1:
+            raise BadReading(text, "is not a whole number from 1")
+        return int(value)
+
+
+def read_table(path: Path, required: tuple[str, ...]) -> Table:
+    """Read a delimited text file and check that it has the columns it needs.
+
+    Byte-order marks, CR LF line ends, empty lines, lines that start with ``#``, and commas, semicolons or tabs between the
+    fields are all accepted.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+    required : tuple of str
+        Names of the columns that must be there; others are allowed.
+
+    Raises
+    ------
+    LaserFormatError
+        The file is empty, is not text, or lacks a column.
+    """
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as fault:
+        raise LaserFormatError(f"{path}: byte {fault.start} is not UTF-8 text; save the file as CSV in UTF-8") from None
+    _, header = find_header(text.splitlines())
+    if not header:
+        raise LaserFormatError(f"{path}: the file is empty; expected a header line {','.join(required)}")
+    delimiter = delimiter_of(header)
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
+    lines = [
+        (reader.line_num, fields)
+        for fields in reader
+        if any(f.strip() for f in fields) and not fields[0].startswith("#")
+    ]
+    head_line, names = lines[0][0], tuple(name.strip() for name in lines[0][1])
+    absent = [name for name in required if name not in names]
+    if absent:
+        raise LaserFormatError(
+            f"{path}, line {head_line}: no column {', '.join(absent)}; the header is {','.join(names)!r}, "
+            f"expected {','.join(required)!r} (names carry the unit: convert the values and rename the column)"
+        )
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise LaserFormatError(
+            f"{path}, line {head_line}: column {', '.join(repeated)} stands there more than once; keep one"
+        )
+    return Table(path, names, lines[1:], delimiter == ";")
+
+
+def find_header(lines: Iterable[str]) -> tuple[int, str]:
+    """Return the header line and how many stand before it: the first that is neither empty nor starts with ``#``, "" where none is."""
+    return next(((at, line) for at, line in enumerate(lines) if line.strip() and not line.startswith("#")), (0, ""))
+
+
+def delimiter_of(header: str) -> str:
+    """Return what parts the fields, from a header line: the comma, semicolon or tab that stands there most often."""
+    return max(",;\t", key=header.count)
+
+
+def read_timed_rows(
+    table: Table, variables: Mapping[str, Mapping[str, str]], parse: Callable[[dict[str, str]], list[float]]
+) -> xr.Dataset:
+    """Return the rows of a table that has a column ``time``.
+
+    Parameters
+    ----------
+    table : Table
+    variables : mapping
+        Attributes of the variables by name, in the order in which `parse` returns their values.
+    parse : callable
+        From the fields of a line by column to its values; raises `BadReading` where one cannot be used.
+
+    Returns
+    -------
+    xarray.Dataset
+        The variables along ``time`` (UTC, increasing); ``attrs["left_out"]`` lists the lines left out.
+
+    Raises
+    ------
+    LaserFormatError
+        More lines are bad than good, or only some times have a zone.
+    """
+    rows: dict[np.datetime64, list[float]] = {}
+    left_out: list[Rejected] = []
+    zones: dict[str, int] = {}
+    for line, fields in table.records():
+        try:
+            if fields is None:
+                raise BadReading("", f"does not have {len(table.columns)} fields")
+            time, zone = parse_time(fields["time"])
+            if time in rows:
+                raise BadReading(fields["time"], "stands on an earlier line too, which is kept")
+            rows[time] = parse(fields)
+        except BadReading as fault:
+            left_out.append(Rejected(table.path.name, line, fault.value, fault.reason))
+            continue
+        zones.setdefault(zone, line)
+    refuse_hopeless(table.path, len(rows), left_out)
+    times = sorted(rows)
+    values = np.array([rows[time] for time in times])
+    dataset = xr.Dataset(
+        {name: (("time",), values[:, at], dict(attrs)) for at, (name, attrs) in enumerate(variables.items())},
+        coords={"time": np.array(times, dtype="datetime64[ns]")},
+        attrs={"source": table.path.name, "left_out": json.dumps([asdict(one) for one in left_out])},
+    )
+    dataset["time"].attrs["reference"] = join_zones(table.path, zones)
+    return dataset
+
+
+def parse_time(text: str) -> tuple[np.datetime64, str]:
+    """Return an ISO 8601 time in UTC and the zone it was written in ("" where none was).
+
+    Raises
+    ------
+    BadReading
+        The text is not a time.
+    """
+    try:
+        stamp = datetime.fromisoformat(text.strip())
+    except ValueError:
+        raise BadReading(text, "is not an ISO 8601 time such as 2026-03-09T06:30:05+00:00") from None
+    zone = "" if stamp.tzinfo is None else stamp.strftime("%z")
+    utc = stamp if stamp.tzinfo is None else stamp.astimezone(UTC).replace(tzinfo=None)
+    return np.datetime64(utc, "ns"), zone
+
+
+def refuse_hopeless(path: Path, kept: int, left_out: list[Rejected]) -> None:
+    """Raise where fewer than half of the lines could be used: that is a fault of the file, not of single readings.
+
+    Raises
+    ------
+    LaserFormatError
+        No line, or less than half of the lines, was usable.
+    """
+    if kept == 0 and not left_out:
+        raise LaserFormatError(f"{path}: no reading below the header; export the measured values again")
+    if kept < len(left_out):
+        first = left_out[0]
+        raise LaserFormatError(
+            f"{path}: {len(left_out)} of {kept + len(left_out)} lines cannot be used, the first is line {first.line}: "
+            f"{first.value!r} {first.reason}; correct that column"
+        )
+
+
+def join_zones(path: Path, zones: dict[str, int]) -> str:
+    """Say how the times of a file were brought to UTC.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+    zones : dict
+        First line at which each zone was met, by zone ("" for none).
+
+    Raises
+    ------
+    LaserFormatError
+        Some times have a zone and some have none: no one can know what the latter mean.
+    """
+    if "" in zones and len(zones) > 1:
+        other = next(zone for zone in zones if zone)
+        raise LaserFormatError(
+            f"{path}: the time on line {zones['']} has no zone, that on line {zones[other]} has {other}; write all of them with a zone"
+        )
+    if "" in zones:
+        return "no zone in the file: taken as UTC"
+    if set(zones) == {"+0000"}:
+        return "UTC in the file"
+    return "converted to UTC from " + ", ".join(sorted(zones))

@@ -1,0 +1,93 @@
+"""Positioning tests logged as assignments (``REF_DATA_FWD[target,cycle]=value``), as the ecmc test tools write them."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from interferometry.deviations import build_deviations
+from interferometry.io.delimited import LaserFormatError, Rejected
+
+_ASSIGNMENT = re.compile(r"^(TGT_DATA|REF_DATA_FWD|REF_DATA_BWD|UNIT|CYCLES|POSITIONS)(?:\[(\d+)(?:,(\d+))?\])?=(.*)$")
+_UM_PER_UNIT = {"mm": 1e3, "um": 1.0, "m": 1e6}
+_DIRECTION = {"REF_DATA_FWD": 0, "REF_DATA_BWD": 1}
+
+
+def is_ecmc_log(start: bytes) -> bool:
+    """Tell from the first bytes of a file whether it is such a log."""
+    return b"REF_DATA_FWD[" in start or b"TGT_DATA[" in start
+
+
+def read_ecmc_log(path: Path) -> xr.Dataset:
+    """Read a test log that holds target and reference positions, but no times.
+
+    Returns
+    -------
+    xarray.Dataset
+        Keeps ``contract.DEVIATIONS``; every time is NaT (``time.attrs["origin"]`` is "none").
+
+    Raises
+    ------
+    LaserFormatError
+        The unit is unknown, or targets or cycles differ from the counts that the file states.
+    """
+    stated: dict[str, str] = {}
+    target_at: dict[int, float] = {}
+    readings: dict[tuple[int, int, int], float] = {}
+    left_out: list[Rejected] = []
+    for line, text in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        match = _ASSIGNMENT.match(text.strip())
+        if match is None:
+            continue
+        name, target, cycle, value = match.groups()
+        if target is None:
+            stated[name] = value.strip()
+            continue
+        try:
+            number = float(value)
+        except ValueError:
+            left_out.append(Rejected(path.name, line, value, "is not a number"))
+            continue
+        if name == "TGT_DATA":
+            target_at[int(target)] = number
+        else:
+            readings[int(cycle) - 1, _DIRECTION[name], int(target) - 1] = number
+    unit = stated.get("UNIT", "mm")
+    if unit not in _UM_PER_UNIT:
+        raise LaserFormatError(f"{path}: UNIT={unit} is not known; use one of {', '.join(_UM_PER_UNIT)}")
+    cycles, targets = _counts(path, stated, target_at, readings)
+    scale = _UM_PER_UNIT[unit]
+    position = np.array([target_at[target] for target in range(1, targets + 1)])
+    deviation = np.full((cycles, 2, targets), np.nan)
+    for at, measured in readings.items():
+        deviation[at] = (measured - position[at[2]]) * scale
+    time = np.full(deviation.shape, np.datetime64("NaT", "ns"))
+    dataset = build_deviations(range(1, cycles + 1), range(1, targets + 1), position * scale / 1e3, deviation, time)
+    dataset["time"].attrs.update(origin="none", reference="the file holds no times")
+    missing = int(np.isnan(deviation).sum())
+    dataset.attrs.update(source=path.name, left_out=json.dumps([asdict(one) for one in left_out]), missing=missing)
+    return dataset
+
+
+def _counts(
+    path: Path, stated: dict[str, str], target_at: dict[int, float], readings: dict[tuple[int, int, int], float]
+) -> tuple[int, int]:
+    """Return the numbers of cycles and targets, after holding what was found against what the file states."""
+    if not target_at or not readings:
+        raise LaserFormatError(f"{path}: no TGT_DATA or no REF_DATA_FWD/REF_DATA_BWD; export the test again")
+    targets, cycles = max(target_at), max(at[0] for at in readings) + 1
+    if sorted(target_at) != list(range(1, targets + 1)) or max(at[2] for at in readings) + 1 > targets:
+        raise LaserFormatError(
+            f"{path}: TGT_DATA gives targets {sorted(target_at)}, but readings refer to others; give each its position"
+        )
+    for name, found in (("CYCLES", cycles), ("POSITIONS", targets)):
+        if name in stated and int(stated[name]) != found:
+            raise LaserFormatError(
+                f"{path}: {name}={stated[name]}, but {found} were found; the file is cut short or joined from two"
+            )
+    return cycles, targets

@@ -1,0 +1,326 @@
+"""Renishaw linear tests (.rtl) and dynamic captures (.rtx)."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from interferometry.deviations import DIRECTIONS, build_deviations
+from interferometry.io.delimited import SENTINEL_MAGNITUDE, LaserFormatError, Rejected
+
+#: A temperature sensor that is not connected reads -10 degC.
+UNCONNECTED_DEGC = -10.0
+USER_TEXT = ("machine", "serial_number", "date", "by", "axis", "location", "title")
+_TIME = re.compile(r"(\d{4})[-/.](\d\d)[-/.](\d\d)[ T]+(\d\d):(\d\d):(\d)(\d?)")
+
+
+@dataclass
+class _Run:
+    """One run of the DEVIATIONS block: its targets and deviations in measuring order."""
+
+    number: int
+    targets: list[int] = field(default_factory=list)
+    deviations: list[float] = field(default_factory=list)
+
+    @property
+    def is_empty(self) -> bool:
+        return not any(math.isfinite(value) for value in self.deviations)
+
+
+def read_rtl(
+    path: Path, *, feed_mm_per_min: float | None = None, dwell_s: float | None = None, encoding: str = "latin-1"
+) -> xr.Dataset:
+    """Read a Renishaw linear test.
+
+    Runs become cycles and directions by the order in which their targets were measured: towards larger positions is positive.
+    Readings that the file marks with -1e20 are missing. The times of readings, which the file lacks, are rebuilt from its start
+    and end.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+    feed_mm_per_min, dwell_s : float, optional
+        Feed between targets and rest at each. With both, what is left of the test's duration is given to the turns between
+        runs; otherwise readings are spread evenly.
+    encoding : str
+        Of the user text, whose keys and values are in the language of the program that wrote the file.
+
+    Returns
+    -------
+    xarray.Dataset
+        Keeps ``contract.DEVIATIONS``; beside it, at ``instant`` start and end: air_temperature (degC), air_pressure (hPa),
+        relative_humidity (percent), material_temperature (degC; NaN where not connected), environment_factor (um),
+        expansion_coefficient (ppm/K).
+
+    Raises
+    ------
+    LaserFormatError
+        The file is cut short, is not a linear test, or breaks what its own header says.
+    """
+    sections = _split_sections(path, path.read_bytes().decode(encoding))
+    kind = _keyed(sections.get("HEADER", [])).get("filetype", "rtl")
+    if kind.lower() != "rtl":
+        raise LaserFormatError(
+            f"{path}: File type is {kind}, not rtl; only linear tests hold positioning deviations in um"
+        )
+    targets = _parse_targets(path, sections)
+    runs, left_out = _parse_runs(path, sections, len(targets))
+    start, end, start_u = _parse_test_times(sections)
+    schedule, schedule_u = _rebuild_schedule(runs, targets, start, end, feed_mm_per_min, dwell_s)
+    deviation, seconds = _lay_out(runs, targets, schedule)
+    time = np.full(deviation.shape, np.datetime64("NaT", "ns"))
+    if start is not None:
+        known = np.isfinite(seconds)
+        time[known] = start + (seconds[known] * 1e9).astype("timedelta64[ns]")
+    cycles = deviation.shape[0]
+    dataset = build_deviations(range(1, cycles + 1), range(1, len(targets) + 1), targets, deviation, time)
+    if start is None:
+        dataset["time"].attrs.update(origin="none", reference="the file holds no start and end that can be read")
+    else:
+        dataset["time"].attrs.update(origin="reconstructed", reference="no zone in the file: taken as UTC")
+        named = {"units": "s", "long_name": "standard uncertainty of time"}
+        dataset["time_u"] = ((), math.hypot(start_u, schedule_u), named)
+    dataset = dataset.assign(_parse_environment(sections))
+    dataset.attrs.update(
+        source=path.name,
+        left_out=json.dumps([asdict(one) for one in left_out]),
+        missing=int(np.isnan(deviation).sum()),
+        runs_empty=json.dumps([run.number for run in runs if run.is_empty]),
+        user_text=json.dumps(_parse_user_text(sections)),
+    )
+    return dataset
+
+
+def _lay_out(runs: list[_Run], targets: np.ndarray, schedule: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return deviations in um and seconds since the start, (cycle, direction, target), from the runs in measuring order."""
+    directions = [_direction(run, targets) for run in runs]
+    number = [directions[: at + 1].count(direction) for at, direction in enumerate(directions)]
+    deviation = np.full((max(number, default=1), 2, len(targets)), np.nan)
+    seconds = np.full(deviation.shape, np.nan)
+    for run, direction, cycle, instants in zip(runs, directions, number, schedule, strict=True):
+        for target, value, instant in zip(run.targets, run.deviations, instants, strict=True):
+            at = cycle - 1, DIRECTIONS.index(direction), target - 1
+            deviation[at], seconds[at] = value, instant if math.isfinite(value) else math.nan
+    return deviation, seconds
+
+
+def _split_sections(path: Path, text: str) -> dict[str, list[tuple[int, str]]]:
+    sections: dict[str, list[tuple[int, str]]] = {}
+    current: list[tuple[int, str]] = []
+    for line, content in enumerate(re.split(r"\r\n|\n|\r", text), start=1):
+        if content.rstrip().endswith("::") and content[:1].isalpha():
+            current = sections.setdefault(content.strip().removesuffix("::"), [])
+        elif content.strip():
+            current.append((line, content))
+    for name in ("TARGET DATA", "DEVIATIONS", "EOF"):
+        if name not in sections:
+            raise LaserFormatError(
+                f"{path}: no section {name}::; the file is cut short, copy it again from the measuring computer"
+            )
+    return sections
+
+
+def _keyed(section: list[tuple[int, str]]) -> dict[str, str]:
+    """Return values by key, letter case and spaces of the key ignored ("Date Time" and "DateTime" are both met)."""
+    pairs = (content.split(":", 1) for _, content in section if ":" in content)
+    return {re.sub(r"[^a-z0-9]", "", key.lower()): value.strip() for key, value in pairs}
+
+
+def _parse_targets(path: Path, sections: dict[str, list[tuple[int, str]]]) -> np.ndarray:
+    section = sections["TARGET DATA"]
+    count = int(_keyed(section).get("targetcount", "0") or 0)
+    begin = next((at for at, (_, content) in enumerate(section) if re.match(r"Targets\s*:", content)), None)
+    numbers: list[float] = []
+    for line, content in section[begin + 1 :] if begin is not None else []:
+        if ":" in content:
+            break
+        try:
+            numbers += [float(word) for word in content.replace(",", ".").split()]
+        except ValueError:
+            raise LaserFormatError(
+                f"{path}, line {line}: {content.strip()!r} is not a row of target positions in mm"
+            ) from None
+    if len(numbers) != count or count == 0:
+        raise LaserFormatError(
+            f"{path}: Target-count is {count}, but {len(numbers)} target positions follow; the file is damaged"
+        )
+    return np.array(numbers)
+
+
+def _parse_runs(
+    path: Path, sections: dict[str, list[tuple[int, str]]], targets: int
+) -> tuple[list[_Run], list[Rejected]]:
+    runs: dict[int, _Run] = {}
+    left_out: list[Rejected] = []
+    for line, content in sections["DEVIATIONS"]:
+        words = content.replace(",", ".").split()
+        if words[0] == "Run":
+            continue
+        try:
+            run, target, value = int(words[0]), int(words[1]), float(words[2])
+        except (ValueError, IndexError):
+            left_out.append(Rejected(path.name, line, content.strip(), "is not 'run target deviation'"))
+            continue
+        if not 1 <= target <= targets or run < 1:
+            left_out.append(
+                Rejected(path.name, line, content.strip(), f"names no run from 1 or no target of 1..{targets}")
+            )
+            continue
+        rows = runs.setdefault(run, _Run(run))
+        if target in rows.targets:
+            left_out.append(
+                Rejected(path.name, line, content.strip(), f"repeats run {run} target {target}, the first is kept")
+            )
+            continue
+        rows.targets.append(target)
+        rows.deviations.append(value if abs(value) < SENTINEL_MAGNITUDE else math.nan)
+    stated = int(_keyed(sections.get("RUNS", [])).get("runcount", max(runs, default=0)))
+    if not runs or max(runs) > stated:
+        raise LaserFormatError(
+            f"{path}: Run-count is {stated}, but DEVIATIONS holds runs {sorted(runs)}; the file is damaged"
+        )
+    return [runs[number] for number in sorted(runs)], left_out
+
+
+def _direction(run: _Run, targets: np.ndarray) -> str:
+    """Return the direction of approach: by the order of the positions, by odd or even number where a run has one target."""
+    travel = targets[run.targets[-1] - 1] - targets[run.targets[0] - 1]
+    if travel == 0:
+        return DIRECTIONS[(run.number - 1) % 2]
+    return DIRECTIONS[0] if travel > 0 else DIRECTIONS[1]
+
+
+def _parse_test_times(
+    sections: dict[str, list[tuple[int, str]]],
+) -> tuple[np.datetime64 | None, np.datetime64 | None, float]:
+    """Return start, end and the standard uncertainty of the start in s; a digit lost to a control byte costs 10/sqrt(12) s."""
+    stamps = _TIME.findall(_keyed(sections.get("ENVIRONMENT", [])).get("datetime", ""))
+    if len(stamps) != 2:
+        return None, None, 0.0
+    times, lost = [], 0.0
+    for year, month, day, hour, minute, tens, ones in stamps:
+        lost = math.hypot(lost, 0.0 if ones else 10 / math.sqrt(12))
+        times.append(np.datetime64(f"{year}-{month}-{day}T{hour}:{minute}:{tens}{ones or 5}", "ns"))
+    return times[0], times[1], lost
+
+
+def _rebuild_schedule(
+    runs: list[_Run],
+    targets: np.ndarray,
+    start: np.datetime64 | None,
+    end: np.datetime64 | None,
+    feed_mm_per_min: float | None,
+    dwell_s: float | None,
+) -> tuple[list[np.ndarray], float]:
+    """Return, per run, seconds since the start of the test, and their standard uncertainty.
+
+    Runs without a reading took no time. The uncertainty is that of one step taken as a rectangle of its half width.
+    """
+    measured = [run for run in runs if not run.is_empty]
+    count = sum(len(run.targets) for run in measured)
+    duration = float((end - start) / np.timedelta64(1, "s")) if start is not None and end is not None else 0.0
+    step = duration / max(count, 1)
+    turn = step
+    travel: dict[int, np.ndarray] = {run.number: np.full(len(run.targets) - 1, step) for run in measured}
+    if feed_mm_per_min and dwell_s is not None:
+        for run in measured:
+            travel[run.number] = np.abs(np.diff(targets[np.array(run.targets) - 1])) / feed_mm_per_min * 60 + dwell_s
+        moving = sum(float(times.sum()) for times in travel.values())
+        turn = (duration - moving) / len(measured)
+        if turn < 0:
+            travel = {number: times * duration / moving for number, times in travel.items()}
+            turn = 0.0
+    at, schedule = 0.0, []
+    for run in runs:
+        if run.is_empty:
+            schedule.append(np.full(len(run.targets), np.nan))
+            continue
+        instants = at + turn + np.concatenate([[0.0], np.cumsum(travel[run.number])])
+        at = float(instants[-1])
+        schedule.append(instants)
+    return schedule, max(step, turn) / (2 * math.sqrt(3))
+
+
+def _parse_environment(
+    sections: dict[str, list[tuple[int, str]]],
+) -> dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]]:
+    keyed = _keyed(sections.get("ENVIRONMENT", []))
+    wanted = (
+        ("airtemp", "air_temperature", "degC", 1.0),
+        ("airpress", "air_pressure", "hPa", 10.0),
+        ("airhumid", "relative_humidity", "percent", 1.0),
+        ("envfactor", "environment_factor", "um", 1.0),
+        ("expcoeff", "expansion_coefficient", "ppm/K", 1.0),
+    )
+    found: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]] = {}
+    for key, name, unit, scale in wanted:
+        if key in keyed:
+            found[name] = (("instant",), _pair(keyed[key]) * scale, {"units": unit})
+    material = [_pair(keyed[f"mattemp{sensor}"]) for sensor in (1, 2, 3) if f"mattemp{sensor}" in keyed]
+    if material:
+        data = np.where(np.array(material) == UNCONNECTED_DEGC, np.nan, material)
+        found["material_temperature"] = (("sensor", "instant"), data, {"units": "degC"})
+    return found
+
+
+def _pair(text: str) -> np.ndarray:
+    """Return the start and end values of one line of the ENVIRONMENT block (a status may follow them)."""
+    words = text.replace(",", ".").split()
+    return np.array([float(word) for word in words[:2]])
+
+
+def _parse_user_text(sections: dict[str, list[tuple[int, str]]]) -> dict[str, str]:
+    """Return the user text by English names: keys are localised, their order is not."""
+    values = [content.split(":", 1)[1].strip() for _, content in sections.get("USER-TEXT", []) if ":" in content]
+    return dict(zip(USER_TEXT, values, strict=False))
+
+
+def read_rtx(path: str | Path) -> xr.Dataset:
+    """Read a Renishaw dynamic capture.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dim sample: displacement (mm) and seconds (s since the first sample); the header in ``attrs["header"]`` as JSON.
+
+    Raises
+    ------
+    LaserFormatError
+        A marker is missing, no sample rate is given, or the number of samples is not the one stated.
+    """
+    path = Path(path)
+    content = path.read_bytes()
+    begin, end = content.find(b"Data:\r\n"), content.rfind(b"EOF::")
+    if not content.startswith(b"HEADER::") or begin < 0 or end < 0:
+        raise LaserFormatError(
+            f"{path}: HEADER::, Data: or EOF:: is missing; the file is not a complete .rtx, copy it again"
+        )
+    lines = [
+        (0, line) for line in content[:begin].decode("latin-1").split("\r\n") if ":" in line and not line.endswith("::")
+    ]
+    header = {line.split(":", 1)[0].strip(): line.split(":", 1)[1].strip() for _, line in lines}
+    keyed = _keyed(lines)
+    data = content[begin + len(b"Data:\r\n") : end]
+    rate = float(keyed.get("actualsamplerate") or keyed.get("samplerate") or 0)
+    if rate <= 0:
+        raise LaserFormatError(f"{path}: no 'Actual sample rate' or 'Sample rate' above 0 in the header")
+    usable = len(data) // 8 * 8
+    displacement = np.frombuffer(data[:usable], dtype="<f8")
+    stated = int(float(keyed.get("sampleno", displacement.size)))
+    if stated != displacement.size:
+        raise LaserFormatError(
+            f"{path}: 'Sample no' is {stated}, but {displacement.size} samples follow; the file is cut short"
+        )
+    return xr.Dataset(
+        {
+            "displacement": (("sample",), displacement.astype("f8"), {"units": "mm"}),
+            "seconds": (("sample",), np.arange(displacement.size) / rate, {"units": "s"}),
+        },
+        attrs={"source": path.name, "header": json.dumps(header)},
+    )

@@ -1,0 +1,168 @@
+"""Deviations and environment to the files that instruments write: Renishaw .rtl and CSV."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+#: Lines of the ENVIRONMENT block: key of the argument, label in the file, factor to the file's unit.
+_ENVIRONMENT = (
+    ("air_temperature_degC", "Air temp   ", 1.0),
+    ("air_pressure_hPa", "Air press  ", 0.1),
+    ("relative_humidity_percent", "Air humid  ", 1.0),
+    ("material_temperature_degC", "Mat temp 1 ", 1.0),
+    ("environment_factor_um", "Env factor ", 1.0),
+    ("expansion_coefficient_ppm_per_K", "Exp coeff  ", 1.0),
+)
+_USER_TEXT = (
+    ("machine", "Machine"),
+    ("serial_number", "Serial No"),
+    ("date", "Date"),
+    ("by", "By"),
+    ("axis", "Axis"),
+    ("location", "Location"),
+    ("title", "TITLE"),
+)
+
+
+def write_rtl(
+    path: str | Path,
+    deviations: xr.Dataset,
+    *,
+    environment: Mapping[str, tuple[float, float]] | None = None,
+    start: np.datetime64 | None = None,
+    end: np.datetime64 | None = None,
+    user_text: Mapping[str, str] | None = None,
+) -> None:
+    """Write a Renishaw linear test: two runs per cycle, the reverse one in measuring order, missing readings as -1e20.
+
+    Parameters
+    ----------
+    path : str or pathlib.Path
+    deviations : xarray.Dataset
+        Keeps ``contract.DEVIATIONS``. The file has no place for the times of readings.
+    environment : mapping, optional
+        Start and end of the test for any of air_temperature_degC, air_pressure_hPa, relative_humidity_percent,
+        material_temperature_degC, environment_factor_um, expansion_coefficient_ppm_per_K.
+    start, end : numpy.datetime64, optional
+        UTC; left out: the first and the last reading's time.
+    user_text : mapping, optional
+        Any of machine, serial_number, date, by, axis, location, title.
+
+    Raises
+    ------
+    ValueError
+        An unknown name stands in ``environment`` or ``user_text``.
+    """
+    environment, user_text = environment or {}, user_text or {}
+    _refuse_unknown("environment", environment, [name for name, _, _ in _ENVIRONMENT])
+    _refuse_unknown("user_text", user_text, [name for name, _ in _USER_TEXT])
+    position = deviations["position"].values
+    lines = ["HEADER::", "File type  : rtl", "Owner      : Linear", "Version no : V20.02.01", ""]
+    lines += ["TARGET DATA::", "Filetype  : ISO", f"Target-count: {position.size}", "Targets :"]
+    lines += ["  ".join(f"{value:.6f}" for value in position[at : at + 5]) + " " for at in range(0, position.size, 5)]
+    lines += ["Flags: 0 0 2 1", "", "USER-TEXT::"]
+    lines += [f"{label}:{user_text.get(name, '')}" for name, label in _USER_TEXT]
+    lines += ["", "RUNS::", f"Run-count:{2 * deviations.sizes['cycle']}", "", "DEVIATIONS::", "Run Target Data:"]
+    lines += _deviation_rows(deviations)
+    lines += ["", "ENVIRONMENT::"]
+    for name, label, factor in _ENVIRONMENT:
+        if name in environment:
+            first, last = environment[name]
+            lines.append(f"{label}: {first * factor:.8f} {last * factor:.8f} 0")
+    lines += _test_times(deviations, start, end)
+    lines += ["", "EOF::", ""]
+    Path(path).write_text("\r\n".join(lines), encoding="latin-1", newline="")
+
+
+def _refuse_unknown(argument: str, given: Mapping[str, object], known: list[str]) -> None:
+    unknown = sorted(set(given) - set(known))
+    if unknown:
+        raise ValueError(f"{argument}: {', '.join(unknown)} has no place in a .rtl; known are {', '.join(known)}")
+
+
+def _deviation_rows(deviations: xr.Dataset) -> list[str]:
+    """Return the rows of all runs; a run along falling positions is stored last target first."""
+    along = np.argsort(deviations["position"].values, kind="stable")
+    values = np.nan_to_num(deviations["deviation"].values, nan=-1e20)
+    rows = []
+    for cycle in range(values.shape[0]):
+        for direction, name in enumerate(deviations["direction"].values):
+            order = along if name == "positive" else along[::-1]
+            run = 2 * cycle + direction + 1
+            rows += [f"{run:<3d} {at + 1:<4d} {values[cycle, direction, at]:10.4f}" for at in order]
+    return rows
+
+
+def _test_times(deviations: xr.Dataset, start: np.datetime64 | None, end: np.datetime64 | None) -> list[str]:
+    times = deviations["time"].values
+    known = times[~np.isnat(times)]
+    if start is None or end is None:
+        if known.size == 0:
+            return []
+        start, end = known.min() if start is None else start, known.max() if end is None else end
+    first, last = (str(time.astype("datetime64[s]")).replace("T", " ") for time in (start, end))
+    return [f'Date Time  : "{first}" "{last}"']
+
+
+def write_deviations_csv(path: str | Path, deviations: xr.Dataset) -> None:
+    """Write readings in measuring order as CSV (cycle,direction,target,position_mm,time,deviation_um); missing ones get no line.
+
+    Parameters
+    ----------
+    path : str or pathlib.Path
+    deviations : xarray.Dataset
+        Keeps ``contract.DEVIATIONS``.
+    """
+    present = np.isfinite(deviations["deviation"].values) & ~np.isnat(deviations["time"].values)
+    times = deviations["time"].values
+    cells = sorted(zip(*np.nonzero(present), strict=True), key=lambda at: times[at])
+    with Path(path).open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(("cycle", "direction", "target", "position_mm", "time", "deviation_um"))
+        for cycle, direction, target in cells:
+            writer.writerow(
+                (
+                    int(deviations["cycle"].values[cycle]),
+                    str(deviations["direction"].values[direction]),
+                    int(deviations["target"].values[target]),
+                    f"{deviations['position'].values[target]:.6g}",
+                    _iso_utc(times[cycle, direction, target]),
+                    f"{deviations['deviation'].values[cycle, direction, target]:.4f}",
+                )
+            )
+
+
+def write_environment_csv(path: str | Path, environment: xr.Dataset) -> None:
+    """Write air and material conditions as CSV.
+
+    Parameters
+    ----------
+    path : str or pathlib.Path
+    environment : xarray.Dataset
+        Dim time: air_temperature (degC), air_pressure (hPa), relative_humidity (percent), material_temperature (degC).
+    """
+    names = ("air_temperature", "air_pressure", "relative_humidity", "material_temperature")
+    columns = [environment[name].values for name in names]
+    with Path(path).open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(
+            (
+                "time",
+                "air_temperature_degC",
+                "air_pressure_hPa",
+                "relative_humidity_percent",
+                "material_temperature_degC",
+            )
+        )
+        for time, *values in zip(environment["time"].values, *columns, strict=True):
+            writer.writerow((_iso_utc(time), *(f"{value:.4f}" for value in values)))
+
+
+def _iso_utc(time: np.datetime64) -> str:
+    milliseconds = time.astype("datetime64[ms]")
+    return f"{milliseconds}+00:00"

@@ -1,0 +1,120 @@
+"""Readings and fields on one clock: integrals along the measured line, cycles, and what lies outside the frames."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from fusion.alignment.align import AlignmentError, AxisGeometry, align, camera_on_laser_clock, cycle_bounds
+from interferometry.deviations import build_deviations
+
+AXIS = AxisGeometry((500.0, 90.0), (-1.0, 0.0))
+START = np.datetime64("2026-03-09T06:30:00", "ns")
+POSITIONS = np.arange(16) * 20.0
+
+
+def deviations(cycles=4, period_s=252):
+    order = np.concatenate([np.arange(16), np.arange(15, -1, -1)]).reshape(2, 16)
+    rank = np.empty((2, 16))
+    rank[0], rank[1, order[1]] = np.arange(16), np.arange(16, 32)
+    seconds = np.arange(cycles)[:, None, None] * period_s + 5 + 6.0 * rank
+    time = START + (seconds * 1e9).astype("timedelta64[ns]")
+    return build_deviations(range(1, cycles + 1), range(1, 17), POSITIONS, np.zeros(time.shape), time)
+
+
+def fields(rise, cycles=4, period_s=252):
+    """Frames at the end of every cycle; ``rise(x, y, seconds)`` in K."""
+    x, y = np.arange(140) * 5.0 + 2.5, np.arange(36) * 5.0 + 2.5
+    seconds = np.arange(cycles) * period_s + 222.0
+    frames = np.stack([24.0 + rise(x[None, :], y[:, None], s) for s in seconds])
+    time = START + (seconds * 1e9).astype("timedelta64[ns]")
+    return xr.Dataset({"frame_temperature": (("time", "y", "x"), frames)}, coords={"time": time, "y": y, "x": x})
+
+
+def test_a_uniform_rise_integrates_to_rise_times_position():
+    fused = align(deviations(), fields(lambda x, y, s: 0.01 * s + 0 * x + 0 * y), AXIS)
+    seconds = (fused["time"] - START) / np.timedelta64(1, "s")
+    rise = 0.01 * (seconds - 222.0)
+    inside = fused["inside_frames"]
+    np.testing.assert_allclose(fused["mean_rise"].where(inside), rise.where(inside), atol=1e-12)
+    np.testing.assert_allclose(fused["axis_integral"].where(inside), (rise * POSITIONS).where(inside), atol=1e-9)
+    np.testing.assert_allclose(fused["local_rise"].where(inside), rise.where(inside), atol=1e-12)
+
+
+def test_a_rise_along_the_axis_is_integrated_where_the_spindle_stands():
+    # At axis position X the spindle stands over x = 500 - X, so a rise k * (500 - x) integrates to k X^2 / 2.
+    fused = align(deviations(), fields(lambda x, y, s: 1e-4 * s * (500.0 - x) / 100.0 + 0 * y), AXIS)
+    seconds = ((fused["time"] - START) / np.timedelta64(1, "s")).values
+    expected = 1e-6 * (seconds - 222.0) * POSITIONS**2 / 2.0
+    inside = fused["inside_frames"].values
+    np.testing.assert_allclose(fused["axis_integral"].values[inside], expected[inside], rtol=1e-9, atol=1e-9)
+
+
+def test_masked_discs_are_bridged_along_the_line():
+    field = fields(lambda x, y, s: 1e-3 * s + 0 * x + 0 * y)
+    plain = align(deviations(), field, AXIS)
+    hole = (np.hypot(field["x"] - 400, field["y"] - 90) < 12).transpose("y", "x")
+    masked = align(deviations(), field.assign(frame_temperature=field["frame_temperature"].where(~hole)), AXIS)
+    np.testing.assert_allclose(masked["axis_integral"], plain["axis_integral"], atol=1e-9)
+
+
+def test_readings_outside_the_frames_get_no_field_and_are_marked():
+    fused = align(deviations(), fields(lambda x, y, s: s + 0 * x + 0 * y), AXIS)
+    before_first_frame = fused["time"] < START + np.timedelta64(222, "s")
+    assert not fused["inside_frames"].where(before_first_frame, False).any()
+    assert np.isnan(fused["mean_rise"].values[before_first_frame.values]).all()
+    assert int(fused["inside_frames"].sum()) == 96
+
+
+def test_environment_is_interpolated_and_never_extrapolated():
+    time = START + np.array([300, 600], "timedelta64[s]")
+    log = xr.Dataset({"air_temperature": ("time", [20.0, 23.0], {"units": "degC"})}, coords={"time": time})
+    fused = align(deviations(), fields(lambda x, y, s: s + 0 * x + 0 * y), AXIS, environment=log)
+    reading = fused.isel(cycle=1, direction=0, target=10)
+    seconds = float((reading["time"] - START) / np.timedelta64(1, "s"))
+    assert float(reading["air_temperature"]) == pytest.approx(20.0 + 3.0 * (seconds - 300.0) / 300.0)
+    assert np.isnan(fused["air_temperature"].isel(cycle=3)).all()
+
+
+def test_a_frame_at_the_end_of_a_cycle_belongs_to_that_cycle():
+    bounds = cycle_bounds(deviations())
+    frame = START + np.timedelta64(222 + 252, "s")
+    assert bounds[1, 0] <= frame < bounds[1, 1]
+    assert (bounds[1:, 0] == bounds[:-1, 1]).all()
+
+
+def test_the_clock_offset_is_camera_minus_laser():
+    camera = np.array([START + np.timedelta64(37, "s")])
+    assert camera_on_laser_clock(camera, 37.0)[0] == START
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d, f: (d, f.assign_coords(time=f["time"] + np.timedelta64(2, "h")), AXIS), "never meet"),
+        (lambda d, f: (d, f, AxisGeometry((100.0, 90.0), (-1.0, 0.0))), "leaves the plan: axis position"),
+        (lambda d, f: (d.assign(time=d["time"].where(d["cycle"] != 2)), f, AXIS), r"cycles \[2\] hold no reading"),
+    ],
+)
+def test_what_cannot_be_aligned_is_named(change, message):
+    readings, field, axis = change(deviations(), fields(lambda x, y, s: s + 0 * x + 0 * y))
+    with pytest.raises(AlignmentError, match=message):
+        cycle_bounds(readings)
+        align(readings, field, axis)
+
+
+def test_overlapping_cycles_are_refused():
+    readings = deviations()
+    time = readings["time"].values.copy()
+    time[2] = time[1] + np.timedelta64(30, "s")
+    with pytest.raises(AlignmentError, match="cycle 3 starts before cycle 2 has ended"):
+        cycle_bounds(readings.assign(time=readings["time"].copy(data=time)))
+
+
+def test_inputs_stay_as_they_were():
+    readings, field = deviations(), fields(lambda x, y, s: s + 0 * x + 0 * y)
+    kept = readings.copy(deep=True), field.copy(deep=True)
+    align(readings, field, AXIS)
+    xr.testing.assert_identical(readings, kept[0])
+    xr.testing.assert_identical(field, kept[1])

@@ -1,0 +1,86 @@
+"""Contact sensors in place of the camera, on axes of known sources."""
+
+import os
+
+import numpy as np
+import pytest
+
+from fusion.attribution.contact_sensors import FOLDS, Excess, choose_sensors
+from tests.fusion import film_simulator as simulator
+
+RUNS = int(os.environ.get("THERMOFUSE_RUNS", "100"))
+
+
+def two_sources(rng, um=3.0):
+    """Sources 0 and 1 drive the axis with opposite signs: one sensor cannot stand for both."""
+    responses = simulator.source_responses("duty", rng)[1]
+    driver = um * (responses[:, 0] - responses[:, 1])
+    walks = 0.02 * np.cumsum(rng.standard_normal((2, simulator.CYCLES)), axis=1)
+    film = simulator.film("duty", rng, responses)
+    return simulator.session(film, driver + walks[0], driver + walks[1], rng), driver
+
+
+def thin(made):
+    return made.field[:, ::2, ::2]
+
+
+def test_one_source_needs_one_sensor_and_it_sits_there():
+    made = simulator.driven_session(np.random.default_rng(12), source=0, nuisance_um=0.02)
+    choice = choose_sensors(made.fused, thin(made), most=3)
+    x_mm, y_mm = choice.sets[0].places_mm[0]
+    assert simulator.distance_cells(y_mm / 10 - 0.5, x_mm / 10 - 0.5, 0) <= 5
+    assert choice.without.decided
+    # What is lost with one sensor is small beside what the camera is worth.
+    assert choice.sets[0].loss.at_most_um < 0.3 * choice.without.um
+
+
+def test_two_sources_need_two_sensors():
+    made, _ = two_sources(np.random.default_rng(3))
+    choice = choose_sensors(made.fused, thin(made), most=3)
+    assert [len(one.places_mm) for one in choice.sets] == [1, 2, 3]
+    first, second, _ = choice.sets
+    assert first.loss.decided and first.loss.um > 0.2
+    assert second.loss.at_most_um < 0.5 * first.loss.um
+    near = [min(simulator.distance_cells(y / 10 - 0.5, x / 10 - 0.5, k) for x, y in second.places_mm) for k in (0, 1)]
+    assert max(near) <= 5
+
+
+def test_a_field_that_drives_nothing_leaves_it_undecided():
+    made = simulator.driven_session(np.random.default_rng(5), source=0, um_per_unit=0.0)
+    assert not choose_sensors(made.fused, thin(made), most=1).without.decided
+
+
+def test_a_still_field_places_no_sensor(rng):
+    made = simulator.driven_session(rng, source=0)
+    still = thin(made).copy(data=20.0 + 0.03 * rng.standard_normal(thin(made).shape))
+    assert choose_sensors(made.fused, still).sets == ()
+
+
+def test_an_excess_within_its_uncertainty_is_no_loss():
+    assert Excess(-0.1, 0.2).um == 0.0 and not Excess(-0.1, 0.2).decided
+    assert Excess(0.25, 0.01).um == pytest.approx(0.5) and Excess(0.25, 0.01).decided
+    assert Excess(0.0, 0.02).at_most_um == pytest.approx(0.2)
+
+
+@pytest.mark.slow
+def test_losses_and_their_uncertainty_against_the_truth():
+    """The worth of the camera is estimated without bias, with honest uncertainty: the true driver is known."""
+    scores = []
+    for seed in range(RUNS):
+        made = simulator.driven_session(np.random.default_rng([seed, 61]), source=seed % 3)
+        choice = choose_sensors(made.fused, thin(made), most=2)
+        truth = 3.0 * made.responses[:, seed % 3]
+        runs = np.array_split(truth, FOLDS)
+        within = np.concatenate([run - run.mean() for run in runs])
+        # The camera cannot be worth more than a perfect prediction of both channels, weighted as rms over the targets.
+        scaled = np.linspace(-1, 1, 16)
+        perfect = (within**2).mean() * (1.0 + (scaled**2).mean())
+        scores.append((choice.without.value / perfect, choice.without.u / perfect, choice.sets[0].loss.value / perfect))
+    worth, u, loss = np.array(scores).T
+    print(
+        f"\\ncamera takes out {np.median(worth):.2f} of what a perfect prediction would (u {np.median(u):.2f}); ",
+        end="",
+    )
+    print(f"more than all in {np.mean(worth - 2 * u > 1.0):.3f}; one sensor loses {np.median(loss):.3f}, N = {RUNS}")
+    # More than a perfect prediction, by two uncertainties: 0.025 expected if u is right.
+    assert np.mean(worth - 2 * u > 1.0) <= 0.08

@@ -1,0 +1,185 @@
+"""Randomised duty: the law that is promised, a test that keeps its level in a warm-up, and a plan that says its power."""
+
+import itertools
+import os
+
+import numpy as np
+import pytest
+import xarray as xr
+from statsmodels.stats.proportion import proportion_confint
+
+from fusion.alignment.first_order_lag import respond
+from fusion.attribution.duty_plan import DutyPlanError, Machine, plan_duty, switchings
+from fusion.attribution.randomised_duty import (
+    DutyLaw,
+    RandomisationError,
+    duty_responses,
+    randomisation_test,
+    read_duty,
+)
+from tests.fusion import film_simulator as simulator
+
+MIDDLE = np.arange(simulator.CYCLES) * simulator.PERIOD_S
+FINE = np.arange(0.0, simulator.CYCLES * simulator.PERIOD_S, 60.0)
+NAMES = ["spindle", "pump", "drive"]
+
+
+def run_schedule(law, rng):
+    courses = np.column_stack([law.course(FINE, rng) for _ in NAMES])
+    time = simulator.START + (FINE * 1e9).astype("timedelta64[ns]")
+    return xr.DataArray(courses, dims=("time", "source"), coords={"time": time, "source": NAMES})
+
+
+def driven(duty, source, rng, um=3.0, nuisance_um=0.1):
+    heated = respond(FINE, simulator.TAU_S[source], duty.values[:, [source]])
+    moved = np.interp(MIDDLE, FINE, respond(FINE, 1800.0, heated)[:, 0])
+    walks = nuisance_um * np.cumsum(rng.standard_normal((2, simulator.CYCLES)), axis=1)
+    still = np.zeros((simulator.CYCLES, 1, 1))
+    return simulator.session(still, um * moved + walks[0], um * moved + walks[1], rng).fused
+
+
+def test_the_law_keeps_its_mean_and_least_dwell(rng):
+    law = DutyLaw(1800.0, 300.0)
+    _, switching = law.draw(4e6, rng)
+    dwell = np.diff(switching)
+    assert dwell.min() >= 300.0
+    # About 2,200 dwells of spread 1,500 s: standard error 32 s; 4 sigma.
+    assert dwell.mean() == pytest.approx(1800.0, abs=130.0)
+    assert set(np.unique(law.course(FINE, rng))) <= {0.0, 1.0}
+
+
+def test_responses_hold_first_and_second_order_bodies():
+    seconds = np.arange(0.0, 36000.0, 60.0)
+    responses = duty_responses(seconds, np.where(seconds > 0, 1.0, 0.0)[:, None])
+    assert responses.shape == (600, 1, 8)
+    # Ten hours after the switch even the slowest body of two hours, behind one of half an hour, is within 1 %.
+    assert (responses[-1] > 0.99).all()
+    # At the start a body behind a body lags more.
+    assert responses[10, 0, 4] < responses[10, 0, 0]
+
+
+def test_the_switched_source_is_named(rng):
+    law = DutyLaw(1800.0)
+    duty = run_schedule(law, rng)
+    found = randomisation_test(driven(duty, 1, rng, um=6.0), duty, law, draws=199)
+    assert found.attrs["source"] == "pump"
+    assert float(found["p_value"].sel(source="pump")) <= 0.05
+    assert float(found["sensitivity"].sel(source="pump")) > 0
+
+
+def test_a_source_that_was_never_switched_is_refused(rng):
+    duty = run_schedule(DutyLaw(1800.0), rng)
+    duty[:, 2] = 1.0
+    with pytest.raises(RandomisationError, match="drive: never switched in this session"):
+        randomisation_test(driven(duty, 0, rng), duty, DutyLaw(1800.0))
+
+
+def test_an_impossible_law_is_refused():
+    with pytest.raises(RandomisationError, match="mean dwell of 300 s must be longer than the least dwell of 600 s"):
+        DutyLaw(300.0, 600.0)
+
+
+def logged(rng, full=3000.0):
+    """A driver log of one load that was switched by the law, once a minute, at 0 and `full`."""
+    time = simulator.START + (FINE * 1e9).astype("timedelta64[ns]")
+    values = full * DutyLaw(1800.0, 300.0).course(FINE, rng) + rng.normal(0.0, 2.0, FINE.size)
+    return xr.Dataset({"speed": ("time", values), "load": ("time", rng.random(FINE.size))}, coords={"time": time})
+
+
+def test_a_logged_load_becomes_a_schedule_of_two_states(rng):
+    duty = read_duty(logged(rng), ["speed"], DutyLaw(1800.0, 300.0))
+    assert duty.dims == ("time", "source") and list(duty["source"].values) == ["speed"]
+    assert set(np.unique(duty.values)) == {0.0, 1.0}
+
+
+def test_a_logged_load_that_was_never_switched_is_refused(rng):
+    still = logged(rng)
+    still["speed"] = still["speed"] * 0.0
+    with pytest.raises(
+        RandomisationError, match=r"drivers\.csv: speed was never switched; take it out of drivers\.randomised"
+    ):
+        read_duty(still, ["speed"], DutyLaw(1800.0), source="drivers.csv")
+
+
+@pytest.mark.parametrize(
+    ("names", "law", "message"),
+    [
+        (["spindle"], DutyLaw(1800.0), "drivers.csv: no column spindle for drivers.randomised; it has: speed, load"),
+        (
+            ["load"],
+            DutyLaw(1800.0),
+            r"drivers.csv: load takes levels between 0\S* and 0\S*; the randomisation test is for loads",
+        ),
+        (["speed"], DutyLaw(9000.0, 5000.0), r"speed was switched again after \d+ s, before the least dwell of 5000 s"),
+        (
+            ["speed"],
+            DutyLaw(60.0),
+            r"speed was switched \d+ times in 7.0 h, where a mean dwell of 60 s makes about 419",
+        ),
+    ],
+)
+def test_a_log_that_the_law_cannot_have_made_is_refused(rng, names, law, message):
+    with pytest.raises(RandomisationError, match=message):
+        read_duty(logged(rng), names, law, source="drivers.csv")
+
+
+def test_the_plan_grows_with_time_and_falls_with_drift():
+    quiet = Machine(("spindle", "pump"), (1200.0, 3600.0), 5.0, drift_um_per_sqrt_h=0.2)
+    restless = Machine(("spindle", "pump"), (1200.0, 3600.0), 5.0, drift_um_per_sqrt_h=2.0)
+    short = {"hours": (3.0, 7.0), "dwells_s": (1800.0, 3600.0)}
+    plan = plan_duty(quiet, **short)
+    power = plan["power"].values
+    assert (power[1] >= power[0]).all()
+    assert (plan_duty(restless, **short)["power"].values.max(axis=1) < power.max(axis=1)).all()
+    assert 0.0 < float(plan["separation"].min()) <= 1.0
+
+
+def test_the_plan_can_be_worked_through_and_repeated():
+    machine = Machine(("spindle", "pump"), (1200.0, 3600.0), 8.0, drift_um_per_sqrt_h=0.2)
+    short = {"hours": (3.0, 7.0), "dwells_s": (1800.0,), "least_dwell_s": 600.0}
+    plan = plan_duty(machine, **short)
+    events = switchings(plan)
+    assert [event for event in events if event[0] == 0.0] != []
+    for name in machine.sources:
+        minutes = [when for when, which, _ in events if which == name]
+        states = [state for _, which, state in events if which == name]
+        assert (np.diff(minutes) >= 10.0 - 1.0).all()
+        assert all(a != b for a, b in itertools.pairwise(states))
+    xr.testing.assert_identical(plan, plan_duty(machine, **short))
+    assert not plan_duty(machine, **short, seed=1)["duty"].equals(plan["duty"])
+
+
+def test_a_plan_without_sources_is_refused():
+    with pytest.raises(DutyPlanError, match="2 sources and 1 time constants: name every source once"):
+        Machine(("a", "b"), (1200.0,), 3.0)
+
+
+def test_a_plan_without_usable_dwells_is_refused():
+    with pytest.raises(DutyPlanError, match="is longer than the least dwell of 7200 s"):
+        plan_duty(Machine(("a",), (1200.0,), 3.0), least_dwell_s=7200.0)
+
+
+@pytest.mark.slow
+def test_level_and_power_of_the_randomisation_test():
+    runs = int(os.environ.get("THERMOFUSE_RUNS", "400"))
+    law = DutyLaw(1800.0)
+    false = right = wrong = 0
+    for seed in range(runs):
+        rng = np.random.default_rng([seed, 31])
+        duty = run_schedule(law, rng)
+        kind = ("warm", "rw", "duty")[seed % 3]
+        still = np.zeros((simulator.CYCLES, 1, 1))
+        null = simulator.session(
+            still, 3 * simulator.smooth_series(kind, rng), 2 * simulator.smooth_series(kind, rng), rng
+        ).fused
+        false += randomisation_test(null, duty, law, draws=199, seed=seed).attrs["source"] != ""
+        source = seed % 3
+        named = randomisation_test(driven(duty, source, rng), duty, law, draws=199, seed=seed).attrs["source"]
+        right += named == NAMES[source]
+        wrong += named not in ("", NAMES[source])
+    for what, count in (("false alarms", false), ("right source", right), ("wrong source", wrong)):
+        low, high = proportion_confint(count, runs, method="wilson")
+        print(f"\n{what}: {count / runs:.3f} [{low:.3f}, {high:.3f}] of {runs}", end="")
+    low, high = proportion_confint(false, runs, method="wilson")
+    assert low <= 0.07 and high >= 0.03
+    assert proportion_confint(right, runs, method="wilson")[1] >= 0.70

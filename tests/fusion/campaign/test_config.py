@@ -1,0 +1,185 @@
+"""The campaign file: every promise kept for good input, one exact message per kind of bad input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fusion.campaign.config import Campaign, CampaignError, load_campaign
+from fusion.campaign.logged_tables import match_columns
+
+TEXT = """\
+[campaign]
+title = "X axis"
+axis = "X"
+
+[thermography]
+frames = ["thermal/*.jpg"]
+emissivity = 0.97
+reflected_temperature = "22 degC"
+relative_humidity = "45 %"
+object_distance = "120 cm"
+clock_offset = "-2 min"
+
+[plan]
+size = ["0.7 m", "180 mm"]
+cell_size = "5 mm"
+fiducials = "fiducials.csv"
+
+[plan.axis]
+origin = ["500 mm", "90 mm"]
+direction = [-1, 0]
+
+[interferometry]
+deviations = "laser.csv"
+environment = "environment.csv"
+dead_path = "0 mm"
+expansion_coefficient = "11.7 ppm/K"
+
+[model]
+declared = ["axis_expansion", "table_offset"]
+"""
+RECORD = """\
+[campaign]
+title = "Spindle"
+
+[record]
+file = "record.csv"
+time = "time [s]"
+temperatures = ["t* [degC]"]
+displacements = ["ch1 [um]"]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "thermal").mkdir()
+    for name in ("thermal/b.jpg", "thermal/a.jpg", "fiducials.csv", "laser.csv", "environment.csv", "record.csv"):
+        (tmp_path / name).touch()
+    return tmp_path
+
+
+def load(folder: Path, text: str) -> Campaign:
+    path = folder / "campaign.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_campaign(path)
+
+
+def test_numbers_arrive_in_the_unit_of_their_name(folder: Path) -> None:
+    campaign = load(folder, TEXT)
+    assert campaign.thermography is not None and campaign.plan is not None and campaign.interferometry is not None
+    assert campaign.plan.size_mm == (700.0, 180.0)
+    assert campaign.plan.axis.origin_mm == (500.0, 90.0)
+    assert campaign.thermography.object_distance_m == 1.2
+    assert campaign.thermography.clock_offset_s == -120.0
+    assert campaign.thermography.relative_humidity == 0.45
+    assert campaign.thermography.reflected_temperature_degC == 22.0
+    assert campaign.thermography.atmospheric_temperature_degC is None
+    assert campaign.interferometry.expansion_coefficient_ppm_per_K == 11.7
+
+
+def test_paths_start_from_the_campaign_file_and_frames_are_sorted(folder: Path) -> None:
+    campaign = load(folder, TEXT)
+    assert [path.name for path in campaign.frame_paths()] == ["a.jpg", "b.jpg"]
+    assert list(campaign.input_files()) == [
+        "campaign.toml", "thermal/a.jpg", "thermal/b.jpg", "fiducials.csv", "laser.csv", "environment.csv",
+    ]  # fmt: skip
+
+
+def test_a_record_stands_instead_of_the_instruments(folder: Path) -> None:
+    campaign = load(folder, RECORD)
+    assert campaign.record is not None and campaign.thermography is None
+    assert campaign.record.temperatures == ("t* [degC]",)
+
+
+# Each row: text to replace, its replacement, and the message after "FOLDER/campaign.toml" with {folder} filled in.
+BAD = [
+    ("emissivity", "emisivity",
+     ", line 7: unknown key thermography.emisivity; did you mean emissivity? known here: atmospheric_temperature, clock_offset, "
+     "emissivity, frames, object_distance, reflected_temperature, relative_humidity, table"),
+    ('"5 mm"', "5", ', line 15: plan.cell_size = 5: a length needs its unit in the value; write for example "5 mm"'),
+    ('"5 mm"', '"5"', ', line 15: plan.cell_size = "5": a length needs its unit in the value; write for example "5 mm"'),
+    ('"5 mm"', '"five mm"',
+     ', line 15: plan.cell_size = "five mm": this is not a length with a unit; write for example "5 mm"'),
+    ('"5 mm"', '"5 kg"', ', line 15: plan.cell_size = "5 kg": "kg" is not a unit of a length; use one of nm, um, mm, cm, m, in'),
+    ('"5 mm"', '"-5 mm"', ', line 15: plan.cell_size = "-5 mm": this length in mm lies above 0 and up to 100000'),
+    ('"5 mm"', '"5 um"',
+     ", line 13: [plan]: cell_size 0.005 mm on a plan of 700 x 180 mm makes 5040000000 cells; "
+     "choose it for at least 2 cells per side and at most 4 million in all"),
+    ('"0 mm"', "0", ', line 25: interferometry.dead_path = 0: a length needs its unit in the value; write for example "5 mm"'),
+    ('"22 degC"', '"-300 degC"',
+     ', line 8: thermography.reflected_temperature = "-300 degC": a temperature in degC lies above -273.15 and up to 3000'),
+    ("0.97", "97", ", line 7: thermography.emissivity = 97: this fraction lies above 0 and up to 1"),
+    ('"0.7 m", "180 mm"', '"0.7 m"', ", line 14: plan.size needs 2 values"),
+    ('"0.7 m", "180 mm"', '"0.7 m", 180',
+     ', line 14: plan.size = 180: a length needs its unit in the value; write for example "5 mm"'),
+    ("[-1, 0]", "[0, 0]", ", line 18: [plan.axis]: the direction [0, 0] points nowhere; write for example [-1, 0]"),
+    ("[-1, 0]", '["left", 0]', ', line 20: plan.axis.direction = "left": this is a number without quotes'),
+    ('["thermal/*.jpg"]', '"thermal/*.jpg"',
+     ', line 6: thermography.frames = "thermal/*.jpg": this is a list; write for example ["a", "b"]'),
+    ("*.jpg", "*.seq",
+     ', line 6: thermography.frames = "thermal/*.seq" matches no file in {folder}; paths are relative to the campaign file'),
+    ('"laser.csv"', '"lazer.csv"',
+     ', line 23: interferometry.deviations = "lazer.csv": no such file {folder}/lazer.csv; did you mean laser.csv? '
+     "paths are relative to the campaign file"),
+    ('fiducials = "fiducials.csv"\n', "", ", line 13: [plan] lacks fiducials; add it, see the campaign file in the README"),
+    ('"table_offset"', '"axis_expansion"', ', line 29: model.declared names "axis_expansion" more than once; name each effect once'),
+    ('"X axis"', "X axis", ": this is not TOML: Invalid value (at line 2, column 9); see the campaign file in the README"),
+    ('title = "X axis"', 'title = ""', ', line 2: campaign.title = "": this text is empty; fill it in'),
+    ('title = "X axis"', "title = 5", ", line 2: campaign.title = 5: this is text; write it in quotes"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "message"), BAD)
+def test_bad_input_is_named_with_place_value_and_remedy(folder: Path, old: str, new: str, message: str) -> None:
+    assert old in TEXT
+    with pytest.raises(CampaignError) as error:
+        load(folder, TEXT.replace(old, new))
+    assert str(error.value) == f"{folder}/campaign.toml" + message.format(folder=folder)
+
+
+def test_an_unknown_effect_is_answered_with_the_nearest(folder: Path) -> None:
+    with pytest.raises(
+        CampaignError,
+        match=r'line 29: model.declared holds the unknown effect "table_ofset"; did you mean table_offset[?]',
+    ):
+        load(folder, TEXT.replace("table_offset", "table_ofset"))
+
+
+def test_all_faults_come_in_one_message(folder: Path) -> None:
+    with pytest.raises(CampaignError) as error:
+        load(folder, TEXT.replace("0.97", "97").replace('"5 mm"', "5").replace("axis =", "axes ="))
+    lines = str(error.value).splitlines()
+    assert ["campaign.axes" in lines[0], "emissivity = 97" in lines[1], "cell_size = 5" in lines[2]] == [True] * 3
+    assert len(lines) == 3
+
+
+def test_missing_tables_and_mixed_instruments_are_refused(folder: Path) -> None:
+    with pytest.raises(
+        CampaignError, match=r"line 1: the table \[thermography\], \[plan\], \[interferometry\] is missing"
+    ):
+        load(folder, '[campaign]\ntitle = "empty"\n')
+    with pytest.raises(
+        CampaignError, match=r"line 31: \[record\] stands instead of \[thermography\], \[plan\], \[interferometry\]"
+    ):
+        load(folder, TEXT + "\n" + RECORD.split("\n\n")[1])
+
+
+def test_no_campaign_file(folder: Path) -> None:
+    with pytest.raises(
+        CampaignError, match=r"absent\.toml: no such campaign file; check the name or give its full path"
+    ):
+        load_campaign(folder / "absent.toml")
+    with pytest.raises(CampaignError, match="is a folder; name the campaign file in it"):
+        load_campaign(folder)
+    (folder / "latin.toml").write_bytes(b'[campaign]\ntitle = "\xb5"\n')
+    with pytest.raises(CampaignError, match="byte 20 is not UTF-8; save the campaign file as UTF-8 text"):
+        load_campaign(folder / "latin.toml")
+
+
+def test_columns_are_selected_by_name_or_pattern_in_file_order() -> None:
+    headings = ["time [s]", "t1 [degC]", "t2 [degC]", "ch1 [um]"]
+    assert match_columns(["t2 [degC]", "t* [degC]"], headings) == ("t1 [degC]", "t2 [degC]")
+    with pytest.raises(CampaignError, match=r'no column is named "z\*"; the file has: time \[s\], t1'):
+        match_columns(["z*"], headings)

@@ -1,0 +1,137 @@
+"""The laser's compensation in a campaign: as recorded, undone from its factor, and done again with what the camera saw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from fusion.alignment.align import AxisGeometry
+from fusion.campaign.config import InterferometryTable, load_campaign
+from fusion.campaign.inputs import compensate_by_camera, read_source
+from fusion.campaign.recompensation import RecompensationError, compensate_readings, see_material
+from fusion.pipeline import drift_model
+from fusion.pipeline.interferometry import evaluate_interferometry
+from fusion.products.store import read_dataset
+from interferometry.compensation import CompensationError, air_index, environment_factor
+from interferometry.io.readers import read_deviations
+from interferometry.io.writers import write_rtl
+from tests.interferometry.simulated_campaigns import START, simulate
+
+
+def table(**keys: object) -> InterferometryTable:
+    return InterferometryTable.model_validate({"deviations": "laser.csv", **keys})
+
+
+@pytest.fixture
+def readings(rng: np.random.Generator) -> xr.Dataset:
+    return simulate(rng, cycles=10)[0]
+
+
+@pytest.fixture
+def log() -> xr.Dataset:
+    minutes = np.arange(-5.0, 60.0)
+    columns = {
+        "air_temperature": 22 + 0.05 * minutes,
+        "air_pressure": 1000 + 0.1 * minutes,
+        "relative_humidity": np.full(minutes.size, 45.0),
+        "material_temperature": 21 + 0.1 * minutes,
+    }
+    time = START + (minutes * 60e9).astype("timedelta64[ns]")
+    return xr.Dataset({name: (("time",), values) for name, values in columns.items()}, coords={"time": time})
+
+
+def test_as_recorded_the_readings_stay_as_they_are(readings: xr.Dataset, log: xr.Dataset) -> None:
+    left = compensate_readings(readings, log, table())
+    assert left.deviations.identical(readings)
+    assert left.budget is None and left.notices == []
+
+
+def test_redone_with_the_conditions_that_the_instrument_followed_nothing_moves(
+    readings: xr.Dataset, log: xr.Dataset
+) -> None:
+    redone = compensate_readings(readings, log, table(compensation="redo"))
+    np.testing.assert_allclose(redone.deviations["deviation"], readings["deviation"], atol=1e-9)
+    assert redone.budget is not None
+    # The probe wandered from 20.5 to 26.9 degC; the budget allows for the coefficient over its mean distance from 20 degC.
+    assert redone.budget.difference_from_20_degC_K == pytest.approx(float(log["material_temperature"].mean()) - 20.0)
+    assert redone.notices[0].code == "compensation_redone"
+
+
+def test_a_factor_in_a_rtl_is_taken_out_and_the_logged_conditions_put_in(
+    readings: xr.Dataset, log: xr.Dataset, tmp_path: Path
+) -> None:
+    fixed = float(environment_factor(air_index(20.0, 1013.25, 50.0)))
+    write_rtl(tmp_path / "laser.rtl", readings, environment={"environment_factor_um": (fixed, fixed)})
+    read = read_deviations(tmp_path / "laser.rtl", feed_mm_per_min=300.0, dwell_s=2.0)
+    redone = compensate_readings(read, log, table(compensation="redo", expansion_coefficient="11.7 ppm/K"))
+    minutes = (read["time"].values - START) / np.timedelta64(1, "m")
+    wanted = environment_factor(
+        air_index(22 + 0.05 * minutes, 1000 + 0.1 * minutes, 45.0),
+        material_temperature_degC=21 + 0.1 * minutes,
+        expansion_coefficient_ppm_per_K=11.7,
+    )
+    displayed_um = read["position"].values * 1e3 + read["deviation"].values
+    added = redone.deviations["deviation"].values - read["deviation"].values
+    # The file prints the factor to 1e-8 um, 0.03 ppm: 0.01 um over 300 mm.
+    np.testing.assert_allclose(added, displayed_um * (wanted / fixed - 1.0), atol=0.01)
+    assert np.abs(added).max() > 5.0
+    stated = table(compensation="redo", environment_factor=[f"{fixed} um", f"{fixed} um"])
+    exact = compensate_readings(read, log, stated).deviations["deviation"].values - read["deviation"].values
+    np.testing.assert_allclose(exact, displayed_um * (wanted / fixed - 1.0), atol=1e-6)
+
+
+def test_what_cannot_be_redone_is_refused(readings: xr.Dataset, log: xr.Dataset) -> None:
+    with pytest.raises(RecompensationError, match=r'compensation = "redo" needs the air: log air temperature'):
+        compensate_readings(readings, None, table(compensation="redo"))
+    with pytest.raises(RecompensationError, match=r'belong to compensation = "redo"; add it, or leave them out'):
+        compensate_readings(readings, log, table(material_temperature="camera"))
+    wrong = table(compensation="redo", environment_factor=["0.3 um", "0.3 um"])
+    with pytest.raises(CompensationError, match=r"the environment factor 0.3 um differs by \d+ ppm"):
+        compensate_readings(readings, log, wrong)
+
+
+def test_the_camera_gives_the_mean_temperature_between_zero_and_the_target(readings: xr.Dataset) -> None:
+    x, y = np.arange(0.0, 400.0, 10.0), np.arange(0.0, 60.0, 10.0)
+    time = START + (np.arange(0.0, 60.0, 10.0) * 60e9).astype("timedelta64[ns]")
+    slope = 20.0 + 0.01 * (350.0 - x)
+    frames = np.broadcast_to(slope, (time.size, y.size, x.size)) + 0.1 * np.arange(time.size)[:, None, None]
+    fields = xr.Dataset(
+        {
+            "frame_temperature": (("time", "y", "x"), frames),
+            "temperature_u": (("cycle", "y", "x"), np.full((10, y.size, x.size), 0.7)),
+        },
+        coords={"time": time, "y": y, "x": x},
+    )
+    seen = see_material(fields, AxisGeometry((350.0, 30.0), (-1.0, 0.0)), readings)
+    minutes = (readings["time"].values - START) / np.timedelta64(1, "m")
+    expected = 20.0 + 0.01 * readings["position"].values / 2 + 0.01 * minutes
+    np.testing.assert_allclose(seen.temperature.values, expected, atol=1e-6)
+    # Noise and the data sheet's +-2 K, taken as a rectangle.
+    assert seen.u_K == pytest.approx(np.hypot(0.7, 2 / 3**0.5))
+
+
+def test_a_campaign_with_the_camera_as_thermometer(campaign_folder: Path, results_folder: Path) -> None:
+    text = (campaign_folder / "campaign.toml").read_text()
+    asked = text.replace(
+        "[interferometry]\n", '[interferometry]\ncompensation = "redo"\nmaterial_temperature = "camera"\n'
+    )
+    other = campaign_folder / "camera.toml"
+    other.write_text(asked)
+    source = read_source(load_campaign(other, effect_names=drift_model.effect_names()))
+    recorded = read_source(load_campaign(campaign_folder / "campaign.toml", effect_names=drift_model.effect_names()))
+    assert source.deviations.identical(recorded.deviations)
+    source, notices = compensate_by_camera(source, read_dataset(results_folder / "fields.nc"))
+    assert "the temperature that the camera saw along the axis" in notices[0].message
+    found = evaluate_interferometry(source)
+    # Twice the length moves twice as far, but for the temperature along it; at the laser's zero nothing moves.
+    added = (source.deviations["deviation"] - recorded.deviations["deviation"]).mean(("cycle", "direction")).values
+    along = np.argsort(source.deviations["position"].values)
+    assert abs(added[along[0]]) < 0.05 < abs(added[along[-1]])
+    np.testing.assert_allclose(found.dataset["material_u"], source.deviations["material_u"])
+    plain = evaluate_interferometry(recorded)
+    # The camera's temperature enters E and A along the axis, but cancels where both directions meet at one place.
+    assert found.parts["iso230"]["E_um"]["u"] > 3 * plain.parts["iso230"]["E_um"]["u"]
+    assert found.parts["iso230"]["B_um"]["u"] == pytest.approx(plain.parts["iso230"]["B_um"]["u"], rel=0.2)

@@ -1,0 +1,127 @@
+"""Causes of odd positions: each is named where it is plain, none where the data do not decide."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from fusion.diagnosis.diagnose import CHECKS, THRESHOLDS, diagnose
+from fusion.diagnosis.explanations import DiagnosisError, fit_slow, local_residuals
+from tests.fusion import film_simulator as simulator
+from tests.fusion.residual_simulator import CAUSES, odd_position
+
+
+@dataclass(frozen=True)
+class Flag:
+    target: int
+    direction: str = "both"
+
+
+@pytest.mark.parametrize("cause", ["structural", "local_temperature", "step", "stick_slip", "one_direction", "slow"])
+def test_a_plain_effect_gets_its_name(cause):
+    """At 0.6 um beside 0.4 um of noise, twice the size that the thresholds are set for."""
+    found = [
+        diagnose([Flag(3)], odd_position(cause, np.random.default_rng([seed, 5]), rms_um=0.6))[0].cause
+        for seed in range(3)
+    ]
+    assert found.count(CAUSES[cause]) >= 2, found
+    assert "local_temperature" not in found or cause == "local_temperature"
+
+
+def test_the_step_is_dated_and_measured(rng):
+    fused = odd_position("structural", rng, rms_um=0.0)
+    deviation = fused["deviation"].values.copy()
+    deviation[60:, :, 2] += 1.0
+    fused["deviation"] = (fused["deviation"].dims, deviation)
+    found = diagnose([Flag(3)], fused)[0]
+    assert found.cause == "step"
+    # The first reading after the step is that of cycle 61.
+    assert abs(found.evidence["step_cycle"] - 61) <= 1
+    assert found.evidence["step_um"] == pytest.approx(1.0, abs=4 * found.evidence["step_u_um"])
+    assert any("step of +" in sentence for sentence in found.for_it)
+    assert found.check == CHECKS["step"]
+
+
+def test_sensitivity_and_lag_of_a_local_temperature(rng):
+    fused = odd_position("structural", rng, rms_um=0.0)
+    rise = fused["local_rise_series"].values[:, 2]
+    response = simulator.first_order(rise - rise[0], 1800.0)
+    deviation = fused["deviation"].values.copy()
+    deviation[:, :, 2] += 0.3 * response[:, None]
+    fused["deviation"] = (fused["deviation"].dims, deviation)
+    found = diagnose([Flag(3)], fused)[0]
+    assert found.cause == "local_temperature"
+    assert found.evidence["temperature_lag_s"] == 1800.0
+    u = found.evidence["temperature_u_um_per_K"]
+    assert found.evidence["temperature_um_per_K"] == pytest.approx(0.3, abs=4 * u)
+    assert found.evidence["temperature_held_out_nats"] > 0
+
+
+def test_a_local_warm_up_is_not_called_a_cause(rng):
+    fused = odd_position("structural", rng, rms_um=0.0)
+    warm = 3.0 * (1 - np.exp(-np.arange(100) * simulator.PERIOD_S / 4500.0))
+    fused["local_rise_series"] = (("frame_time", "target"), np.tile(warm[:, None], (1, 16)))
+    deviation = fused["deviation"].values.copy()
+    deviation[:, :, 2] += warm[:, None]
+    fused["deviation"] = (fused["deviation"].dims, deviation)
+    found = diagnose([Flag(3)], fused)[0]
+    assert found.cause == "undetermined"
+    assert found.evidence["temperature_warm_up_share"] > 0.98
+
+
+def test_without_a_camera_the_other_causes_are_still_judged(rng):
+    fused = odd_position("structural", rng, rms_um=0.6).drop_vars("local_rise_series")
+    found = diagnose([Flag(3)], fused)[0]
+    assert found.cause == "structural"
+    assert "temperature_p" not in found.evidence
+
+
+def test_one_direction_alone_can_be_diagnosed(rng):
+    fused = odd_position("step", rng, rms_um=0.8).sel(direction=["positive"])
+    found = diagnose([Flag(3, "positive")], fused)[0]
+    assert found.evidence["probability_step"] > 0.5
+    assert np.isnan(found.evidence["step_held_out_nats"])
+
+
+def test_probabilities_sum_to_one_and_follow_the_anomalies(rng):
+    fused = odd_position("structural", rng)
+    found = diagnose([Flag(3), Flag(7, "positive"), Flag(3, "negative")], fused)
+    assert [(one.target, one.direction) for one in found] == [(3, "both"), (7, "positive"), (3, "negative")]
+    for one in found:
+        total = sum(value for name, value in one.evidence.items() if name.startswith("probability_"))
+        assert total == pytest.approx(1.0)
+        assert one.cause == "undetermined" or one.probability >= THRESHOLDS[one.cause]
+
+
+def test_the_residual_is_free_of_drift_and_has_the_noise_of_a_reading(rng):
+    fused = odd_position("structural", rng, rms_um=0.0)
+    residual = local_residuals(fused, 3, {3})
+    # 200 readings know their scatter to 5 %, the 15 other targets theirs to 1 %; levels and stretches of each pass cost 4 %.
+    assert np.std(residual.values) == pytest.approx(0.4, rel=0.2)
+    assert residual.typical_um == pytest.approx(0.4, rel=0.1)
+    slow = fit_slow(residual)
+    assert slow.shared - slow.white < 3.0
+
+
+def test_missing_readings_are_tolerated(rng):
+    fused = odd_position("structural", rng, rms_um=0.6)
+    gone = rng.random(fused["deviation"].shape) < 0.1
+    fused["deviation"] = fused["deviation"].where(~gone)
+    assert diagnose([Flag(3)], fused)[0].cause == "structural"
+
+
+def test_an_unknown_target_is_refused(rng):
+    with pytest.raises(DiagnosisError, match=r"target 40 is not among the measured targets \[1, 2, 3"):
+        diagnose([Flag(40)], odd_position("structural", rng))
+
+
+def test_too_few_sound_targets_are_refused(rng):
+    flags = [Flag(target) for target in range(1, 15)]
+    with pytest.raises(DiagnosisError, match="only 2 targets are free of anomalies"):
+        diagnose(flags, odd_position("structural", rng))
+
+
+def test_too_few_cycles_are_refused(rng):
+    fused = odd_position("structural", rng).isel(cycle=slice(0, 8))
+    with pytest.raises(DiagnosisError, match="target 3 has readings in 8 cycles; a diagnosis needs 12"):
+        diagnose([Flag(3)], fused)

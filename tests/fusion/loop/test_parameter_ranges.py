@@ -1,0 +1,63 @@
+"""How well nonlinear parameters are known, by profile likelihood."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fusion.effects.candidates import Member, pitch_error_members
+from fusion.loop.scoring import parameter_ranges
+from fusion.report.model_section import parameters_with_ranges
+from tests.fusion.loop_bench import readings_of
+
+NOTHING = np.empty((0, 1))
+
+
+def state(minutes: float, follows: str = "duty") -> Member:
+    return Member(NOTHING, {"follows": follows, "time_constant_min": minutes}, ("um",))
+
+
+def test_a_range_ends_where_the_likelihood_has_fallen_by_two():
+    near = [state(minutes) for minutes in (10.0, 20.0, 30.0, 40.0, 50.0)]
+    found = parameter_ranges(near, np.array([1.0, 8.5, 10.0, 9.0, 7.0]), near[2], 10.0)
+    assert found == {"time_constant_min": [10.0, 50.0]}
+
+
+def test_a_range_is_open_where_the_neighbourhood_ends_first():
+    near = [state(minutes) for minutes in (10.0, 20.0, 30.0)]
+    assert parameter_ranges(near, np.array([9.0, 10.0, 9.5]), near[1], 10.0) == {"time_constant_min": [None, None]}
+    assert parameter_ranges(near, np.array([5.0, 9.9, 10.0]), near[2], 10.0) == {"time_constant_min": [10.0, None]}
+
+
+def test_a_state_that_fits_as_well_is_told_and_does_not_widen_the_numbers():
+    near = [state(10.0), state(20.0), state(30.0), state(80.0, "warm_up"), state(90.0, "mean_rise")]
+    found = parameter_ranges(near, np.array([5.0, 10.0, 5.0, 9.0, 7.9]), near[1], 10.0)
+    assert found == {"follows": ["warm_up"], "time_constant_min": [10.0, 30.0]}
+
+
+@pytest.mark.parametrize(
+    ("ranges", "words"),
+    [
+        ({}, "follows duty, time constant / min 20.0"),
+        (
+            {"follows": ["warm_up"], "time_constant_min": [10.0, 30.0]},
+            "follows duty (or warm up), time constant / min 20.0 (10.0 to 30.0)",
+        ),
+        ({"time_constant_min": [None, 30.0]}, "follows duty, time constant / min 20.0 (at most 30.0)"),
+        ({"time_constant_min": [10.0, None]}, "follows duty, time constant / min 20.0 (at least 10.0)"),
+        ({"time_constant_min": [None, None]}, "follows duty, time constant / min 20.0 (not determined)"),
+    ],
+)
+def test_ranges_are_printed_beside_the_values(ranges, words):
+    assert parameters_with_ranges({"follows": "duty", "time_constant_min": 20.0}, ranges) == words
+
+
+def test_a_closer_look_stays_among_waves_that_a_screw_can_make():
+    """Half a travel is the longest wave that is tried; the states that scale it are all offered again."""
+    readings = readings_of(seed=3)
+    travel = float(np.ptp(readings.positions_mm))
+    longest = next(member for member in pitch_error_members(readings, {}, None))
+    assert longest.parameters["period_mm"] == pytest.approx(travel / 2)
+    near = list(pitch_error_members(readings, {}, longest))
+    assert max(member.parameters["period_mm"] for member in near) <= travel / 2 * 1.001
+    assert {member.parameters["follows"] for member in near} == {"mean_rise", "duty", "warm_up"}

@@ -1,0 +1,128 @@
+"""What the command makes of drift and field: regions, hotspots, randomised duty, and the words for them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+import xarray as xr
+
+from fusion.campaign.config import CampaignError, load_campaign
+from fusion.campaign.inputs import read_source
+from fusion.pipeline.attribution import correlate_field
+from fusion.pipeline.interferometry import align_recordings
+from fusion.products.grouped import correlation_of, group
+from fusion.products.progress import silent
+from fusion.products.results import results_schema
+from fusion.products.store import read_dataset
+from fusion.report.attribution_section import describe_correlation
+from fusion.twin.machine.recipe import Duty
+from fusion.twin.machine.schedule import duty_levels
+from interferometry.io.readers import read_deviations
+
+
+@pytest.fixture(scope="module")
+def campaign(campaign_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small campaign with a load that was switched at random, and one region of its own."""
+    folder = shutil.copytree(campaign_folder, tmp_path_factory.mktemp("switched") / "campaign")
+    path = folder / "drivers.csv"
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    seconds = 60.0 * np.arange(len(rows) - 1)
+    levels = duty_levels(Duty("randomised", mean_hold_min=10.0, least_hold_min=3.0), seconds, 5)
+    lines = [
+        "time,spindle [1/min]",
+        *(f"{row[0]},{3000 * level:.0f}" for row, level in zip(rows[1:], levels, strict=True)),
+    ]
+    path.write_text("\n".join(lines) + "\n")
+    (folder / "regions.csv").write_text("name,x_mm,y_mm\nmotor,100,20\nmotor,300,20\nmotor,300,160\nmotor,100,160\n")
+    toml = folder / "campaign.toml"
+    text = toml.read_text().replace(
+        'fiducials = "fiducials.csv"', 'fiducials = "fiducials.csv"\nregions = "regions.csv"'
+    )
+    law = 'file = "drivers.csv"\nrandomised = ["spindle [1/min]"]\nmean_dwell = "10 min"\nleast_dwell = "3 min"'
+    toml.write_text(text.replace('file = "drivers.csv"', law))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def outcome(campaign: Path, results_folder: Path) -> tuple[xr.Dataset, dict[str, object], xr.Dataset]:
+    source = read_source(load_campaign(campaign / "campaign.toml"))
+    fields = read_dataset(results_folder / "fields.nc")
+    fused, _ = align_recordings(source, fields, read_deviations(campaign / "laser.csv"))
+    found = correlate_field(source, fields, fused, report=silent)
+    return found.dataset, dict(found.parts), fused
+
+
+def test_the_part_of_the_results_keeps_the_schema(outcome) -> None:
+    _, parts, _ = outcome
+    document = {"schema": 1, "campaign": "x", "warnings": [], **json.loads(json.dumps(parts))}
+    jsonschema.Draft202012Validator(results_schema()).validate(document)
+
+
+def test_regions_and_hotspots_are_tested_by_name(outcome) -> None:
+    maps, parts, _ = outcome
+    names = [one["name"] for one in parts["correlation"]["regions"]]
+    assert names[0] == "motor"
+    assert names[1:] == [f"hotspot {k}" for k in range(1, len(names))]
+    assert set(parts["correlation"]["regions"][0]["parts"]) == {"common", "proportional", "reversal", "joint"}
+    assert maps["target_regions_p_value"].sizes == {"series": 12, "region": len(names)}
+    assert len(parts["hotspots"]) >= len(names) - 1
+
+
+def test_the_switched_load_gets_its_own_verdict(outcome) -> None:
+    _, parts, _ = outcome
+    (spindle,) = parts["correlation"]["randomised_duty"]
+    assert spindle["name"] == "spindle"
+    # The log was replaced by a schedule that has nothing to do with the drift.
+    assert spindle["p_value"] > 0.05 and spindle["cause"] is False
+
+
+def test_the_report_says_it_in_words(outcome) -> None:
+    maps, parts, fused = outcome
+    whole = fused.assign({f"correlation_{name}": array for name, array in maps.data_vars.items()})
+    whole = whole.assign_attrs({f"correlation_{name}": value for name, value in maps.attrs.items()})
+    xr.testing.assert_equal(group(correlation_of(whole), "duty"), group(maps, "duty"))
+    assert correlation_of(whole).attrs["verdict"] == maps.attrs["verdict"]
+    said = describe_correlation(whole, parts, None)
+    assert said is not None
+    assert said["duty"][0][0] == "spindle" and said["duty"][0][-1] == "not shown"
+    assert "False alarms of this map" in said["captions"]["cells"]
+    assert said["tell"] and said["headline"]
+    assert said["sensors"]["text"].endswith("of left-out cycles.")
+
+
+@pytest.mark.parametrize(
+    ("law", "message"),
+    [
+        ('randomised = ["spindle [1/min]"]', "randomised and mean_dwell belong together"),
+        (
+            'randomised = ["spindle [1/min]"]\nmean_dwell = "2 min"\nleast_dwell = "3 min"',
+            "least_dwell 180 s must be shorter than mean_dwell 120 s",
+        ),
+    ],
+)
+def test_half_a_law_is_refused(campaign: Path, tmp_path: Path, law: str, message: str) -> None:
+    folder = shutil.copytree(campaign, tmp_path / "campaign")
+    toml = folder / "campaign.toml"
+    lines = [
+        line
+        for line in toml.read_text().splitlines()
+        if not line.startswith(("randomised", "mean_dwell", "least_dwell"))
+    ]
+    toml.write_text("\n".join(lines).replace('file = "drivers.csv"', f'file = "drivers.csv"\n{law}'))
+    with pytest.raises(CampaignError, match=message):
+        load_campaign(toml)
+
+
+def test_the_twin_switches_by_the_law_that_it_states() -> None:
+    seconds = 20.0 * np.arange(120_000)
+    levels = duty_levels(Duty("randomised", mean_hold_min=30.0, least_hold_min=5.0), seconds, 1)
+    holds = np.diff(seconds[np.flatnonzero(np.diff(levels))])
+    assert set(np.unique(levels)) == {0.0, 1.0}
+    assert holds.min() >= 300.0
+    # About 1,300 holds of spread 25 min: standard error 0.7 min; 4 sigma.
+    assert holds.mean() / 60.0 == pytest.approx(30.0, abs=2.8)

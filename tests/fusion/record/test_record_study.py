@@ -1,0 +1,52 @@
+"""How often the loop on a record is right: campaigns of the twin, run by `make soak`; the documentation quotes these figures."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from fusion.record.blocks import reduce_record
+from fusion.record.loop import open_seal
+from fusion.record.search import declare, seal, search
+from fusion.twin.machine.recipe import EffectRecipe
+from tests.fusion.record_tables import twin_table
+
+pytestmark = pytest.mark.slow
+
+RUNS = int(os.environ.get("THERMOFUSE_RUNS", "30"))
+FIRST_SEED = 7000
+#: One missing effect at a time; a record of 24 h, 10 sensors, 3 channels, 0.3 um noise.
+KINDS = {
+    "none": None,
+    "unseen_heat_source": EffectRecipe("unseen_heat_source", 1.5),
+    "step_event": EffectRecipe("step_event", 1.0, parameters={"at_cycle": 11}),
+    "periodic_disturbance": EffectRecipe("periodic_disturbance", 0.6, parameters={"period_min": 37.0}),
+    "thermal_lag": EffectRecipe("thermal_lag", 1.0),
+}
+
+
+def test_rates_of_names_on_records(capsys: pytest.CaptureFixture[str]) -> None:
+    wrong, rows = {}, []
+    for kind, effect in KINDS.items():
+        names: Counter[tuple[str, ...]] = Counter()
+        before, after = [], []
+        for seed in range(FIRST_SEED, FIRST_SEED + RUNS):
+            record = reduce_record(twin_table(*([effect] if effect else []), seed=seed))
+            train, _ = seal(record)
+            found, _, sealed = open_seal(search(record, train, declare(["quasi_static"], record)))
+            names[tuple(score.name for score, _ in found.entries)] += 1
+            before.append(sealed[0].mean())
+            after.append(sealed[-1].mean())
+        right = sum(count for found_names, count in names.items() if found_names == ((kind,) if effect else ()))
+        wrong[kind] = sum(count for found_names, count in names.items() if set(found_names) - {kind})
+        rows.append(
+            f"{kind:22s} right alone {right}/{RUNS}, a wrong name {wrong[kind]}/{RUNS}, "
+            f"sealed error {np.median(before):.2f} -> {np.median(after):.2f} um   {dict(names)}"
+        )
+    with capsys.disabled():
+        print("\n" + "\n".join(rows))
+    # Twice the error that the level of the search allows, plus three standard deviations of a count of RUNS.
+    assert wrong["none"] <= 0.1 * RUNS + 3.0 * np.sqrt(0.1 * 0.9 * RUNS)

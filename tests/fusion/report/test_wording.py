@@ -1,0 +1,79 @@
+"""Numbers and verdicts in words: digits follow the uncertainty, every verdict has its sentence, remedies come in order."""
+# ruff: noqa: E501 - sentences are quoted whole
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fusion.report import wording
+
+
+@pytest.mark.parametrize(
+    ("value", "u", "text"),
+    [
+        (9.9017, 1.378, "9.9 ± 2.8 µm"),
+        (0.05512, 0.0023, "0.0551 ± 0.0046 µm"),
+        (-123.4, 20.0, "−123 ± 40 µm"),
+        (1.5, None, "1.50 µm"),
+        (1.5, 0.0, "1.50 µm"),
+        (float("nan"), 1.0, "–"),
+        (None, None, "–"),
+    ],
+)
+def test_a_value_has_the_digits_of_its_uncertainty(value: float | None, u: float | None, text: str) -> None:
+    assert wording.measured(value, u, "µm") == text
+
+
+def test_small_things_read_well() -> None:
+    assert wording.p_value(0.0004) == "< 0.001" and wording.p_value(0.0123) == "0.012" and wording.p_value(None) == "–"
+    assert wording.duration(90) == "90 s" and wording.duration(1800) == "30 min" and wording.duration(25200) == "7.0 h"
+    assert wording.join(["a", "b", "c"]) == "a, b and c" and wording.join(["a"]) == "a" and wording.join([]) == ""
+    assert wording.moment(np.datetime64("2026-03-09T06:30:05")) == "2026-03-09 06:30 UTC"
+
+
+def loop(verdict: str, *effects: str, shape: str = "") -> dict[str, Any]:
+    return {
+        "verdict": verdict,
+        "steps": [{"effect": name} for name in effects],
+        "unexplained": {"shape": shape, "rms_um": 0.2},
+        "rmse_declared_um": 1.94,
+        "rmse_final_um": 0.66,
+        "noise_floor_um": 0.42,
+    }
+
+
+@pytest.mark.parametrize(
+    ("found", "sentence"),
+    [
+        (loop("complete"), "The declared model explains the drift; nothing in these data shows that an effect is missing."),
+        (loop("explained", "step_event"), "The declared model lacked an effect: sudden step. With it, nothing is left that these data can show."),
+        (
+            loop("explained", "step_event", "dead_path"),
+            "The declared model lacked 2 effects: sudden step and dead path of the laser. With them, nothing is left that these data can show.",
+        ),
+        (
+            loop("partial", "step_event", shape="a wave of 37 min"),
+            "The declared model lacked an effect: sudden step. With it, something without a name is left (a wave of 37 min).",
+        ),
+        (loop("unexplained"), "Something is left that no effect of the library explains (without a clear shape)."),
+    ],
+)  # fmt: skip
+def test_every_verdict_has_its_sentence(found: dict[str, Any], sentence: str) -> None:
+    assert wording.verdict_headline(found) == sentence
+
+
+def test_next_steps_start_with_the_model_and_leave_out_what_asks_for_nothing() -> None:
+    results = {
+        "loop": loop("partial", "dead_path"),
+        "anomalies": [{"target": 3, "cause": "structural"}],
+        "warnings": [{"remedy": "Nothing has to be done: it is fine."}, {"remedy": "Start the camera earlier."}],
+    }
+    first, second, third, last = wording.next_steps(results)
+    assert first == wording.EFFECTS["dead_path"][1]
+    assert second.startswith("Log more of what happens at the machine")
+    assert third.startswith("Position 3: ") and last == "Start the camera earlier."
+    quiet = {"loop": loop("complete"), "anomalies": [], "warnings": []}
+    assert wording.next_steps(quiet) == ["Nothing has to be done: use the profile and its uncertainty as they are."]

@@ -1,0 +1,227 @@
+"""The twin writes what a laboratory would leave, and nothing of the truth stands where the analysis looks."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from fusion.twin import simulate
+from fusion.twin.datasets import deviations_of, fields_of
+from fusion.twin.instruments import simulate_campaign, truth_folder, write_campaign
+from fusion.twin.machine.recipe import EffectRecipe, Recipe, RecipeError
+from fusion.twin.recipe_file import read_recipe
+from interferometry.contract import DEVIATIONS
+from interferometry.io.readers import read_deviations, read_environment
+from thermography.contract import FIELDS
+from thermography.io.flir import index_frames, read_frame
+
+RECIPE = """
+[campaign]
+title = "Three cycles"
+seed = 4
+[test]
+cycles = 3
+missing_fraction = 0.05
+[camera]
+clock_offset_s = 37.0
+state_clock_offset = false
+[[effect]]
+name = "unseen_heat_source"
+amplitude_um = 0.8
+[[anomaly]]
+target = 3
+"""
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("twin")
+    (folder / "RECIPE.toml").write_text(RECIPE, encoding="utf-8")
+    return simulate_campaign(folder / "RECIPE.toml", folder / "out")
+
+
+@pytest.fixture(scope="module")
+def truth(campaign) -> xr.Dataset:
+    with xr.open_dataset(truth_folder(campaign.parent) / "truth.nc", engine="h5netcdf") as dataset:
+        return dataset.load()
+
+
+def test_campaign_file_names_what_is_there(campaign):
+    content = tomllib.loads(campaign.read_text(encoding="utf-8"))
+    folder = campaign.parent
+    assert content["campaign"]["title"] == "Three cycles"
+    assert len(list(folder.glob(content["thermography"]["frames"][0]))) == 3
+    for table, key in (
+        ("plan", "fiducials"),
+        ("interferometry", "deviations"),
+        ("interferometry", "environment"),
+        ("drivers", "file"),
+    ):
+        assert (folder / content[table][key]).is_file()
+    assert "clock_offset" not in content["thermography"]
+
+
+def test_truth_stands_beside_the_campaign_and_is_not_told_in_it(campaign):
+    beside = truth_folder(campaign.parent)
+    assert {path.name for path in beside.iterdir()} == {"truth.nc", "truth.json"}
+    assert beside.parent == campaign.parent.resolve().parent
+    for path in campaign.parent.rglob("*"):
+        assert "truth" not in path.name
+        if path.suffix in (".toml", ".csv"):
+            text = path.read_text(encoding="utf-8")
+            assert "unseen_heat_source" not in text
+            assert "structural" not in text
+
+
+def test_truth_json_says_what_was_done(campaign, truth):
+    content = json.loads((truth_folder(campaign.parent) / "truth.json").read_text(encoding="utf-8"))
+    assert content["undeclared"] == ["unseen_heat_source"]
+    assert content["anomalies"][0]["target"] == 3
+    assert content["clock_offset_s"] == 37.0
+    assert content["parts_rms_um"]["unseen_heat_source"] == pytest.approx(0.8)
+    assert set(content["parts_rms_um"]) <= set(truth.data_vars)
+
+
+def test_laser_file_holds_the_readings_that_were_not_lost(campaign, truth):
+    read = read_deviations(campaign.parent / "laser.csv")
+    lost = truth["deviation"].isnull().values
+    assert 0 < lost.sum() < lost.size / 4
+    assert np.array_equal(np.isnan(read["deviation"].values), lost)
+    # written with four decimals
+    np.testing.assert_allclose(read["deviation"].values[~lost], truth["deviation"].values[~lost], atol=0.6e-4)
+    assert np.array_equal(read["time"].values[~lost], truth["time"].values[~lost])
+    np.testing.assert_allclose(read["position"].values, np.arange(16) * 20.0)
+
+
+def test_frames_carry_the_cameras_clock_and_settings(campaign):
+    references, rejected = index_frames(sorted((campaign.parent / "thermal").glob("*.jpg")))
+    assert rejected == []
+    # 194 s to the last reading, 30 s later the frame, 37 s of a camera clock that is ahead
+    assert [str(r.time) for r in references][:2] == ["2026-03-09T06:34:21.000", "2026-03-09T06:38:33.000"]
+    frame = read_frame(campaign.parent / "thermal" / "IR_0001.jpg")
+    assert frame.counts.shape == (480, 640)
+    assert frame.parameters.emissivity == pytest.approx(0.97)
+    assert frame.parameters.object_distance_m == pytest.approx(1.76)
+    assert frame.parameters.planck_r1 == pytest.approx(21106.77, abs=0.01)
+    assert frame.camera.model == "FLIR SC660"
+    assert 296.0 < frame.housekeeping["TSShutter"] < 300.0
+
+
+def test_environment_and_drivers_cover_the_test(campaign):
+    environment = read_environment(campaign.parent / "environment.csv")
+    assert environment.sizes["time"] == 13
+    assert float(abs(environment["air_pressure"] - 1000.0).max()) < 3.0
+    rows = (campaign.parent / "drivers.csv").read_text(encoding="utf-8").splitlines()
+    assert rows[0] == "time,duty [1]"
+    assert rows[1].startswith("2026-03-09T06:30:00.000+00:00,")
+
+
+def test_same_recipe_writes_the_same_bytes(campaign, tmp_path):
+    again = simulate_campaign(campaign.parent.parent / "RECIPE.toml", tmp_path / "again")
+    names = sorted(p.relative_to(campaign.parent) for p in campaign.parent.rglob("*") if p.is_file())
+    assert len(names) == 8
+    for name in names:
+        assert (again.parent / name).read_bytes() == (campaign.parent / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("taken", ["out", "out-truth"])
+def test_folder_that_holds_something_is_refused(tmp_path, taken):
+    (tmp_path / "RECIPE.toml").write_text("", encoding="utf-8")
+    (tmp_path / taken).mkdir()
+    (tmp_path / taken / "precious.txt").write_text("mine", encoding="utf-8")
+    with pytest.raises(
+        RecipeError, match=rf"{taken} exists and is not an empty folder; name another output folder or empty it"
+    ):
+        simulate_campaign(tmp_path / "RECIPE.toml", tmp_path / "out")
+    assert [p.name for p in (tmp_path / taken).iterdir()] == ["precious.txt"]
+
+
+def test_empty_folder_is_used_and_progress_is_told(tmp_path):
+    (tmp_path / "out").mkdir()
+    told = []
+    write_campaign(
+        simulate(Recipe().vary(test={"cycles": 2})), tmp_path / "out", progress=lambda *step: told.append(step)
+    )
+    assert told == [(1, 2, "render frames"), (2, 2, "render frames")]
+
+
+def test_moving_table_is_written_as_a_sequence(tmp_path):
+    recipe = Recipe().vary(test={"cycles": 1}, camera={"table": "moving", "file": "seq", "frame_interval_s": 40.0})
+    path = write_campaign(simulate(recipe), tmp_path / "out")
+    assert 'table = "moving"' in path.read_text(encoding="utf-8")
+    references, rejected = index_frames([tmp_path / "out" / "thermal" / "IR_0001.seq"])
+    assert (len(references), rejected) == (6, [])
+    with xr.open_dataset(tmp_path / "out-truth" / "truth.nc", engine="h5netcdf") as truth:
+        assert truth.sizes["frame"] == 6
+        assert float(truth["table_position"].max()) > 100.0
+
+
+def test_rtl_holds_the_same_deviations(tmp_path):
+    truth = simulate(Recipe().vary(test={"cycles": 2}, laser={"file": "rtl"}))
+    write_campaign(truth, tmp_path / "out")
+    read = read_deviations(tmp_path / "out" / "laser.rtl")
+    np.testing.assert_allclose(read["deviation"].values, truth.readings["deviation"].values, atol=0.6e-4)
+
+
+def test_datasets_without_files_keep_the_contracts():
+    truth = simulate(Recipe().vary(test={"cycles": 5, "missing_fraction": 0.1}))
+    for dataset, contract in ((deviations_of(truth), DEVIATIONS), (fields_of(truth), FIELDS)):
+        for name, (dims, units, kind) in contract.items():
+            assert dataset[name].dims == dims, name
+            assert dataset[name].dtype.kind == kind, name
+            assert dataset[name].attrs.get("units", "") == units, name
+    deviations = deviations_of(truth)
+    assert np.array_equal(np.isnat(deviations["time"].values), np.isnan(deviations["deviation"].values))
+
+
+def test_fields_without_files_are_cell_means_with_the_frames_noise():
+    truth = simulate(Recipe().vary(test={"cycles": 6}))
+    quiet, noisy = fields_of(truth, noise_K=0.0), fields_of(truth)
+    fine_x, fine_y = np.arange(0.25, 700, 0.5)[600:610], np.arange(0.25, 180, 0.5)[150:160]
+    cell = truth.temperature(truth.session.frame_s, fine_x, fine_y).mean(axis=(1, 2))
+    np.testing.assert_allclose(quiet["temperature"].sel(x=302.5, y=77.5), cell, atol=1e-4)
+    noise = (noisy["temperature"] - quiet["temperature"]).std()
+    # 50 mK over 18.9 pixels of 5 mm
+    assert float(noise) == pytest.approx(0.0115, abs=0.0005)
+
+
+def test_burst_lowers_the_noise_of_a_cycle_and_shows_its_spread():
+    one, many = (simulate(Recipe().vary(test={"cycles": 4}, camera={"frames_per_cycle": n})) for n in (1, 16))
+    quiet = fields_of(many, noise_K=0.0)["temperature"]
+    left = [float((fields_of(truth)["temperature"] - quiet).std()) for truth in (one, many)]
+    # 22,680 values of noise; within three seconds the table itself moves by well under 1 mK
+    assert left[0] / left[1] == pytest.approx(4.0, rel=0.05)
+    assert float(fields_of(many)["temperature_spread"].mean()) == pytest.approx(0.0115 * np.sqrt(15 / 16), rel=0.05)
+
+
+def test_fields_without_files_show_what_the_camera_adds():
+    effects = (EffectRecipe("camera_offset", amplitude_K=0.5, parameters={"at_cycle": 3}),)
+    spot = (EffectRecipe("reflected_source", amplitude_K=40.0, parameters={"follows": "constant"}),)
+    plain = fields_of(simulate(Recipe().vary(test={"cycles": 6})), noise_K=0.0)["temperature"]
+    lifted = fields_of(simulate(Recipe().vary(test={"cycles": 6}, effect=effects)), noise_K=0.0)["temperature"] - plain
+    np.testing.assert_allclose(lifted.mean(["y", "x"]), [0, 0, 0.5, 0.5, 0.5, 0.5], atol=1e-12)
+    mirrored = fields_of(simulate(Recipe().vary(test={"cycles": 6}, effect=spot)), noise_K=0.0)["temperature"] - plain
+    peak = mirrored[-1].argmax(["y", "x"])
+    # the spot's centre lies on the border of two cells in x and of two in y
+    assert abs(float(mirrored["x"][peak["x"]]) - 480.0) == 2.5
+    assert abs(float(mirrored["y"][peak["y"]]) - 60.0) == 2.5
+    # 3 % of 40 K over 97 %, warmed up to 99 %
+    assert float(mirrored[-1].max()) == pytest.approx(1.23, abs=0.05)
+
+
+def test_fields_of_a_moving_table_need_frames():
+    with pytest.raises(ValueError, match=r"fields_of needs camera\.table = 'still'; write the campaign"):
+        fields_of(simulate(Recipe().vary(test={"cycles": 2}, camera={"table": "moving"})))
+
+
+def test_truth_holds_the_cell_means_of_the_true_field(campaign, truth):
+    again = simulate(read_recipe(campaign.parent.parent / "RECIPE.toml"))
+    expected = again.temperature(again.session.frame_s, truth["x"].values, truth["y"].values, cell_mm=2.5)
+    # stored as float32
+    np.testing.assert_allclose(truth["temperature"].values, expected, atol=5e-6)
+    assert np.array_equal(truth["field_time"].values, again.clock(again.session.frame_s).astype("datetime64[ns]"))

@@ -1,0 +1,154 @@
+"""A recipe says what it means or is refused with file, key, value and remedy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fusion.twin.machine.effects import EFFECTS
+from fusion.twin.machine.recipe import AnomalyRecipe, EffectRecipe, Recipe, RecipeError
+from fusion.twin.recipe_file import packaged_recipe, read_recipe
+from fusion.twin.simulate import simulate
+
+ROOT = Path(__file__).parents[3]
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "RECIPE.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("path", [ROOT / "data" / "demo.toml", packaged_recipe("paper")], ids=lambda path: path.stem)
+def test_shipped_recipes_are_valid(path):
+    assert read_recipe(path).test.targets == 16
+
+
+def test_empty_recipe_is_the_default(tmp_path):
+    assert read_recipe(write(tmp_path, "")) == Recipe()
+
+
+def test_tables_and_lists_reach_the_recipe(tmp_path):
+    text = """
+    [test]
+    positions_mm = [0, 11.5, 30]
+    [[source]]
+    name = "lamp"
+    x_mm = 10
+    y_mm = 20
+    spread_x_mm = 30
+    spread_y_mm = 30
+    power_W = 4
+    [[effect]]
+    name = "dead_path"
+    mm = 120
+    [[anomaly]]
+    target = 2
+    """
+    recipe = read_recipe(write(tmp_path, text))
+    assert recipe.test.positions_mm == (0.0, 11.5, 30.0)
+    assert recipe.source[0].power_W == 4.0
+    assert recipe.effect == (EffectRecipe("dead_path", parameters={"mm": 120}),)
+    assert recipe.anomaly == (AnomalyRecipe(2),)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "[test]\ncycels = 4",
+            r"RECIPE\.toml: unknown key 'test\.cycels', did you mean 'cycles'\?; known here: cycles",
+        ),
+        ("[tset]\n", r"unknown key 'tset', did you mean 'test'\?"),
+        ("[test]\ncycles = 4.5", r"test\.cycles = 4\.5; write a int"),
+        ("[test]\nfeed_mm_per_min = 'fast'", r"test\.feed_mm_per_min = 'fast'; write a finite number"),
+        ("[test]\nfeed_mm_per_min = nan", r"test\.feed_mm_per_min = nan; write a finite number"),
+        ("[test]\ncycles = 0", r"test\.cycles = 0; write a number above 0"),
+        ("[test]\ntargets = 1", r"test\.targets = 1; a positioning test needs at least 2"),
+        ("[test]\npositions_mm = 3", r"test\.positions_mm = 3; write a list"),
+        ("test = 3", r"test = 3; write a table, \[test\]"),
+        ("[duty]\nkind = 'wild'", r"duty\.kind = 'wild'; write one of random, constant, switched, randomised"),
+        (
+            "[duty]\nleast_hold_min = 40",
+            r"duty\.least_hold_min = 40\.?0?; write a number from 0 to below duty\.mean_hold_min",
+        ),
+        ("[plan]\ndirection = [-1, 1]", r"plan\.direction = \[-1\.0, 1\.0\]; write a unit vector such as \[-1, 0\]"),
+        ("[plan]\norigin_mm = [1]", r"plan\.origin_mm has 1 numbers; write two, \[x, y\]"),
+        ("[plan]\nfiducials_x_mm = [1]", r"fiducials_x_mm and plan\.fiducials_y_mm differ in length"),
+        ("[[source]]\nname = 'a'", r"source\[0\]\.x_mm is missing"),
+        ("[[effect]]\nname = 'slip'", r"effect 1: name = 'slip'; known: air_index, angular_growth"),
+        ("[[effect]]\nname = 'step_evnt'", r"did you mean 'step_event'\?"),
+        (
+            "[[effect]]\nname = 'step_event'\nat = 3",
+            r"effect 1 \(step_event\): unknown key 'at'.*; known: um, at_cycle, at_part",
+        ),
+        ("[[effect]]\nname = 'step_event'\nat_cycle = 'two'", r"at_cycle = 'two'; write a int such as 30"),
+        ("[[effect]]\nname = 'thermal_lag'\nshape = 'cubic'", r"shape = 'cubic'; write one of flat, linear"),
+        (
+            "[[effect]]\nname = 'dead_path'\namplitude_K = 1",
+            r"amplitude_K is for effects that only the camera sees; write amplitude_um",
+        ),
+        ("[[effect]]\nname = 'camera_offset'\namplitude_K = 1\namplitude_um = 1", r"are both given; keep one"),
+        ("[[anomaly]]\ntarget = 17", r"anomaly 1: target = 17; the test has targets 1 to 16"),
+        ("[[anomaly]]\ntarget = 3\nkind = 'odd'", r"anomaly\.kind = 'odd'; write one of structural"),
+        ("[test", r"RECIPE\.toml: is not TOML .*; mend the line"),
+    ],
+)
+def test_wrong_recipe_is_refused(tmp_path, text, message):
+    with pytest.raises(RecipeError, match=message):
+        read_recipe(write(tmp_path, text))
+
+
+def test_missing_recipe_is_refused(tmp_path):
+    with pytest.raises(
+        RecipeError, match=r"none\.toml: cannot be read \(No such file or directory\); name an existing"
+    ):
+        read_recipe(tmp_path / "none.toml")
+
+
+def test_unknown_packaged_recipe_names_those_there_are():
+    with pytest.raises(RecipeError, match=r"no packaged recipe 'nothing'; there are: .*paper"):
+        packaged_recipe("nothing")
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        (
+            {"test": {"period_s": 100.0}},
+            r"test\.period_s = 100\.0 is shorter than one cycle, 19\d\.\d s; raise it or the feed",
+        ),
+        ({"test": {"positions_mm": (0.0, 5.0, 4.0)}}, r"the target positions do not grow"),
+        (
+            {"camera": {"frame_after_s": 90.0}},
+            r"camera: the last frame of a cycle is due 28\d\.\d s after its start, past its end at 252",
+        ),
+        (
+            {"effect": (EffectRecipe("step_event", amplitude_um=1.0, parameters={"at_cycle": 90}),)},
+            r"effect step_event: nothing moves in this test, so it cannot be scaled to 1\.0 um rms",
+        ),
+        (
+            {"effect": (EffectRecipe("sensor_fault", amplitude_um=1.0, parameters={"kind": "stuck"}),)},
+            r"effect sensor_fault: a stuck sensor errs by what it misses; remove amplitude_um, or use kind = 'jump'",
+        ),
+        (
+            {"effect": (EffectRecipe("sensor_fault"), EffectRecipe("sensor_fault"))},
+            r"effect sensor_fault is there more than once; the twin has one of it",
+        ),
+        (
+            {"effect": (EffectRecipe("reflected_source", amplitude_um=1.0),)},
+            r"effect reflected_source: amplitude_um has no meaning for a spot; write amplitude_K",
+        ),
+    ],
+)
+def test_test_that_cannot_be_is_refused(tables, message):
+    with pytest.raises(RecipeError, match=message):
+        simulate(Recipe().vary(**tables))
+
+
+def test_library_holds_every_effect_that_the_analysis_names():
+    named = """thermal_lag unseen_heat_source dead_path air_index material_compensation angular_growth reversal_drift step_event
+    periodic_disturbance pitch_error camera_offset reflected_source laser_warm_up sensor_fault"""
+    outside = {"telegraph_switching", "travelling_chirp", "local_creep", "direction_scale"}
+    assert set(EFFECTS) == set(named.split()) | outside

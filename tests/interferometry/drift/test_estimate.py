@@ -1,0 +1,256 @@
+"""The joint estimate: against dense algebra, against the plain mean, and against simulated truth in single runs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from interferometry.deviations import OUTLIER, sort_readings
+from interferometry.drift.estimate import DriftDataError, estimate_drift, flag_outliers, state_weights, track_reversal
+from interferometry.drift.gls import average_drift
+from interferometry.drift.state_space import drift_system
+from tests.interferometry.simulated_campaigns import CYCLE_S, SIGMA_UM, simulate
+
+
+def dense_drift_covariance(seconds: np.ndarray, order: int, ratios: np.ndarray) -> np.ndarray:
+    """Prior covariance (components, n, components, n) of walks that start at zero at the first reading."""
+    t = seconds - seconds[0]
+    shorter, longer = np.minimum.outer(t, t), np.maximum.outer(t, t)
+    one = shorter if order == 1 else shorter**2 * (3 * longer - shorter) / 6
+    return np.einsum("ab,ij->aibj", np.diag(ratios), one)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_average_drift_agrees_with_dense_conditioning(order: int, rng: np.random.Generator) -> None:
+    n, ratios = 40, np.array([0.3, 0.1]) if order == 1 else np.array([2e-3, 1e-3])
+    seconds = np.sort(rng.uniform(0, 30, n))
+    loadings = np.column_stack([np.ones(n), rng.uniform(0, 1, n)])
+    variance = rng.uniform(0.5, 2.0, n)
+    observed = rng.random(n) < 0.9
+    weights = rng.uniform(0, 1, n)
+    y = rng.standard_normal((n, 2))
+    system = drift_system(
+        seconds,
+        loadings,
+        order=order,
+        ratios=ratios,
+        variance=variance,
+        observed=observed,  # type: ignore[arg-type]
+    )
+    average, covariance, with_drift = average_drift(system, weights, y)
+
+    prior = dense_drift_covariance(seconds, order, ratios)
+    seen = np.einsum("kc,ckbj->kbj", loadings, prior)
+    total = np.einsum("kbj,jb->kj", seen, loadings) + np.diag(variance)
+    seen, total = seen[observed], total[np.ix_(observed, observed)]
+    gain = np.linalg.solve(total, seen.reshape(seen.shape[0], -1))
+    mean = np.einsum("kp,kbj->bjp", y[observed], gain.reshape(-1, 2, n))
+    posterior = prior - np.einsum("kai,kbj->aibj", seen, gain.reshape(-1, 2, n))
+    np.testing.assert_allclose(average, np.einsum("j,bjp->bp", weights, mean), atol=1e-9)
+    np.testing.assert_allclose(covariance, np.einsum("i,aibj,j->ab", weights, posterior, weights), atol=1e-9)
+    np.testing.assert_allclose(with_drift, np.einsum("aibj,j->iab", posterior, weights), atol=1e-9)
+
+
+def test_with_complete_readings_the_profile_is_the_plain_mean(rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng)
+    estimated = estimate_drift(deviations, robust=False)
+    plain = deviations["deviation"].mean("cycle")
+    relative = (plain - plain.isel(target=0)).mean("direction")
+    # Both directions of a cycle pass every position at the same mean time, so that only the smoother's weights differ.
+    np.testing.assert_allclose(estimated["profile_relative"].mean("direction"), relative, atol=0.002)
+
+
+def test_profile_drift_and_scatter_come_back(rng: np.random.Generator) -> None:
+    deviations, truth = simulate(rng)
+    estimated = estimate_drift(deviations)
+    present = np.ones(truth.seconds.shape, dtype=bool)
+    profile = truth.mean_profile(present)
+    relative = profile - profile[:, :1]
+    error = (estimated["profile_relative"].values - relative).mean(axis=0)
+    # Both directions, 100 cycles: 0.4 * sqrt(2 / 200) = 0.040 um; 16 values scatter around it by less than half.
+    assert np.sqrt(np.mean(error**2)) < 0.06
+    assert np.sqrt(np.mean((estimated["scatter_position"].values - SIGMA_UM) ** 2)) < 0.033
+    drift = truth.profile + truth.drift - profile
+    inside = np.abs(estimated["drift"].values - drift) < 1.96 * estimated["drift_u"].values
+    assert inside.mean() > 0.85
+    assert float(estimated["sigma"]) == pytest.approx(SIGMA_UM, rel=0.04)
+    assert estimated["component"].values.tolist() == ["shift", "stretch"]
+
+
+def test_profile_and_drift_and_noise_make_up_the_reading(rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=30)
+    for state in ("mean", "start", "end", 3000.0):
+        estimated = estimate_drift(deviations, state=state)
+        sum_of_parts = estimated["profile"] + estimated["drift"] + estimated["noise"]
+        np.testing.assert_allclose(
+            sum_of_parts.transpose(*deviations["deviation"].dims), deviations["deviation"], atol=1e-6
+        )
+
+
+def test_the_stated_state_is_where_drift_is_zero(rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=30)
+    start, end = (estimate_drift(deviations, state=state) for state in ("start", "end"))
+    assert float(start["drift"].values[0, 0, 0]) == pytest.approx(0.0, abs=1e-9)
+    assert float(start["drift_u"].values[0, 0, 0]) == pytest.approx(0.0, abs=1e-6)
+    assert float(end["drift"].values[-1, 1, 0]) == pytest.approx(0.0, abs=1e-9)
+    assert float(end["drift_u"].values[-1, 1, 0]) == pytest.approx(0.0, abs=1e-6)
+    middle = estimate_drift(deviations, state="mean")
+    assert float(middle["profile_u"].mean()) < float(start["profile_u"].mean())
+
+
+def test_the_state_at_the_start_of_a_steep_warm_up_is_within_its_bands() -> None:
+    inside = []
+    for seed in range(10):
+        deviations, truth = simulate(np.random.default_rng(800 + seed), kind="warmup")
+        estimated = estimate_drift(deviations, state="start")
+        profile = truth.profile + truth.shift[0, 0, 0] + truth.stretch[0, 0, 0] * truth.position
+        error = estimated["profile"].values - profile
+        inside.append(np.mean(np.abs(error) < 1.96 * estimated["profile_u"].values))
+    # All 32 values of one campaign share the error of the drift there, so that its share varies by about 0.2; ten of
+    # them by 0.06. A drift as calm at the start as later would hold a third of them.
+    assert np.mean(inside) > 0.75
+
+
+def test_a_wandering_reversal_is_found_and_tracked(rng: np.random.Generator) -> None:
+    deviations, truth = simulate(rng)
+    growth = 1.0 - np.exp(-truth.seconds / 5000.0)
+    deviations["deviation"].values[:] += growth * np.array([0.5, -0.5])[None, :, None]
+    estimated = estimate_drift(deviations)
+    assert "reversal" in estimated["component"].values
+    tracked = estimated["drift_reversal"].mean(("direction", "target")).values
+    centred = growth.mean(axis=(1, 2)) - growth.mean()
+    # 32 readings a cycle: one cycle alone would know its reversal to 0.14 um; smoothing does better.
+    assert np.sqrt(np.mean((tracked - tracked.mean() - centred) ** 2)) < 0.07
+    assert float(estimated["sigma"]) == pytest.approx(SIGMA_UM, rel=0.04)
+    history = track_reversal(deviations, estimated)
+    true = (truth.profile[0] - truth.profile[1])[None, :] + growth.mean(axis=(1, 2))[:, None]
+    assert np.sqrt(np.mean((history["reversal"].values - true) ** 2)) < 0.09
+    assert history["as_read"].std() > history["reversal"].std()
+    # Two readings of 0.4 um each.
+    assert float(history["as_read_u"].mean()) == pytest.approx(0.566, rel=0.05)
+
+
+def test_a_strong_drift_of_the_reversal_leaves_the_noise_what_it_is(rng: np.random.Generator) -> None:
+    deviations, truth = simulate(rng, cycles=24, kind="none")
+    growth = 1.0 - np.exp(-truth.seconds / 2500.0)
+    deviations["deviation"].values[:] += 10.0 * growth * np.array([1.0, -1.0])[None, :, None]
+    estimated = estimate_drift(deviations)
+    # Without its own component the others wander from reading to reading after it; they have to settle again once it has one.
+    assert float(estimated["sigma"]) == pytest.approx(SIGMA_UM, rel=0.06)
+    assert estimated.attrs["order"] == 2
+
+
+def test_a_reversal_that_stays_is_reported_constant(rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=30)
+    history = track_reversal(deviations, estimate_drift(deviations))
+    assert float(history["reversal"].std("cycle").max()) < 1e-12
+
+
+def test_a_position_that_scatters_more_is_known_less_well(rng: np.random.Generator) -> None:
+    made = rng.normal(0, SIGMA_UM, (100, 2, 16))
+    made[:, :, 2] *= 3.0
+    estimated = estimate_drift(simulate(rng, noise=made)[0])
+    u = estimated["profile_u"].values
+    # Its own 100 readings of 1.2 um in each direction, less the weight that wild readings lost.
+    assert u[:, 2] == pytest.approx(0.12, rel=0.2)
+    assert np.delete(u, 2, axis=1).max() < 0.06
+
+
+def test_gross_outliers_are_flagged_and_lose_their_weight(rng: np.random.Generator) -> None:
+    deviations, truth = simulate(rng)
+    deviations["deviation"].values[20, 0, 4] += 40.0
+    deviations["deviation"].values[70, 1, 9] -= 25.0
+    estimated = estimate_drift(deviations)
+    flagged = flag_outliers(deviations, estimated)["quality_flag"].values & OUTLIER.mask
+    assert np.argwhere(flagged).tolist() == [[20, 0, 4], [70, 1, 9]]
+    profile = truth.mean_profile(np.ones(truth.seconds.shape, dtype=bool))
+    error = estimated["profile_relative"].values - (profile - profile[:, :1])
+    assert abs(error[0, 4]) < 4 * float(estimated["profile_relative_u"][0, 4])
+    # The ordinary mean would be wrong by 0.4 um there.
+    assert abs(error[0, 4]) < 0.2
+
+
+def test_a_direction_that_was_hardly_measured_is_still_placed(rng: np.random.Generator) -> None:
+    deviations, truth = simulate(rng)
+    deviations["deviation"].values[:60, 1, :] = np.nan
+    estimated = estimate_drift(deviations)
+    reversal = truth.profile[0] - truth.profile[1]
+    z = (estimated["reversal"].values - reversal) / estimated["reversal_u"].values
+    assert np.abs(z).max() < 4.0
+    assert float(estimated["reversal_u"].max()) < 0.12
+
+
+def test_what_was_never_measured_stays_unknown(rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=20)
+    deviations["deviation"].values[:, 1, :] = np.nan
+    deviations["deviation"].values[:, 0, 5] = np.nan
+    estimated = estimate_drift(deviations)
+    assert np.isnan(estimated["profile"].values[1]).all()
+    assert np.isnan(estimated["profile"].values[0, 5])
+    assert np.isfinite(estimated["profile"].values[0, [0, 1, 15]]).all()
+    assert np.isnan(estimated["reversal"].values).all()
+
+
+def test_covariance_is_that_of_the_uncertainties(rng: np.random.Generator) -> None:
+    estimated = estimate_drift(simulate(rng, cycles=20)[0])
+    covariance = estimated["covariance"].values.reshape(32, 32)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), estimated["profile_u"].values.ravel())
+    np.testing.assert_allclose(covariance, covariance.T, atol=1e-12)
+    assert np.linalg.eigvalsh(covariance).min() > -1e-12
+
+
+def test_inputs_are_left_as_they_were(rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=10)
+    before = deviations.copy(deep=True)
+    flag_outliers(deviations, estimate_drift(deviations))
+    assert deviations.identical(before)
+
+
+def test_a_state_is_an_average_of_times() -> None:
+    seconds, cycle = np.array([0.0, 1.0, 3.0, 7.0]), np.array([1, 1, 1, 2])
+    assert state_weights(seconds, cycle, "mean") == pytest.approx([1 / 6, 1 / 6, 1 / 6, 1 / 2])
+    assert state_weights(seconds, cycle, 2.0).tolist() == [0.0, 0.5, 0.5, 0.0]
+    assert state_weights(seconds, cycle, "start").tolist() == [1.0, 0.0, 0.0, 0.0]
+    for wrong in ("warm", 8.0):
+        with pytest.raises(DriftDataError, match=r"is neither 'mean', 'start', 'end' nor seconds within 0 .. 7"):
+            state_weights(seconds, cycle, wrong)
+
+
+def test_readings_that_cannot_be_fitted_are_refused(rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=3)
+    with pytest.raises(DriftDataError, match="1 cycles and 16 targets hold readings"):
+        estimate_drift(deviations.isel(cycle=[0]))
+    with pytest.raises(DriftDataError, match=r"components \['twist'\] are not known"):
+        estimate_drift(deviations, components=["shift", "twist"])
+    timeless = deviations.copy(deep=True)
+    timeless["time"].values[:] = np.datetime64("NaT")
+    with pytest.raises(DriftDataError, match="no reading has a time"):
+        estimate_drift(timeless)
+
+
+def test_readings_that_repeat_exactly_are_refused(rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=4)
+    deviations["deviation"].values[:] = 1.0
+    with pytest.raises(DriftDataError, match="readings repeat exactly"):
+        estimate_drift(deviations)
+
+
+def test_a_sentinel_does_not_reach_the_fit(rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=20)
+    clean = estimate_drift(deviations)
+    deviations["deviation"].values[7, 0, 3] = 99999.0
+    struck = estimate_drift(deviations)
+    assert float(struck["sigma"]) == pytest.approx(float(clean["sigma"]), rel=0.01)
+    flagged = flag_outliers(deviations, struck)["quality_flag"].values & OUTLIER.mask
+    assert np.argwhere(flagged).tolist() == [[7, 0, 3]]
+
+
+def test_the_order_of_targets_does_not_matter(rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=10)
+    shuffled = estimate_drift(deviations.isel(target=rng.permutation(16))).sortby("target")
+    np.testing.assert_allclose(shuffled["profile"], estimate_drift(deviations)["profile"], atol=1e-9)
+
+
+def test_sorted_readings_hold_the_real_time(rng: np.random.Generator) -> None:
+    readings = sort_readings(simulate(rng, cycles=2)[0])
+    assert float(readings["seconds"][32]) == pytest.approx(CYCLE_S)

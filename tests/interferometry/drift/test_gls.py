@@ -1,0 +1,190 @@
+"""The O(n) filter against dense Gaussian algebra, and the estimates against simulated truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from interferometry.drift.gls import estimate, fit_fixed_effects, settling_pace
+from interferometry.drift.state_space import DriftModelError, drift_system, start_columns
+
+POSITIONS = np.r_[np.arange(16), np.arange(15, -1, -1)]
+
+
+def readings(rng, n=60):
+    seconds = np.sort(rng.uniform(0, 1000, n))
+    loadings = np.column_stack([np.ones(n), rng.integers(0, 5, n) / 5.0])
+    return seconds, loadings, rng.normal(size=n)
+
+
+def dense_covariance(seconds, loadings, order, ratios, variance):
+    start = seconds - seconds[0]
+    early, late = np.minimum.outer(start, start), np.maximum.outer(start, start)
+    walk = early if order == 1 else early**2 * (3 * late - early) / 6
+    drift = sum(ratio * walk * np.outer(column, column) for ratio, column in zip(ratios, loadings.T, strict=True))
+    return drift, drift + np.diag(variance)
+
+
+@pytest.mark.parametrize(("order", "ratios"), [(1, [0.01, 0.02]), (2, [1e-6, 3e-6])])
+def test_agrees_with_dense_generalised_least_squares(rng, order, ratios):
+    seconds, loadings, y = readings(rng)
+    variance = rng.uniform(0.5, 3.0, y.size)
+    design = start_columns(seconds, loadings, order)
+    system = drift_system(seconds, loadings, order=order, ratios=ratios, variance=variance)
+    fit = fit_fixed_effects(system, y, design)
+
+    drift, total = dense_covariance(seconds, loadings, order, ratios, variance)
+    inverse = np.linalg.inv(total)
+    unscaled = np.linalg.inv(design.T @ inverse @ design)
+    beta = unscaled @ design.T @ inverse @ y
+    residual = y - design @ beta
+    freedom = y.size - design.shape[1]
+    sigma2 = residual @ inverse @ residual / freedom
+    likelihood = -0.5 * (freedom * np.log(sigma2) + np.linalg.slogdet(total)[1] - np.linalg.slogdet(unscaled)[1])
+
+    np.testing.assert_allclose(fit.coefficients, beta, atol=1e-9)
+    np.testing.assert_allclose(fit.covariance, sigma2 * unscaled, rtol=1e-8)
+    assert fit.log_likelihood == pytest.approx(likelihood, abs=1e-8)
+    noise, share = fit.noise()
+    np.testing.assert_allclose(noise, variance * (inverse @ residual), atol=1e-10)
+    np.testing.assert_allclose(share, variance**2 * np.diag(inverse), atol=1e-10)
+    levels, covariance = fit.drift()
+    np.testing.assert_allclose((levels * loadings).sum(1), drift @ inverse @ residual, atol=1e-9)
+    projector = inverse - inverse @ design @ unscaled @ design.T @ inverse
+    np.testing.assert_allclose(
+        np.einsum("nc,nce,ne->n", loadings, covariance, loadings),
+        sigma2
+        * np.diag(drift - drift @ inverse @ drift + drift @ inverse @ design @ unscaled @ design.T @ inverse @ drift),
+        atol=1e-8,
+    )
+    assert np.linalg.eigvalsh(projector).min() > -1e-9
+
+
+def test_deletion_residual_is_the_error_of_predicting_a_reading_from_all_others(rng):
+    seconds, loadings, y = readings(rng, 40)
+    system = drift_system(seconds, loadings, order=1, ratios=[0.01, 0.02])
+    # The fit is taken as known, so that only the drift has to be predicted from the others.
+    fit = fit_fixed_effects(system, y, loadings)
+    _, total = dense_covariance(seconds, loadings, 1, [0.01, 0.02], np.ones(40))
+    residual = fit.residual()
+    k = 17
+    others = np.arange(40) != k
+    weights = np.linalg.solve(total[np.ix_(others, others)], total[others, k])
+    error = residual[k] - weights @ residual[others]
+    variance = total[k, k] - weights @ total[others, k]
+    assert fit.deletion_residuals()[k] == pytest.approx(error / np.sqrt(variance) / fit.sigma, rel=1e-9)
+
+
+def test_held_out_readings_do_not_move_the_fit_and_are_predicted_in_open_loop(rng):
+    seconds, loadings, y = readings(rng)
+    observed = seconds < 700
+    system = drift_system(seconds, loadings, order=1, ratios=[0.01, 0.02], observed=observed)
+    fit = fit_fixed_effects(system, y, loadings)
+    shifted = fit_fixed_effects(system, np.where(observed, y, y + 1e6), loadings)
+    np.testing.assert_array_equal(shifted.coefficients, fit.coefficients)
+    _, total = dense_covariance(seconds, loadings, 1, [0.01, 0.02], np.ones(y.size))
+    errors, spread = system.innovations(y[:, None])
+    known = total[np.ix_(observed, observed)]
+    expected = y[~observed] - total[np.ix_(~observed, observed)] @ np.linalg.solve(known, y[observed])
+    np.testing.assert_allclose(errors[~observed, 0], expected, atol=1e-10)
+    open_loop = total[np.ix_(~observed, ~observed)] - total[np.ix_(~observed, observed)] @ np.linalg.solve(
+        known, total[np.ix_(observed, ~observed)]
+    )
+    np.testing.assert_allclose(spread[~observed], np.diag(open_loop), atol=1e-9)
+
+
+def simulated_test(rng, *, cycles=60, noise_um=0.4, integrated=False):
+    position = np.tile(POSITIONS, cycles) / 15.0
+    seconds = np.arange(position.size) * 7.9
+    steps = rng.normal(size=(2, position.size)) * np.array([[0.4], [0.3]]) / np.sqrt(32)
+    drift = np.cumsum(steps, axis=1)
+    if integrated:
+        drift = np.cumsum(drift, axis=1) / 200
+    y = drift[0] + position * drift[1] + rng.normal(0, noise_um, position.size)
+    design = (np.tile(POSITIONS, cycles)[:, None] == np.arange(16)).astype(float)
+    return seconds, np.column_stack([np.ones(position.size), position]), y, design
+
+
+@pytest.mark.parametrize("integrated", [False, True])
+def test_finds_the_kind_of_drift_and_the_noise(rng, integrated):
+    fit = estimate(*simulated_test(rng, integrated=integrated))
+    assert fit.system.order == (2 if integrated else 1)
+    # 1920 readings determine a standard deviation to 0.4 / sqrt(2 * 1900) = 0.0065 um; 4 of these are allowed.
+    assert fit.sigma == pytest.approx(0.4, abs=0.026)
+    if not integrated:
+        # Steps of 0.4 and 0.3 um per cycle of 252.8 s; the study's spread of such estimates is about 15 %.
+        np.testing.assert_allclose(fit.drift_rate * np.sqrt(252.8 / 3600), [0.4, 0.3], rtol=0.45)
+
+
+def test_a_robust_fit_is_not_moved_by_gross_outliers(rng):
+    seconds, loadings, y, design = simulated_test(rng)
+    hit = rng.choice(y.size, 40, replace=False)
+    spoiled = y.copy()
+    spoiled[hit] += rng.choice([-1, 1], 40) * rng.uniform(5, 50, 40)
+    clean = estimate(seconds, loadings, y, design, order=1)
+    plain = estimate(seconds, loadings, spoiled, design, order=1)
+    robust = estimate(seconds, loadings, spoiled, design, order=1, robust=True)
+    profile = design.shape[1]
+
+    def error(fit):
+        difference = (fit.coefficients - clean.coefficients)[:profile]
+        return float(np.sqrt(np.mean((difference - difference.mean()) ** 2)))
+
+    # 40 of 1920 readings carry no information any more: 1 % more spread than the clean fit's 0.4 / sqrt(120) um.
+    assert error(robust) < 0.02 < error(plain)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s, x, y, d: (s[::-1], x, y, d), "must not decrease"),
+        (lambda s, x, y, d: (s, x[:-1], y, d), "loadings has shape"),
+        (lambda s, x, y, d: (s, x, np.where(s == s[3], np.nan, y), d), "must be finite"),
+        (lambda s, x, y, d: (s, x, y, np.column_stack([d, d[:, :1]])), "column 2 of the design depends"),
+        (lambda s, x, y, d: (s, x, y, np.column_stack([d, 0 * s])), "vanish"),
+    ],
+)
+def test_bad_input_is_named(rng, change, message):
+    seconds, loadings, y = readings(rng)
+    seconds, loadings, y, design = change(seconds, loadings, y, loadings)
+    with pytest.raises(DriftModelError, match=message):
+        fit_fixed_effects(drift_system(seconds, loadings, order=1, ratios=[0.01, 0.02]), y, design)
+
+
+@pytest.mark.parametrize(("order", "ratio"), [(1, 0.01), (2, 1e-6)])
+def test_a_pace_multiplies_the_variance_of_its_own_steps(rng, order, ratio):
+    seconds, _, y = readings(rng, 40)
+    loadings, pace = np.ones((40, 1)), rng.uniform(0.2, 5.0, 40)
+    system = drift_system(seconds, loadings, order=order, ratios=[ratio], pace=pace)
+    fit = fit_fixed_effects(system, y, start_columns(seconds, loadings, order))
+
+    steps = np.diff(seconds, prepend=seconds[0]) * ratio * pace
+    after = np.maximum(np.subtract.outer(seconds, seconds), 0.0)
+    begun = np.subtract.outer(seconds, seconds) >= 0
+    if order == 1:
+        walk = (begun * steps) @ begun.T
+    else:
+        h = np.diff(seconds, prepend=seconds[0])
+        walk = (begun * (steps * h**2 / 3)) @ begun.T + after * steps @ after.T
+        cross = (begun * (steps * h / 2)) @ after.T
+        walk += cross + cross.T
+    inverse = np.linalg.inv(walk + np.eye(40))
+    design = fit.design
+    beta = np.linalg.solve(design.T @ inverse @ design, design.T @ inverse @ y)
+    np.testing.assert_allclose(fit.coefficients, beta, atol=1e-8)
+    drift, _ = fit.drift()
+    np.testing.assert_allclose(drift[:, 0], walk @ inverse @ (y - design @ beta), atol=1e-8)
+
+
+def test_a_drift_that_settles_is_livelier_at_the_start_only(rng):
+    seconds = np.arange(600) * 40.0
+    loadings = np.ones((600, 1))
+    warming = 12.0 * (1.0 - np.exp(-seconds / 1200.0)) + rng.normal(0, 0.4, 600)
+    columns = np.ones((600, 1))
+    fit = estimate(seconds, loadings, warming, columns, settling=True)
+    assert fit.system.paces[0] > 10.0
+    assert fit.system.paces[-1] == 1.0
+    assert (np.diff(fit.system.paces) <= 0).all()
+    assert settling_pace(seconds, 600.0, 2.0)[15] == pytest.approx(0.25)
+    wandering = np.cumsum(rng.normal(0, 0.1, 600)) + rng.normal(0, 0.4, 600)
+    assert (estimate(seconds, loadings, wandering, columns, settling=True).system.paces == 1.0).all()

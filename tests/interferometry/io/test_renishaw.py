@@ -1,0 +1,266 @@
+"""Renishaw files: the traps of the genuine one, broken promises of the header, and round trips."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from interferometry.compensation import air_index, environment_factor
+from interferometry.inspection import describe_test
+from interferometry.io.delimited import LaserFormatError
+from interferometry.io.readers import read_deviations, read_environment
+from interferometry.io.renishaw import read_rtx
+from interferometry.io.writers import write_deviations_csv, write_environment_csv, write_rtl
+from tests.interferometry.simulated_campaigns import simulate
+
+GENUINE = "friedcucumber__RenishawWork/data/22.rtl"
+
+
+@pytest.mark.real_data
+def test_genuine_file_with_all_its_traps(real_file: Callable[[str], Path]) -> None:
+    test = read_deviations(real_file(GENUINE))
+    assert test.sizes["cycle"] == 1
+    assert test["position"].values.tolist() == list(np.arange(-280.0, 421.0, 50.0))
+    forward = test["deviation"].sel(direction="positive").values[0]
+    printed = [-0.7, -0.2, -1.4, -1.0, -1.4, -4.5, -6.4, -8.1, -9.4, -9.4, -10.5, -7.5, -7.7, -6.6, -7.9]
+    assert forward.tolist() == printed
+    assert np.isnan(test["deviation"].sel(direction="negative")).all()
+    assert json.loads(test.attrs["runs_empty"]) == [2]
+    assert test.attrs["missing"] == 15
+    assert test["air_temperature"].values.tolist() == [26.234373, 26.281248]
+    assert test["air_pressure"].values == pytest.approx([1011.4, 1011.6])
+    assert test["material_temperature"].values[0].tolist() == [24.562498, 24.570311]
+    assert np.isnan(test["material_temperature"].values[1:]).all()
+    assert test["environment_factor"].values.tolist() == [0.31639452, 0.31639449]
+    assert json.loads(test.attrs["user_text"])["date"] == "2014-10-08 10:53:29"
+
+
+@pytest.mark.real_data
+def test_genuine_file_gets_times_with_their_uncertainty(real_file: Callable[[str], Path]) -> None:
+    test = read_deviations(real_file(GENUINE))
+    times = test["time"].sel(direction="positive").values[0]
+    assert test["time"].attrs["origin"] == "reconstructed"
+    # The start's last digit is a control byte (10:53:4?): the middle of its ten seconds, and 10/sqrt(12) s in the u.
+    assert times[0] > np.datetime64("2014-10-08T10:53:45")
+    assert times[-1] == np.datetime64("2014-10-08T10:56:49")
+    assert (np.diff(times) > np.timedelta64(0)).all()
+    assert float(test["time_u"]) >= 10 / np.sqrt(12)
+    assert np.isnat(test["time"].sel(direction="negative").values).all()
+
+
+def rtl(folder: Path, old: str = "", new: str = "", *, line_end: str = "\n") -> Path:
+    text = "\n".join(
+        [
+            "HEADER::",
+            "File type  : rtl",
+            "",
+            "TARGET DATA::",
+            "Filetype  : ISO",
+            "Target-count: 3",
+            "Targets :",
+            "-10.000000  0.000000 ",
+            "10.000000 ",
+            "Flags: 0 0 2 1",
+            "",
+            "RUNS::",
+            "Run-count:4",
+            "",
+            "DEVIATIONS::",
+            "Run Target Data:",
+            *[f"{run} {target} {run + target / 10}" for run in (1, 3) for target in (1, 2, 3)],
+            *[f"{run} {target} {-run - target / 10}" for run in (2, 4) for target in (3, 2, 1)],
+            "",
+            "ENVIRONMENT::",
+            'DateTime : "2014-10-08 10:00:00" "2014-10-08 10:02:00"',
+            "",
+            "EOF::",
+            "",
+        ]
+    )
+    assert old in text
+    path = folder / "test.rtl"
+    path.write_bytes(text.replace(old, new, 1).replace("\n", line_end).encode("latin-1"))
+    return path
+
+
+def test_runs_become_cycles_and_directions(tmp_path: Path) -> None:
+    test = read_deviations(rtl(tmp_path))
+    assert test["deviation"].sel(direction="positive").values.tolist() == [[1.1, 1.2, 1.3], [3.1, 3.2, 3.3]]
+    assert test["deviation"].sel(direction="negative").values.tolist() == [[-2.1, -2.2, -2.3], [-4.1, -4.2, -4.3]]
+    assert read_deviations(rtl(tmp_path, line_end="\r\n")).equals(test)
+
+
+def test_a_test_measured_in_one_direction_has_one_direction(tmp_path: Path) -> None:
+    text = rtl(tmp_path).read_text("latin-1")
+    reverse = "\n".join(f"2 {target} {-2 - target / 10}" for target in (3, 2, 1))
+    forward = "\n".join(f"2 {target} {-2 - target / 10}" for target in (1, 2, 3))
+    path = tmp_path / "one.rtl"
+    text = (
+        text.replace(reverse, forward)
+        .replace("4 3 -4.3\n4 2 -4.2\n4 1 -4.1\n", "")
+        .replace("Run-count:4", "Run-count:3")
+    )
+    path.write_text(text, encoding="latin-1")
+    test = read_deviations(path)
+    assert test.sizes["cycle"] == 3
+    assert np.isnan(test["deviation"].sel(direction="negative")).all()
+
+
+def test_feed_and_dwell_place_readings_within_their_run(tmp_path: Path) -> None:
+    test = read_deviations(rtl(tmp_path), feed_mm_per_min=300.0, dwell_s=2.0)
+    steps = np.diff(test["time"].sel(direction="positive").values[0]) / np.timedelta64(1, "s")
+    assert steps == pytest.approx([4.0, 4.0])
+    assert test["time"].values.max() == np.datetime64("2014-10-08T10:02:00")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("Target-count: 3", "Target-count: 4", "Target-count is 4, but 3 target positions follow"),
+        ("10.000000 \nFlags", "ten\nFlags", r"line 9: 'ten' is not a row of target positions"),
+        ("Run-count:4", "Run-count:2", r"Run-count is 2, but DEVIATIONS holds runs \[1, 2, 3, 4\]"),
+        (": rtl", ": rta", "File type is rta, not rtl; only linear tests"),
+        ("EOF::", "", "no section EOF::; the file is cut short"),
+        ("DEVIATIONS::", "DEVIATIONS", "no section DEVIATIONS::"),
+    ],
+)
+def test_broken_promises_of_the_header_are_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
+    with pytest.raises(LaserFormatError, match=message):
+        read_deviations(rtl(tmp_path, old, new))
+
+
+@pytest.mark.parametrize(
+    ("new", "reason"),
+    [
+        ("1 2 abc", "is not 'run target deviation'"),
+        ("1 9 1.2", "names no run from 1 or no target of 1..3"),
+        ("1 1 1.2", "repeats run 1 target 1, the first is kept"),
+    ],
+)
+def test_bad_rows_are_left_out_with_their_line(tmp_path: Path, new: str, reason: str) -> None:
+    test = read_deviations(rtl(tmp_path, "1 2 1.2", new))
+    (listed,) = json.loads(test.attrs["left_out"])
+    assert (listed["line"], listed["reason"]) == (18, reason)
+    assert np.isnan(test["deviation"].values[0, 0, 1])
+
+
+def test_minus_1e20_is_a_missing_reading(tmp_path: Path) -> None:
+    test = read_deviations(rtl(tmp_path, "1 2 1.2", "1 2 -100000000000000000000.000"))
+    assert np.isnan(test["deviation"].values[0, 0, 1])
+    assert test.attrs["missing"] == 1
+
+
+def test_a_file_without_times_says_so(tmp_path: Path) -> None:
+    test = read_deviations(rtl(tmp_path, "DateTime", "Nothing"))
+    assert test["time"].attrs["origin"] == "none"
+    assert np.isnat(test["time"].values).all()
+
+
+def test_rtl_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=3)
+    deviations["deviation"].values[1, 0, 5] = np.nan
+    environment = {"air_temperature_degC": (20.5, 21.0), "air_pressure_hPa": (1000.0, 1001.0)}
+    write_rtl(tmp_path / "t.rtl", deviations, environment=environment, user_text={"machine": "X3"})
+    back = read_deviations(tmp_path / "t.rtl", feed_mm_per_min=300, dwell_s=2)
+    # The file prints four decimals of a micrometre.
+    np.testing.assert_allclose(back["deviation"], deviations["deviation"], atol=5.1e-5)
+    assert back["air_pressure"].values == pytest.approx([1000.0, 1001.0])
+    assert json.loads(back.attrs["user_text"])["machine"] == "X3"
+
+
+def test_rtl_writer_refuses_what_has_no_place(tmp_path: Path, rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=2)
+    with pytest.raises(ValueError, match=r"environment: wind has no place in a .rtl"):
+        write_rtl(tmp_path / "t.rtl", deviations, environment={"wind": (1.0, 2.0)})
+
+
+def test_csv_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=3)
+    write_deviations_csv(tmp_path / "t.csv", deviations)
+    back = read_deviations(tmp_path / "t.csv")
+    np.testing.assert_allclose(back["deviation"], deviations["deviation"], atol=5.1e-5)
+    assert (back["time"].values == deviations["time"].values).all()
+
+
+def test_environment_csv_round_trip(tmp_path: Path) -> None:
+    source = tmp_path / "a.csv"
+    source.write_text(
+        "time,air_temperature_degC,air_pressure_hPa,relative_humidity_percent,material_temperature_degC\n"
+        "2026-03-09T06:30:00Z,23.5,1000.2,42,23.9\n2026-03-09T06:31:00Z,23.6,1000.1,41,24.0\n",
+        encoding="utf-8",
+    )
+    environment = read_environment(source)
+    write_environment_csv(tmp_path / "b.csv", environment)
+    assert read_environment(tmp_path / "b.csv").equals(environment)
+
+
+AIR = {
+    "air_temperature_degC": (26.2, 26.3),
+    "air_pressure_hPa": (1011.4, 1011.6),
+    "relative_humidity_percent": (37.0, 38.0),
+    "material_temperature_degC": (24.5, 24.6),
+    "expansion_coefficient_ppm_per_K": (11.7, 11.7),
+}
+
+
+def test_inspection_holds_factor_air_and_material_against_each_other(tmp_path: Path, rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=2)
+    deviations["deviation"].values[:, 1] = np.nan
+    deviations["deviation"].values[0, 0, 3] = np.nan
+    for coefficient, starts in ((11.7, "environment factor"), (10.7, "warning: environment factor")):
+        index = air_index(np.array([26.2, 26.3]), np.array([1011.4, 1011.6]), np.array([37.0, 38.0]))
+        factor = environment_factor(
+            index,
+            material_temperature_degC=np.array([24.5, 24.6]),
+            expansion_coefficient_ppm_per_K=coefficient,
+        )
+        path = tmp_path / "t.rtl"
+        write_rtl(path, deviations, environment={**AIR, "environment_factor_um": (factor[0], factor[1])})
+        lines = describe_test(read_deviations(path))
+        assert lines[0] == "warning: 1 of 32 readings missing in the positive direction"
+        assert lines[1] == "warning: no reading in the negative direction"
+        assert any(line.startswith("runs without a reading: 2, 4") for line in lines)
+        assert any("material 24.5 to 24.6 degC, expansion 11.7 ppm/K" in line for line in lines)
+        assert lines[-1].startswith(starts)
+    # 1 ppm/K over 4.55 K.
+    assert "-4.55" in lines[-1] or "+4.55" in lines[-1]
+
+
+@pytest.mark.real_data
+def test_inspection_of_the_genuine_file(real_file: Callable[[str], Path]) -> None:
+    lines = describe_test(read_deviations(real_file(GENUINE)))
+    assert "warning: no reading in the negative direction" in lines
+    assert "runs without a reading: 2" in lines
+    assert "a vacuum wavelength of 632.99063 nm, +0.013 ppm from" in lines[-1]
+
+
+def rtx(folder: Path, samples: int, stated: int, *, end: bytes = b"EOF::\r\n", rate: str = "100") -> Path:
+    header = f"HEADER::\r\nFile Type: rtx\r\nSample no: {stated}\r\nActual sample rate: {rate}\r\nData:\r\n"
+    path = folder / "t.rtx"
+    path.write_bytes(header.encode() + struct.pack(f"<{samples}d", *range(samples)) + end)
+    return path
+
+
+def test_rtx_gives_displacement_and_seconds(tmp_path: Path) -> None:
+    capture = read_rtx(rtx(tmp_path, 5, 5))
+    assert capture["displacement"].values.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert capture["seconds"].values[-1] == pytest.approx(0.04)
+
+
+def test_rtx_is_not_a_test_of_targets(tmp_path: Path) -> None:
+    with pytest.raises(LaserFormatError, match="a dynamic capture has no targets; read it with"):
+        read_deviations(rtx(tmp_path, 5, 5))
+
+
+def test_rtx_that_breaks_its_promises_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(LaserFormatError, match="'Sample no' is 6, but 5 samples follow"):
+        read_rtx(rtx(tmp_path, 5, 6))
+    with pytest.raises(LaserFormatError, match="HEADER::, Data: or EOF:: is missing"):
+        read_rtx(rtx(tmp_path, 5, 5, end=b""))
+    with pytest.raises(LaserFormatError, match="no 'Actual sample rate'"):
+        read_rtx(rtx(tmp_path, 5, 5, rate="0"))

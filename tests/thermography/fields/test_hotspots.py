@@ -1,0 +1,80 @@
+"""Hotspots against fields whose peaks are known."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from thermography.fields.hotspots import detect_hotspots, follow_hotspots, isotherms
+
+X = np.arange(140) * 5.0 + 2.5
+Y = np.arange(36) * 5.0 + 2.5
+
+
+def plane(*peaks, slope=0.0):
+    x, y = np.meshgrid(X, Y)
+    values = slope * x
+    for x0, y0, height, width in peaks:
+        values = values + height * np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / (2 * width**2))
+    return xr.DataArray(values, dims=("y", "x"), coords={"y": Y, "x": X})
+
+
+def test_two_peaks_are_found_where_they_are(rng):
+    field = plane((203.0, 91.0, 3.0, 30.0), (551.0, 60.0, 1.5, 25.0))
+    noisy = field + rng.normal(0, 0.014, field.shape)
+    first, second = detect_hotspots(noisy)
+    # A peak of width w in noise s is located to about s / height * w^2 / cell / sqrt(cells): below 1 mm here.
+    assert (first.x_mm, first.y_mm) == pytest.approx((203.0, 91.0), abs=2)
+    assert (second.x_mm, second.y_mm) == pytest.approx((551.0, 60.0), abs=3)
+    assert first.peak_rise_K == pytest.approx(3.0, abs=0.04)
+    assert second.peak_rise_K == pytest.approx(1.5, abs=0.04)
+    # Above half its height a Gaussian covers 2 pi ln 2 w^2.
+    assert first.area_mm2 == pytest.approx(2 * np.pi * np.log(2) * 30**2, rel=0.1)
+    assert not first.at_edge
+    assert (first.centroid_x_mm, first.centroid_y_mm) == pytest.approx((203.0, 91.0), abs=3)
+
+
+def test_noise_and_flat_fields_hold_no_hotspot(rng):
+    flat = plane()
+    assert detect_hotspots(flat) == []
+    assert detect_hotspots(flat + rng.normal(0, 0.015, flat.shape)) == []
+    assert detect_hotspots(flat + np.nan) == []
+
+
+def test_maximum_of_a_slope_is_marked_as_lying_at_the_edge():
+    (spot,) = detect_hotspots(plane(slope=0.01))
+    assert spot.at_edge
+    assert spot.x_mm == pytest.approx(697.5)
+
+
+def test_masked_discs_neither_make_nor_break_hotspots(rng):
+    field = plane((300.0, 90.0, 2.0, 40.0)) + rng.normal(0, 0.014, (36, 140))
+    field[16:20, 60:64] = np.nan
+    field[4:8, 100:104] = np.nan
+    (spot,) = detect_hotspots(field)
+    assert np.hypot(spot.x_mm - 300, spot.y_mm - 90) < 15
+
+
+def test_hotspots_keep_their_identity_over_cycles(rng):
+    cycles = [
+        plane((200.0 + 4 * n, 90.0, 0.3 * n, 30.0), (550.0, 60.0, 1.5 if n > 4 else 0.0, 25.0))
+        + rng.normal(0, 0.014, (36, 140))
+        for n in range(1, 10)
+    ]
+    followed = follow_hotspots(xr.concat(cycles, "cycle").assign_coords(cycle=np.arange(1, 10)))
+    assert followed.sizes["hotspot"] == 2
+    moving, late = followed.isel(hotspot=0), followed.isel(hotspot=1)
+    np.testing.assert_allclose(moving["x"], 200 + 4 * np.arange(1, 10), atol=4)
+    np.testing.assert_allclose(moving["peak_rise"], 0.3 * np.arange(1, 10), atol=0.05)
+    assert np.isfinite(late["x"].values).tolist() == [False] * 4 + [True] * 5
+
+
+def test_isotherm_of_a_peak_is_a_circle():
+    lines = isotherms(plane((350.0, 90.0, 2.0, 30.0)), [1.0])[1.0]
+    assert len(lines) == 1
+    radius = np.hypot(*(lines[0] - (350.0, 90.0)).T)
+    np.testing.assert_allclose(radius, 30 * np.sqrt(2 * np.log(2)), atol=0.3)
+
+
+def test_a_stack_is_refused():
+    with pytest.raises(ValueError, match=r"give one field \(y, x\) of at least 3 x 3 cells"):
+        detect_hotspots(xr.concat([plane()], "cycle"))

@@ -1,0 +1,145 @@
+"""A table that travels through the view: its place in every frame, and the field that stays attached to it."""
+
+import json
+import pickle
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.thermography.plan_scene import DISCS, GRID, START, Scene, cell_truth, record
+from thermography.fields import moving
+from thermography.fields.checkpoint import CheckpointError
+from thermography.fields.moving import reduce_moving_frames
+from thermography.fields.still import FieldError
+from thermography.registration.register import register
+
+DIRECTION = (-1, 0)
+PLACES_MM = np.array([0.0, 121.3, 200.5, 299.7, 160.2, 5.5])
+
+
+def edges(*seconds):
+    return START + np.array(seconds) * np.timedelta64(1, "s")
+
+
+@pytest.fixture(scope="module")
+def travel(tmp_path_factory):
+    """Six frames of a table that moves 300 mm, seen by a lens of k1 = -1.2; registered where it stood first."""
+    rng = np.random.default_rng(7)
+    home = Scene(disc_K=-4.0, k1=-1.2, rays=3, corners_px=((80, 150), (480, 140), (495, 285), (75, 300)))
+    registration = register(home.render(rng), DISCS, grid=GRID)
+    # The plan point under the spindle moves along -x as the axis position grows, so the table moves along +x.
+    images = (replace(home, shift_mm=(float(p), 0.0)).render(rng) for p in PLACES_MM)
+    frames = record(tmp_path_factory.mktemp("travel") / "a.seq", images)
+    fields = reduce_moving_frames(frames, registration, GRID, edges(0, 3, 6), direction=DIRECTION)
+    return home, registration, frames, fields
+
+
+def test_place_of_the_table_is_known_in_every_frame(travel):
+    _, _, _, fields = travel
+    error = fields["table_position"].values - PLACES_MM
+    # The aim is 0.3 mm per frame; a pixel is 1.7 mm. From 160.2 to 5.5 mm most discs land near the place of their neighbour.
+    assert np.abs(error).max() < 0.1
+    assert np.abs(fields["table_across"].values).max() < 0.1
+    assert (np.abs(error) < 4 * fields["table_position_u"].values).all()
+    assert (fields["table_discs"] >= 6).all()
+
+
+def test_fields_of_frames_at_different_places_overlay(travel):
+    _, _, _, fields = travel
+    error = fields["temperature"].values - cell_truth()
+    # Three frames, 3 x 4 px of 50 mK per cell: 8 mK; a misplacement of 0.1 mm in the largest gradient is 2 mK.
+    assert np.sqrt(np.nanmean(error**2)) < 0.012
+    assert abs(np.nanmean(error)) < 0.002
+    inside = np.isfinite(fields["temperature"].values[0])
+    # The outermost row of cells lies within the lens blur of the edge.
+    assert inside.mean() > 0.85
+    assert fields["count"].values[0].max() == 3
+    # At 300 mm the far end of the table has left the view.
+    assert fields["count"].values[1][30:34, -3].min() < 3
+
+
+def test_stated_uncertainty_is_the_true_error(travel):
+    _, _, _, fields = travel
+    error = fields["temperature"].values - cell_truth()
+    ratio = np.sqrt(np.nanmean((error / fields["temperature_u"].values) ** 2))
+    # Neighbouring cells share pixels and misplacement, so that a few hundred values are independent.
+    assert 0.7 < ratio < 1.4
+
+
+def test_frames_without_the_table_are_named(travel, tmp_path):
+    home, registration, _, _ = travel
+    images = [home.render(), Scene(discs=(), field=lambda x, y: np.full_like(x, 22.5)).render()]
+    frames = record(tmp_path / "a.seq", images)
+    fields = reduce_moving_frames(frames, registration, GRID, edges(0, 2), direction=DIRECTION)
+    assert json.loads(fields.attrs["frames_unplaced"]) == ["a.seq#1"]
+    assert fields["table_discs"].values.tolist()[1] == 0
+    assert np.isnan(fields["table_position"].values[1])
+    with pytest.raises(FieldError, match="the table is found in no frame; check the fiducials"):
+        reduce_moving_frames(frames[1:], registration, GRID, edges(0, 2), direction=DIRECTION)
+    with pytest.raises(FieldError, match="no frame in which the table is found lies within a cycle"):
+        reduce_moving_frames(frames[:1], registration, GRID, edges(5, 7), direction=DIRECTION)
+
+
+RUN = """
+import sys
+from pathlib import Path
+import numpy as np
+from tests.thermography.plan_scene import GRID, START
+from tests.thermography.fields.test_moving import DIRECTION, load
+from thermography.fields import moving
+from thermography.io.flir import index_frames
+
+moving.BLOCK_FRAMES = 2
+frames, _ = index_frames([sys.argv[1]])
+bounds = START + np.array([0, 3, 6]) * np.timedelta64(1, "s")
+registration = load(Path(sys.argv[2]))
+
+
+def progress(count):
+    print(count, flush=True)
+    # Whoever started this run kills it here.
+    sys.stdin.readline()
+
+
+moving.reduce_moving_frames(
+    frames, registration, GRID, bounds, direction=DIRECTION, block_s=1, checkpoint=sys.argv[3], progress=progress
+)
+"""
+
+
+def load(path):
+    return pickle.loads(path.read_bytes())
+
+
+def test_a_killed_run_goes_on_at_the_first_block_that_is_not_done(travel, tmp_path, monkeypatch):
+    _, registration, frames, _ = travel
+    (tmp_path / "registration").write_bytes(pickle.dumps(registration))
+    command = [sys.executable, "-c", RUN, frames[0].path, tmp_path / "registration", tmp_path / "cp"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as run:
+        for _ in range(5):
+            assert run.stdout.readline() == "1\n"
+            run.stdin.write("\n")
+            run.stdin.flush()
+        run.kill()
+    assert run.returncode != 0
+    monkeypatch.setattr(moving, "BLOCK_FRAMES", 2)
+    seen = []
+    how = {"direction": DIRECTION, "block_s": 1}
+    again = reduce_moving_frames(
+        frames, registration, GRID, edges(0, 3, 6), checkpoint=tmp_path / "cp", progress=seen.append, **how
+    )
+    # Five frames were done, of which a file holds two.
+    assert seen == [4, 1, 1]
+    whole = reduce_moving_frames(frames, registration, GRID, edges(0, 3, 6), **how)
+    for name in whole.variables:
+        assert whole[name].values.tobytes() == again[name].values.tobytes(), name
+    assert whole.attrs == again.attrs
+    with pytest.raises(
+        CheckpointError, match=r"holds cycles of another reduction \(other reach_mm\); remove the folder"
+    ):
+        reduce_moving_frames(
+            frames, registration, GRID, edges(0, 3, 6), checkpoint=tmp_path / "cp", reach_mm=400.0, **how
+        )

@@ -1,0 +1,91 @@
+"""Region and line series against fields that can be integrated by hand."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from thermography.fields.regions import RegionError, fields_at, region_series, segment_series, segment_share
+
+X, Y = np.arange(140) * 5.0 + 2.5, np.arange(36) * 5.0 + 2.5
+TIMES = np.datetime64("2026-03-09T06:00:00", "ns") + np.arange(4) * np.timedelta64(60, "s")
+
+
+def stack(function=lambda x, y: x + 10 * y, grow=1.0):
+    x, y = np.meshgrid(X, Y)
+    values = np.stack([function(x, y) + grow * i for i in range(4)])
+    attrs = {"units": "K", "units_metadata": "temperature: difference"}
+    return xr.DataArray(values, dims=("time", "y", "x"), coords={"time": TIMES, "y": Y, "x": X}, attrs=attrs)
+
+
+def test_rectangle_and_triangle_of_a_plane_have_the_mean_of_their_centroid():
+    square = [(101, 41), (199, 41), (199, 99), (101, 99)]
+    triangle = [(200, 30), (500, 30), (200, 150)]
+    series = region_series(stack(), {"square": square, "triangle": triangle})
+    # Shares are counted by 100 points per cell.
+    np.testing.assert_allclose(series["mean"].sel(region="square"), 150 + 10 * 70 + np.arange(4.0), atol=0.3)
+    np.testing.assert_allclose(series["mean"].sel(region="triangle"), 300 + 10 * 70 + np.arange(4.0), atol=1.0)
+    assert series["n"].sel(region="square").values[0] == pytest.approx(98 * 58 / 25, rel=0.01)
+    assert float(series["max"].sel(region="square")[0]) == 197.5 + 10 * 97.5
+    assert float(series["min"].sel(region="square")[0]) == 102.5 + 10 * 42.5
+    assert series["mean"].attrs["units_metadata"] == "temperature: difference"
+
+
+def test_stated_uncertainty_of_a_region_mean_is_its_scatter(rng):
+    fields = xr.concat([stack(grow=0.0)] * 50, "time")
+    noisy = fields + rng.normal(0, 0.014, fields.shape)
+    series = region_series(noisy, {"square": [(100, 40), (150, 40), (150, 90), (100, 90)]})
+    scatter = (
+        series["mean"] - region_series(fields, {"square": [(100, 40), (150, 40), (150, 90), (100, 90)]})["mean"]
+    ).std()
+    # 200 means give their standard deviation to 5 %.
+    assert float(scatter) == pytest.approx(0.014 / 10, rel=0.15)
+    assert float(series["mean_u"].mean()) == pytest.approx(0.014 / 10, rel=0.05)
+
+
+def test_masked_cells_take_no_part():
+    fields = stack(lambda x, y: np.where((x > 300) & (x < 320), np.nan, 1.0), grow=0.0)
+    series = region_series(fields, {"r": [(280, 50), (340, 50), (340, 100), (280, 100)]})
+    np.testing.assert_allclose(series["mean"], 1.0)
+    np.testing.assert_allclose(series["n"], (60 - 20) * 50 / 25, rtol=0.01)
+
+
+@pytest.mark.parametrize(("start", "end"), [((100, 90), (400, 90)), ((100, 30), (400, 150)), ((650, 100), (350, 100))])
+def test_integral_along_a_line_is_that_of_the_plane(start, end):
+    line = segment_series(stack(), start, end, width_mm=20)
+    length = np.hypot(end[0] - start[0], end[1] - start[1])
+    middle = (start[0] + end[0]) / 2 + 10 * (start[1] + end[1]) / 2
+    np.testing.assert_allclose(line["integral"], length * (middle + np.arange(4.0)), rtol=1e-3)
+    assert line["integral"].attrs["units"] == "K mm"
+
+
+def test_segment_covers_its_own_area():
+    share = segment_share(stack(), (103, 47), (397, 131), width_mm=12)
+    assert float(share.sum()) * 25 == pytest.approx(12 * np.hypot(294, 84), rel=0.01)
+
+
+def test_fields_between_frames_are_linear_and_nothing_is_extrapolated():
+    fields = stack()
+    wanted = TIMES[[0, 1, 3]] + np.array([30, 0, 1]) * np.timedelta64(1, "s")
+    found = fields_at(fields, wanted)
+    np.testing.assert_allclose(found[0], fields[0] + 0.5)
+    np.testing.assert_array_equal(found[1], fields[1])
+    assert np.isnan(found[2]).all()
+
+
+@pytest.mark.parametrize(
+    ("region", "message"),
+    [
+        ([(0, 0), (1, 1)], r"r: corners have shape \(2, 2\); a polygon needs at least three"),
+        ([(800, 0), (900, 0), (900, 50)], r"r: \(x 800..900, y 0..50 mm\) holds no part of the plan"),
+        ([(301, 50), (319, 50), (319, 80), (301, 80)], "r: all its cells are masked or out of view"),
+    ],
+)
+def test_regions_off_the_plan_are_refused(region, message):
+    fields = stack(lambda x, y: np.where((x > 300) & (x < 320), np.nan, 1.0))
+    with pytest.raises(RegionError, match=message):
+        region_series(fields, {"r": region})
+
+
+def test_segment_without_length_is_refused():
+    with pytest.raises(RegionError, match="covers nothing"):
+        segment_share(stack(), (10, 10), (10, 10), width_mm=5)

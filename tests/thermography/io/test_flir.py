@@ -1,0 +1,333 @@
+"""FLIR files as read: every container, packing and byte order; what is left out is said."""
+
+from __future__ import annotations
+
+import struct
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.thermography.flir_mutations import CAMERA, HOUSEKEEPING, LIMITS, PARAMETERS, SETTINGS, TIME, jpeg, sequence
+from thermography.io.flir import index_frames, read_frame
+from thermography.io.flir_writer import write_jpeg
+
+SC660_JPEG = "gtatters__Thermimage/inst/extdata/IR_2412.jpg"
+SC660_SEQ = "gtatters__Thermimage/inst/extdata/SampleSEQ.seq"
+T1030_CSQ = "gtatters__Thermimage/inst/extdata/SampleCSQ.csq"
+DUO_SEQ = "LJMUAstroecology__flirpy/test/test_data/test.seq"
+T420_FFF = "LJMUAstroecology__flirpy/test/test_data/frame_000000_le.fff"
+SC640_FFF = "VladimirSinitsin__flir_extractor/bin/examples/frame.fff"
+EX320_JPEG = "gpereyrairujo__IRimage/Windows/IRimage/sample_images/07 - BillHotFlashThermography.jpg"
+XT2_JPEG = "SanNianYiSi__thermal_parser/images/DJI_XT2.jpg"
+C3X_JPEG = "frkatona__ThermalImageFitter/Nov19/FLIR2167.jpg"
+
+
+def _segments(data: bytes) -> list[tuple[int, int]]:
+    """Return (offset, length) of every marker segment before the image."""
+    found, at = [], 2
+    while data[at + 1] == 0xE1:
+        (length,) = struct.unpack_from(">H", data, at + 2)
+        found.append((at, 2 + length))
+        at += 2 + length
+    return found
+
+
+# What files hold -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.real_data
+def test_sc660_jpeg_gives_every_field_of_its_header(real_file) -> None:
+    frame = read_frame(real_file(SC660_JPEG))
+    p = frame.parameters
+    assert frame.counts.shape == (480, 640) and frame.counts.dtype == np.uint16
+    # Printed by exiftool and by the vendor's program.
+    assert (round(p.planck_r1, 2), p.planck_b, p.planck_f, p.planck_o) == (21106.77, 1501.0, 1.0, -7340.0)
+    assert p.planck_r2 == pytest.approx(0.012545258, rel=1e-7)
+    assert p.emissivity == pytest.approx(0.95, rel=1e-7)
+    assert (p.object_distance_m, p.window_transmission, p.stored_transmission, p.relative_humidity) == (1, 1, 0, 0.5)
+    assert (frame.camera.model, frame.camera.serial, frame.camera.lens_model) == ("FLIR SC660", "404003980", "FOL38")
+    assert frame.time == np.datetime64("2013-05-10T02:22:23.335")
+    assert frame.utc_offset_minutes == -360
+    assert frame.limits.raw_minimum == 8812 and frame.limits.raw_maximum == 57240
+    assert frame.housekeeping["TSLens"] == pytest.approx(299.0975, abs=1e-4)
+    settings = frame.settings
+    assert (settings.raw_median, settings.raw_range, settings.frame_rate_Hz) == (18604, 1304, 30)
+    assert settings.focus_distance_m == pytest.approx(1.909071, abs=1e-6)
+    assert (settings.clip_maximum_K, settings.saturated_minimum_K) == pytest.approx((423.15, 213.15))
+    # The raw detector reading and the integration time of the same table are no temperatures.
+    assert set(frame.housekeeping) == {"TSAperture", "TSCapsule", "TSLens", "TSShutter", "TFpa"}
+    assert len(frame.camera_info) == 2476 and frame.camera_info[:2] == b"\x02\x00"
+
+
+@pytest.mark.real_data
+def test_sequence_is_walked_by_record_ends_not_by_magic(real_file) -> None:
+    path = real_file(SC660_SEQ)
+    # The pixels of this file hold the bytes of the magic, at which splitters cut it.
+    assert path.read_bytes().count(b"FFF\0") > 2
+    frames, rejected = index_frames([path])
+    assert [frame.time for frame in frames] == [
+        np.datetime64("2012-06-13T19:52:08.699"),
+        np.datetime64("2012-06-13T19:52:12.666"),
+    ]
+    assert rejected == []
+
+
+@pytest.mark.real_data
+def test_csq_whose_last_frame_lacks_padding_is_read_whole(real_file) -> None:
+    frames, rejected = index_frames([real_file(T1030_CSQ)])
+    assert len(frames) == 8 and rejected == []
+    assert frames[-1].notes == ("the last 4 padding bytes of the samples are missing",)
+    means = [frame.read().counts.mean() for frame in frames]
+    # A still scene at 30 Hz: neighbouring frames agree to a few counts of noise and drift.
+    assert np.ptp(means) < 30
+    steps = np.diff([frame.time for frame in frames]).astype(int)
+    assert steps.min() >= 33 and steps.max() <= 34
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize(
+    ("name", "shape", "frames"),
+    [
+        (DUO_SEQ, (512, 640), 7),
+        (T420_FFF, (240, 320), 1),
+        (SC640_FFF, (480, 640), 1),
+        (EX320_JPEG, (240, 320), 1),
+        (XT2_JPEG, (512, 640), 1),
+        (C3X_JPEG, (96, 128), 1),
+    ],
+)
+def test_other_cameras_give_smooth_pictures(real_file, name: str, shape: tuple[int, int], frames: int) -> None:
+    found, rejected = index_frames([real_file(name)])
+    assert len(found) == frames and rejected == []
+    counts = found[0].read().counts.astype(float)
+    assert counts.shape == shape
+    # Wrong byte order or a shifted line makes neighbours differ by thousands of counts.
+    assert np.median(np.abs(np.diff(counts, axis=1))) < 30
+
+
+# Containers ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("encoding", ["raw", "png", "jpegls"])
+def test_written_jpeg_and_sequence_come_back_equal(tmp_path: Path, encoding: str) -> None:
+    written = jpeg(tmp_path / "a.jpg", encoding)
+    sequence(tmp_path / "a.seq", encoding)
+    for frame in (read_frame(tmp_path / "a.jpg"), index_frames([tmp_path / "a.jpg"])[0][0].read()):
+        np.testing.assert_array_equal(frame.counts, written.counts)
+        assert not frame.counts.flags.writeable
+        assert frame.time == TIME and frame.utc_offset_minutes == 60
+        assert (frame.parameters, frame.camera, frame.limits) == (PARAMETERS, CAMERA, LIMITS)
+        assert frame.housekeeping == HOUSEKEEPING and frame.notes == ()
+    frames, rejected = index_frames([tmp_path / "a.seq"])
+    assert [frame.index for frame in frames] == [0, 1, 2] and rejected == []
+    assert {frame.samples.encoding for frame in frames} == {encoding}
+    assert {frame.settings for frame in frames} == {SETTINGS}
+
+
+def test_segments_may_come_in_any_order(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    written = jpeg(path, rows=200, columns=400)
+    data = path.read_bytes()
+    segments = _segments(data)
+    pieces = [data[at : at + length] for at, length in segments]
+    end = segments[-1][0] + segments[-1][1]
+    for order in permutations(pieces):
+        path.write_bytes(data[:2] + b"".join(order) + data[end:])
+        np.testing.assert_array_equal(read_frame(path).counts, written.counts)
+    # Exif and three pieces of one record.
+    assert len(pieces) == 4
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_directory_and_records_are_read_in_either_byte_order(tmp_path: Path, order: str) -> None:
+    path = tmp_path / "a.seq"
+    (written,) = sequence(path, frames=1)
+    data = bytearray(path.read_bytes())
+    if order == "<":
+        for at in (0x14, 0x18, 0x1C, 0x20, 0x34, 0x38, 0x3C):
+            data[at : at + 4] = data[at : at + 4][::-1]
+        for at in range(0x40, 0x200, 32):
+            entry = struct.unpack_from(">2H7I", data, at)
+            struct.pack_into("<2H7I", data, at, *entry)
+    path.write_bytes(data)
+    np.testing.assert_array_equal(read_frame(path).counts, written.counts)
+
+
+def test_big_endian_samples_are_read_by_their_own_mark(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    (written,) = sequence(path, frames=1)
+    data = bytearray(path.read_bytes())
+    raw = len(data) - written.counts.nbytes - 0x20
+    data[raw : raw + 6] = struct.pack(">3H", 2, 16, 12)
+    data[raw + 0x20 :] = written.counts.astype(">u2").tobytes()
+    path.write_bytes(data)
+    counts = read_frame(path).counts
+    np.testing.assert_array_equal(counts, written.counts)
+    assert counts.dtype.isnative
+
+
+@pytest.mark.parametrize("padding", [1, 37, 5000])
+def test_undeclared_padding_is_stepped_over_and_said(tmp_path: Path, padding: int) -> None:
+    path = tmp_path / "a.seq"
+    written = sequence(path, frames=3, padding=padding)
+    data = bytearray(path.read_bytes())
+    size = len(data) // 3
+    for start in range(0, len(data), size):
+        struct.pack_into(">I", data, start + 0x34, 0)
+    path.write_bytes(data)
+    frames, rejected = index_frames([path])
+    assert [frame.index for frame in frames] == [0, 1, 2]
+    assert frames[1].notes == (f"{padding} bytes of padding before the frame were stepped over",)
+    np.testing.assert_array_equal(frames[2].read().counts, written[2].counts)
+    assert rejected == []
+
+
+def test_declared_padding_needs_no_search(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    sequence(path, frames=2, padding=100)
+    data = bytearray(path.read_bytes())
+    size = len(data) // 2
+    for start in (0, size):
+        struct.pack_into(">I", data, start + 0x34, size)
+    path.write_bytes(data)
+    frames, rejected = index_frames([path])
+    assert len(frames) == 2 and frames[1].notes == () and rejected == []
+
+
+def test_humidity_in_percent_is_understood_and_said(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    jpeg(path)
+    data = path.read_bytes()
+    stored = struct.pack("<f", 0.5)
+    at = data.index(stored, data.index(struct.pack("<f", PARAMETERS.emissivity)))
+    path.write_bytes(data[:at] + struct.pack("<f", 45.0) + data[at + 4 :])
+    frame = read_frame(path)
+    assert frame.parameters.relative_humidity == pytest.approx(0.45)
+    assert frame.notes == ("relative humidity 45 was stored in percent",)
+
+
+def test_a_file_without_time_is_read_without_one(tmp_path: Path) -> None:
+    write_jpeg(tmp_path / "a.jpg", np.full((4, 5), 18000, np.uint16), PARAMETERS, np.datetime64("NaT"))
+    frames, rejected = index_frames([tmp_path / "a.jpg"])
+    assert np.isnat(frames[0].time) and rejected == []
+
+
+def test_a_camera_info_of_the_shortest_kind_has_no_housekeeping(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    sequence(path, frames=1)
+    data = bytearray(path.read_bytes())
+    struct.pack_into(">I", data, 0x40 + 16, 0x47C)
+    path.write_bytes(data)
+    frame = read_frame(path)
+    assert frame.housekeeping == {} and frame.time == TIME and len(frame.camera_info) == 0x47C
+    assert frame.settings == SETTINGS
+
+
+def test_a_camera_info_that_ends_after_the_calibration_has_no_time(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    sequence(path, frames=1)
+    data = bytearray(path.read_bytes())
+    struct.pack_into(">I", data, 0x40 + 16, 0x314)
+    path.write_bytes(data)
+    frame = read_frame(path)
+    assert np.isnat(frame.time) and frame.settings.raw_range == 0 and frame.settings.clip_maximum_K == 423.25
+    assert frame.parameters == PARAMETERS and frame.camera == CAMERA
+
+
+@pytest.mark.real_data
+def test_camera_temperatures_without_names_are_numbered(real_file) -> None:
+    (frame, _), _ = index_frames([real_file(SC660_SEQ)])
+    expected = {"sensor 1": 302.0170, "sensor 2": 303.4868, "sensor 3": 298.5350, "sensor 4": 300.8738}
+    assert frame.housekeeping == pytest.approx(expected, abs=1e-4)
+
+
+# Many files ----------------------------------------------------------------------------------------------------------
+
+
+def test_frames_of_many_files_come_in_order_of_time(tmp_path: Path) -> None:
+    names = ["c.jpg", "a.jpg", "b.jpg"]
+    for second, name in enumerate(names):
+        jpeg(tmp_path / name, seconds=second)
+    frames, rejected = index_frames(sorted(tmp_path.iterdir()))
+    assert [frame.path.name for frame in frames] == names and rejected == []
+
+
+def test_nothing_is_left_out_in_silence(tmp_path: Path) -> None:
+    jpeg(tmp_path / "good.jpg")
+    (tmp_path / "text.jpg").write_bytes(b"not a picture")
+    (tmp_path / "empty.seq").write_bytes(b"")
+    (tmp_path / "photo.jpg").write_bytes(b"\xff\xd8\xff\xe0\x00\x04ab\xff\xd9")
+    (tmp_path / "twin.jpg").write_bytes((tmp_path / "good.jpg").read_bytes())
+    frames, rejected = index_frames([*sorted(tmp_path.iterdir()), tmp_path / "absent.jpg"])
+    assert [frame.path.name for frame in frames] == ["good.jpg"]
+    reasons = {each.path.name: each.reason for each in rejected}
+    assert set(reasons) == {"text.jpg", "empty.seq", "photo.jpg", "twin.jpg", "absent.jpg"}
+    assert "expected a JPEG (FF D8) or an FFF record (46 46 46 00), found 6e 6f 74 20" in reasons["text.jpg"]
+    assert "found an empty file" in reasons["empty.seq"]
+    assert "expected FLIR APP1 segments, found none: the JPEG is not radiometric" in reasons["photo.jpg"]
+    assert f"has the same time {TIME} as frame 0 of" in reasons["twin.jpg"]
+    assert "No such file" in reasons["absent.jpg"]
+
+
+def test_a_damaged_frame_inside_a_sequence_costs_only_itself(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    written = sequence(path, frames=3)
+    data = bytearray(path.read_bytes())
+    size = len(data) // 3
+    # The second frame loses 100 bytes: the header of the third then stands inside its samples.
+    path.write_bytes(data[: 2 * size - 100] + data[2 * size :])
+    frames, rejected = index_frames([path])
+    assert [frame.index for frame in frames] == [0, 2]
+    np.testing.assert_array_equal(frames[1].read().counts, written[2].counts)
+    (cut,) = rejected
+    assert cut.index == 1 and "100 bytes fewer: the frame is cut short" in cut.reason
+
+
+@pytest.mark.parametrize("kept", [3, 63, 64, 500, 1000])
+def test_a_last_frame_cut_inside_its_headers_is_said(tmp_path: Path, kept: int) -> None:
+    path = tmp_path / "a.seq"
+    sequence(path, frames=3)
+    data = path.read_bytes()
+    path.write_bytes(data[: 2 * len(data) // 3 + kept])
+    frames, rejected = index_frames([path])
+    assert len(frames) == 2 and [each.index for each in rejected] == [2]
+    assert "before the end" in rejected[0].reason or f"found {kept} bytes that are neither" in rejected[0].reason
+
+
+def test_a_jpeg_that_ends_too_early_is_left_out_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    jpeg(path, rows=200, columns=400)
+    data = path.read_bytes()
+    at, length = _segments(data)[-1]
+    path.write_bytes(data[: at + length - 50])
+    frames, rejected = index_frames([path])
+    assert frames == [] and "50 bytes fewer: the frame is cut short" in rejected[0].reason
+
+
+def test_a_frame_reference_reads_in_another_process(tmp_path: Path) -> None:
+    import pickle
+
+    written = jpeg(tmp_path / "a.jpg")
+    (reference,), _ = index_frames([tmp_path / "a.jpg"])
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(reference)).read().counts, written.counts)
+
+
+def test_ten_thousand_frames_are_indexed_without_their_pixels(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    (template,) = sequence(path, frames=1, rows=100, columns=100)
+    record = path.read_bytes()
+    with path.open("wb") as file:
+        for second in range(10_000):
+            start = file.tell()
+            # A sparse file: the pixels are never written, so an index that read them would have to read 200 MB of zeros.
+            file.write(record[: 0x200 + 2476 + 0x40])
+            file.seek(start + 0x200 + 0x384)
+            file.write(struct.pack("<I", 1_772_000_000 + second))
+            file.seek(start + len(record))
+        file.truncate()
+    frames, rejected = index_frames([path])
+    assert len(frames) == 10_000 and rejected == []
+    assert frames[-1].shape == template.counts.shape
+    assert path.stat().st_size == 10_000 * len(record)

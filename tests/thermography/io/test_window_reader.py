@@ -1,0 +1,81 @@
+"""A window of frames comes out the same from memory, past the cache, from whole rows, from parts of them, and from packed frames."""
+
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.thermography.flir_mutations import frame
+from thermography.io.flir import index_frames
+from thermography.io.flir_writer import write_sequence
+from thermography.io.window_reader import WindowReader
+
+WINDOW = (slice(37, 201), slice(0, 320))
+
+
+def film(path, **options):
+    """Twelve frames of 240 x 320 pixels, 1.8 MB: more than the system reads ahead."""
+    frames = [replace(frame(240, 320, seed=i), time=frame(seconds=i).time) for i in range(12)]
+    write_sequence(path, frames, **options)
+    references, rejected = index_frames([path])
+    assert not rejected
+    return references, np.stack([one.counts for one in frames])
+
+
+def forget(path):
+    """Drop a file from the system's memory."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+
+@pytest.mark.parametrize("window", [WINDOW, (slice(0, 240), slice(0, 320)), (slice(3, 5), slice(10, 47))])
+@pytest.mark.parametrize("encoding", ["raw", "png"])
+def test_window_is_the_same_from_memory_and_from_the_disk(tmp_path, window, encoding):
+    references, counts = film(tmp_path / "a.seq", encoding=encoding)
+    expected = counts[(slice(None), *window)]
+    buffer = np.empty_like(expected)
+    for prepare in (lambda path: path.read_bytes(), forget):
+        prepare(references[0].path)
+        with WindowReader(window) as reader:
+            for start in range(0, 12, 5):
+                part = references[start : start + 5]
+                assert (reader.read(part, buffer[:5]) == expected[start : start + 5]).all()
+
+
+def test_file_that_is_not_in_memory_is_read_past_the_cache(tmp_path):
+    references, _ = film(tmp_path / "a.seq")
+    forget(references[0].path)
+    with WindowReader(WINDOW) as reader:
+        reader.read(references, np.empty((12, 164, 320), np.uint16))
+        if reader._file.direct is None:
+            pytest.skip("this file system has no direct reading")
+        assert not reader._file.in_memory
+        references[0].path.read_bytes()
+        # What another program has read since is taken from memory.
+        reader.read(references[3:], np.empty((9, 164, 320), np.uint16))
+        assert reader._file.in_memory
+
+
+def test_frames_of_several_files_and_a_system_without_direct_reading(tmp_path, monkeypatch):
+    one, first = film(tmp_path / "a.seq")
+    other, second = film(tmp_path / "b.seq")
+    monkeypatch.delattr(os, "O_DIRECT", raising=False)
+    for path in (one[0].path, other[0].path):
+        forget(path)
+    with WindowReader(WINDOW) as reader:
+        got = reader.read([one[2], other[3], other[4], one[5]], np.empty((4, 164, 320), np.uint16))
+    expected = np.stack([first[2], second[3], second[4], first[5]])
+    assert (got == expected[(slice(None), *WINDOW)]).all()
+
+
+@pytest.mark.parametrize("left", [0, 700_000])
+def test_file_that_became_shorter_is_named(tmp_path, left):
+    references, _ = film(tmp_path / "a.seq")
+    os.truncate(references[0].path, left)
+    with (
+        WindowReader(WINDOW) as reader,
+        pytest.raises(OSError, match=r"a\.seq: frame \d+ ends early; the file has become shorter since it was indexed"),
+    ):
+        reader.read(references, np.empty((12, 164, 320), np.uint16))

@@ -1,0 +1,145 @@
+"""FLIR files through xarray: lazy, with parameters as variables, honest about what was left out."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from tests.thermography.flir_mutations import PARAMETERS, TIME, frame, jpeg, sequence
+from thermography.io.flir import FrameReference, read_frame
+from thermography.io.flir_writer import write_jpeg, write_sequence
+from thermography.io.frame import FlirFormatError
+from thermography.io.xarray_backend import FlirBackendEntrypoint, open_frames, parameters_at
+from thermography.radiometry.planck import override
+
+
+def _open(path, **options) -> xr.Dataset:
+    return xr.open_dataset(path, engine=FlirBackendEntrypoint, **options)
+
+
+def test_no_pixel_is_read_at_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = sequence(tmp_path / "a.seq", frames=6)
+    read: list[int] = []
+    original = FrameReference.read_counts
+    monkeypatch.setattr(FrameReference, "read_counts", lambda self: read.append(self.index) or original(self))
+    dataset = _open(tmp_path / "a.seq")
+    chosen = dataset["counts"].isel(time=slice(1, 5, 2), row=slice(2, 9, 3), column=[0, 5])
+    assert read == []
+    np.testing.assert_array_equal(chosen[1], written[3].counts[2:9:3][:, [0, 5]])
+    assert set(read) == {3}
+
+
+@pytest.mark.parametrize(
+    "selection",
+    [
+        {"time": 2},
+        {"time": -1, "row": 3},
+        {"time": [0, 3, 1], "column": slice(None, None, -2)},
+        {"time": slice(4, None, -1), "row": [1, 1], "column": 7},
+        {"time": [], "row": 0},
+    ],
+)
+def test_every_kind_of_selection_equals_the_array(tmp_path: Path, selection: dict) -> None:
+    written = sequence(tmp_path / "a.seq", "png", frames=5)
+    everything = xr.DataArray(np.stack([each.counts for each in written]), dims=("time", "row", "column"))
+    dataset = _open(tmp_path / "a.seq")
+    np.testing.assert_array_equal(dataset["counts"].isel(selection), everything.isel(selection))
+
+
+def test_contents_of_a_dataset(tmp_path: Path) -> None:
+    sequence(tmp_path / "a.seq", frames=3)
+    dataset = _open(tmp_path / "a.seq")
+    assert dataset["counts"].dims == ("time", "row", "column") and dataset["counts"].dtype == np.uint16
+    np.testing.assert_array_equal(dataset["time"], TIME + np.arange(3).astype("timedelta64[s]"))
+    assert dataset["emissivity"].dims == () and float(dataset["planck_r1"]) == PARAMETERS.planck_r1
+    assert dataset["reflected_temperature"].attrs == {"units": "K", "units_metadata": "temperature: on_scale"}
+    assert dataset["camera_temperature"].sel(sensor="TSLens").values.tolist() == [299.25] * 3
+    assert json.loads(dataset.attrs["camera"])["serial"] == "404003980"
+    assert json.loads(dataset.attrs["rejected"]) == [] and json.loads(dataset.attrs["notes"]) == []
+    assert parameters_at(dataset, 1) == PARAMETERS
+
+
+def test_parameters_that_vary_lie_along_time(tmp_path: Path) -> None:
+    for second, emissivity in enumerate((0.5, 0.75)):
+        each = frame(seconds=second)
+        write_jpeg(tmp_path / f"{second}.jpg", each.counts, override(PARAMETERS, emissivity=emissivity), each.time)
+    dataset = _open(sorted(tmp_path.iterdir()))
+    assert dataset["emissivity"].dims == ("time",) and dataset["emissivity"].values.tolist() == [0.5, 0.75]
+    assert parameters_at(dataset, 1).emissivity == 0.75 and dataset["camera_temperature"].shape == (2, 0)
+
+
+def test_dask_chunks_read_in_parallel_and_pickle(tmp_path: Path) -> None:
+    import pickle
+
+    written = sequence(tmp_path / "a.seq", frames=7)
+    dataset = _open(tmp_path / "a.seq", chunks={"time": 2})
+    assert dataset["counts"].chunks[0] == (2, 2, 2, 1)
+    mean = pickle.loads(pickle.dumps(dataset["counts"].mean("time"))).compute(scheduler="threads")
+    np.testing.assert_allclose(mean, np.mean([each.counts for each in written], axis=0))
+
+
+def test_a_dataset_survives_netcdf(tmp_path: Path) -> None:
+    sequence(tmp_path / "a.seq", frames=2)
+    dataset = _open(tmp_path / "a.seq")
+    dataset.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as stored:
+        xr.testing.assert_identical(stored.load(), dataset.load())
+
+
+def test_what_is_left_out_is_warned_of_and_listed(tmp_path: Path) -> None:
+    jpeg(tmp_path / "a.jpg")
+    (tmp_path / "b.jpg").write_bytes(b"nothing")
+    with pytest.warns(UserWarning, match=r"1 frames left out, the first: .*b\.jpg: at 0x0: expected a JPEG"):
+        dataset = _open(sorted(tmp_path.iterdir()))
+    (rejected,) = json.loads(dataset.attrs["rejected"])
+    assert rejected["path"].endswith("b.jpg") and "expected a JPEG" in rejected["reason"]
+
+
+def test_no_frame_at_all_and_frames_of_other_sizes_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "b.seq").write_bytes(b"nothing")
+    with pytest.raises(FlirFormatError, match=r"no FLIR frame can be read: .*b\.seq"):
+        _open(tmp_path / "b.seq")
+    with pytest.raises(FlirFormatError, match="no FLIR frame can be read: no files were given"):
+        open_frames([])
+    write_sequence(tmp_path / "b.seq", [frame(8, 9), frame(9, 8, seconds=1)])
+    with pytest.raises(
+        FlirFormatError, match=r"frame 1 has \(rows, columns\) \(9, 8\), .* has \(8, 9\); open files of diff"
+    ):
+        _open(tmp_path / "b.seq")
+
+
+def test_the_engine_is_declared_under_the_name_flir() -> None:
+    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    ((name, target),) = project["entry-points"]["xarray.backends"].items()
+    module, attribute = target.split(":")
+    assert name == "flir" and getattr(importlib.import_module(module), attribute) is FlirBackendEntrypoint
+
+
+def test_files_are_recognised_by_their_start(tmp_path: Path) -> None:
+    sequence(tmp_path / "a.bin")
+    (tmp_path / "b.bin").write_bytes(b"CDF\1")
+    guess = FlirBackendEntrypoint().guess_can_open
+    assert guess(tmp_path / "a.bin") and guess(str(tmp_path / "a.bin"))
+    assert not guess(tmp_path / "b.bin") and not guess(tmp_path / "absent.seq") and not guess(3)
+    assert not guess([tmp_path / "a.bin"])
+
+
+def test_variables_can_be_dropped(tmp_path: Path) -> None:
+    sequence(tmp_path / "a.seq")
+    assert "emissivity" not in _open(tmp_path / "a.seq", drop_variables="emissivity")
+    assert "emissivity" not in _open(tmp_path / "a.seq", drop_variables=["emissivity", "planck_b"])
+
+
+@pytest.mark.real_data
+def test_a_real_series_of_jpegs_is_one_dataset(real_file) -> None:
+    paths = [real_file(f"frkatona__ThermalImageFitter/Nov19/FLIR{number}.jpg") for number in range(2167, 2216, 2)]
+    dataset = _open(paths[::-1])
+    assert dict(dataset.sizes) == {"time": 25, "row": 96, "column": 128, "sensor": 4}
+    assert (np.diff(dataset["time"]) > np.timedelta64(0)).all()
+    np.testing.assert_array_equal(dataset["counts"][24], read_frame(paths[24]).counts)

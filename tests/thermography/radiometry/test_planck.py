@@ -1,0 +1,213 @@
+"""Counts to temperature: the vendor's own numbers, the inverse, and parameters that mean nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.thermography.flir_mutations import PARAMETERS
+from thermography.io.flir import read_frame
+from thermography.io.frame import CameraParameters
+from thermography.radiometry.planck import (
+    RadiometryError,
+    black_body_signal,
+    calibrate,
+    check,
+    counts_from_temperature,
+    override,
+    path_transmission,
+    signal_slope,
+    temperature_from_counts,
+    transmission,
+)
+
+
+@pytest.mark.real_data
+def test_e40bx_equals_the_vendors_export_to_half_a_printed_digit(real_file) -> None:
+    folder = "gpereyrairujo__IRimage/Windows/IRimage/test/"
+    frame = read_frame(real_file(folder + "test_image.jpg"))
+    vendor = np.genfromtxt(real_file(folder + "csv/test_image.csv"), delimiter=",", encoding="utf-8-sig")
+    difference = calibrate(frame.counts, frame.parameters).astype(float) - vendor
+    # Half of the last printed digit, plus the resolution of the float32 kelvins on both sides (300 K: 1.5e-5 K).
+    assert np.abs(difference).max() <= 0.0005 + 1.5e-5
+    # Rounding errors of the print alone: uniform within +-0.0005, mean zero, mean size 0.00025.
+    assert np.abs(difference).mean() == pytest.approx(0.00025, rel=0.02)
+    assert abs(difference.mean()) < 2e-5
+    printed = np.round(temperature_from_counts(frame.counts, frame.parameters), 3)
+    assert np.mean(printed == vendor) > 0.9998
+
+
+@pytest.mark.real_data
+def test_sc660_sequence_stores_the_transmission_that_the_formula_gives(real_file) -> None:
+    frame = read_frame(real_file("gtatters__Thermimage/inst/extdata/SampleSEQ.seq"))
+    stored = frame.parameters.stored_transmission
+    assert stored == pytest.approx(0.993943155, abs=1e-9)
+    # float32 of the file: 3e-8.
+    assert path_transmission(frame.parameters) == pytest.approx(stored, rel=1e-7)
+
+
+def test_formula_at_hand_calculated_points() -> None:
+    """By hand, with rounded constants: S(300 K) = 21106.77 / (0.012545258 (exp(1501/300) - 1)) + 7340 = 18714.9 counts."""
+    black = replace(PARAMETERS, emissivity=1.0, object_distance_m=0.0)
+    expected = 21106.76953125 / (0.012545257806777954 * (np.exp(1501 / 300) - 1)) + 7340
+    assert expected == pytest.approx(18714.9, abs=0.05)
+    assert float(black_body_signal(300.0, black)) == pytest.approx(expected, rel=1e-12)
+    assert float(temperature_from_counts(expected, black)) == pytest.approx(26.85, abs=1e-9)
+    # A grey surface as warm as its surroundings looks like a black one, whatever its emissivity, distance and window.
+    grey = replace(black, emissivity=0.3, object_distance_m=10.0, window_transmission=0.8)
+    warm = {f"{name}_temperature_K": 300.0 for name in ("reflected", "atmospheric", "window")}
+    assert float(temperature_from_counts(expected, replace(grey, **warm))) == pytest.approx(26.85, abs=1e-9)
+
+
+def test_slope_is_the_derivative_of_the_signal() -> None:
+    kelvin = np.array([250.0, 293.15, 400.0])
+    difference = black_body_signal(kelvin + 0.01, PARAMETERS) - black_body_signal(kelvin - 0.01, PARAMETERS)
+    # The second difference of a 0.02 K step leaves 1e-8 of the slope, cancellation of 18000 counts 1e-9.
+    np.testing.assert_allclose(signal_slope(kelvin, PARAMETERS), difference / 0.02, rtol=1e-7)
+
+
+def test_calibrate_is_the_float64_formula_within_float32() -> None:
+    counts = np.arange(9000, 60000, dtype=np.uint16).reshape(-1, 100)
+    before = counts.copy()
+    temperature = calibrate(counts, PARAMETERS)
+    np.testing.assert_array_equal(counts, before)
+    assert temperature.dtype == np.float32 and temperature.shape == counts.shape
+    # Relative float32 resolution of values up to 130 degC.
+    np.testing.assert_allclose(temperature, temperature_from_counts(counts, PARAMETERS), rtol=1e-7, atol=1e-5)
+
+
+@pytest.mark.parametrize("view", [np.s_[::2, ::3], np.s_[:, 5], np.s_[3, 4]])
+def test_any_shape_and_stride_is_calibrated(view: tuple) -> None:
+    counts = np.arange(18000, 18200, dtype=np.uint16).reshape(10, 20)
+    np.testing.assert_array_equal(calibrate(counts[view], PARAMETERS), calibrate(counts, PARAMETERS)[view])
+
+
+def test_empty_counts_give_empty_temperature() -> None:
+    assert calibrate(np.empty((0, 4), np.uint16), PARAMETERS).shape == (0, 4)
+
+
+def test_counts_below_any_temperature_give_nan() -> None:
+    # S = counts - O is negative below 7340 counts minus the offset: no temperature of any surface.
+    assert np.isnan(calibrate(np.array([0, 100], np.uint16), PARAMETERS)).all()
+
+
+fractions = st.floats(0.2, 1.0)
+kelvins = st.floats(250.0, 350.0)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    temperature=st.floats(-20, 120),
+    emissivity=fractions,
+    distance=st.floats(0, 20),
+    reflected=kelvins,
+    air=kelvins,
+    window=kelvins,
+    window_transmission=fractions,
+    humidity=st.floats(0, 1),
+)
+def test_temperature_to_counts_and_back(
+    temperature: float,
+    emissivity: float,
+    distance: float,
+    reflected: float,
+    air: float,
+    window: float,
+    window_transmission: float,
+    humidity: float,
+) -> None:
+    parameters = override(
+        PARAMETERS,
+        emissivity=emissivity,
+        object_distance_m=distance,
+        reflected_temperature_K=reflected,
+        atmospheric_temperature_K=air,
+        window_temperature_K=window,
+        window_transmission=window_transmission,
+        relative_humidity=humidity,
+    )
+    counts = counts_from_temperature(temperature, parameters)
+    assert float(temperature_from_counts(counts, parameters)) == pytest.approx(temperature, abs=1e-8)
+
+
+@given(counts=st.integers(9000, 60000))
+def test_counts_to_temperature_and_back(counts: int) -> None:
+    temperature = calibrate(np.array([counts], np.uint16), PARAMETERS)
+    # float32 of a temperature near 100 degC resolves 1e-3 counts.
+    assert np.rint(counts_from_temperature(temperature, PARAMETERS))[0] == counts
+
+
+def test_an_emissivity_map_equals_one_calibration_per_region() -> None:
+    counts = np.full((2, 3), 19000, np.uint16)
+    emissivity = np.array([[0.95, 0.9, 0.5], [0.2, 1.0, 0.95]])
+    temperature = temperature_from_counts(counts, PARAMETERS, emissivity=emissivity)
+    for place, value in np.ndenumerate(emissivity):
+        alone = temperature_from_counts(19000, override(PARAMETERS, emissivity=value))
+        assert temperature[place] == pytest.approx(float(alone), abs=1e-12)
+
+
+def test_stored_transmission_is_used_until_its_causes_change() -> None:
+    stored = replace(PARAMETERS, stored_transmission=0.9)
+    assert transmission(stored) == 0.9
+    assert transmission(override(stored, emissivity=0.5)) == 0.9
+    assert transmission(override(stored, object_distance_m=1.0)) == pytest.approx(0.9939431, abs=1e-7)
+    assert transmission(override(stored, object_distance_m=1.0, stored_transmission=0.8)) == 0.8
+
+
+def test_transmission_falls_with_distance_and_humidity() -> None:
+    distances = [path_transmission(override(PARAMETERS, object_distance_m=d)) for d in (0, 1, 5, 20, 100)]
+    assert distances[0] == 1.0 and all(a > b for a, b in pairwise(distances))
+    humidities = [path_transmission(override(PARAMETERS, relative_humidity=h)) for h in (0.1, 0.5, 0.9)]
+    assert humidities[0] > humidities[1] > humidities[2]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"emissivity": 0.0}, "emissivity = 0: expected a fraction above 0 and up to 1"),
+        ({"emissivity": 97.0}, "emissivity = 97: expected a fraction"),
+        ({"window_transmission": float("nan")}, "window_transmission = nan: expected a fraction"),
+        ({"relative_humidity": 45.0}, "relative_humidity = 45: expected a fraction from 0 to 1"),
+        ({"object_distance_m": -1.0}, "object_distance_m = -1: expected 0 m or more"),
+        ({"reflected_temperature_K": 22.0}, "reflected_temperature_K = 22: expected kelvin between 100 and 3000"),
+        ({"planck_r1": 0.0}, r"planck_r1 = 0: expected a positive number \(the file is not calibrated\)"),
+        ({"atmosphere_x": float("inf")}, "atmosphere_x = inf: expected a finite number"),
+    ],
+)
+def test_parameters_without_meaning_are_refused_by_name(change: dict[str, float], message: str) -> None:
+    broken = replace(PARAMETERS, **change)
+    with pytest.raises(RadiometryError, match=message + ".*; override what the file has wrong"):
+        calibrate(np.full(3, 18000, np.uint16), broken)
+
+
+def test_all_faults_come_in_one_message() -> None:
+    with pytest.raises(RadiometryError, match=r"emissivity = 2.*relative_humidity = 3"):
+        check(replace(PARAMETERS, emissivity=2.0, relative_humidity=3.0))
+
+
+def test_a_window_that_is_not_there_needs_no_temperature() -> None:
+    check(replace(PARAMETERS, window_temperature_K=0.0))
+    with pytest.raises(RadiometryError, match="window_temperature_K = 0"):
+        check(replace(PARAMETERS, window_temperature_K=0.0, window_transmission=0.9))
+
+
+def test_unknown_names_averages_and_wild_emissivities_are_refused() -> None:
+    with pytest.raises(
+        RadiometryError, match="parameter 'distance' is not known; use one of emissivity, object_distance_m"
+    ):
+        override(PARAMETERS, distance=2.0)
+    with pytest.raises(RadiometryError, match="counts: expected uint16, got float64; use temperature_from_counts"):
+        calibrate(np.array([18000.5]), PARAMETERS)  # type: ignore[arg-type]
+    with pytest.raises(RadiometryError, match=r"emissivity from 0 to 0\.5: expected fractions above 0 and up to 1"):
+        temperature_from_counts(18000, PARAMETERS, emissivity=[0.0, 0.5])
+
+
+def test_parameters_are_plain_and_frozen() -> None:
+    with pytest.raises(AttributeError):
+        PARAMETERS.emissivity = 0.5  # type: ignore[misc]
+    assert CameraParameters(**vars(PARAMETERS)) == PARAMETERS

@@ -1,0 +1,139 @@
+"""Uncertainty of temperatures and rises, held to Monte Carlo simulation of the measurement itself."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from tests.thermography.flir_mutations import PARAMETERS
+from thermography.io.frame import CameraParameters
+from thermography.radiometry.planck import counts_from_temperature, override, temperature_from_counts
+from thermography.radiometry.uncertainty import InputUncertainty, temperature_rise_uncertainty, temperature_uncertainty
+
+DRAWS = 20_000
+#: The Monte Carlo standard deviation of 20,000 draws scatters by 0.5 %; 3 % also holds what first order leaves out.
+TOLERANCE = 0.03
+INPUTS = InputUncertainty(emissivity=0.005, window_transmission=0.01, window_temperature_K=1.0)
+
+
+def _scene(emissivity: float, window: bool) -> CameraParameters:
+    changes = {"emissivity": emissivity, "object_distance_m": 1.2, "reflected_temperature_K": 295.15}
+    if window:
+        changes |= {"window_transmission": 0.85, "window_temperature_K": 296.0}
+    return override(PARAMETERS, **changes)
+
+
+def _inputs(window: bool) -> InputUncertainty:
+    return INPUTS if window else replace(INPUTS, window_transmission=0.0, window_temperature_K=0.0)
+
+
+def _draw(parameters: CameraParameters, inputs: InputUncertainty, rng: np.random.Generator) -> list[CameraParameters]:
+    """Draw what the parameters may really have been; uniform for the fractions that must stay below one."""
+    names = [name for name in asdict(inputs) if name in asdict(parameters)]
+    drawn = []
+    for _ in range(DRAWS // 10):
+        changes = {}
+        for name in names:
+            u, value = getattr(inputs, name), getattr(parameters, name)
+            changes[name] = float(np.clip(value + u * rng.uniform(-1, 1) * 3**0.5, 0, 1 if 0 < value < 1 else np.inf))
+        drawn.append(override(parameters, **changes))
+    return drawn
+
+
+def _simulate(
+    temperatures: np.ndarray, parameters: CameraParameters, inputs: InputUncertainty, rng: np.random.Generator
+) -> np.ndarray:
+    """Return the standard deviation of what the camera would have measured: wrong parameters, noise, rounding, its offset."""
+    black = override(parameters, emissivity=1.0, object_distance_m=0.0, window_transmission=1.0)
+    counts_per_kelvin = np.diff(counts_from_temperature([30.0, 30.001], black))[0] / 0.001
+    true = counts_from_temperature(temperatures, parameters)
+    measured = []
+    for drawn in _draw(parameters, inputs, rng):
+        noise, offset = rng.normal(size=(2, 10, len(temperatures)))
+        counts = np.rint(true + inputs.netd_K * counts_per_kelvin * noise)
+        measured.append(temperature_from_counts(counts, drawn) + inputs.camera_offset_K * offset)
+    return np.concatenate(measured).std(axis=0, ddof=1)
+
+
+@pytest.mark.parametrize("window", [False, True])
+@pytest.mark.parametrize("emissivity", [0.5, 0.8, 0.95, 0.99])
+@pytest.mark.parametrize("camera_offset_K", [2 / 3**0.5, 0.0])
+def test_standard_uncertainty_equals_monte_carlo(
+    rng: np.random.Generator, emissivity: float, window: bool, camera_offset_K: float
+) -> None:
+    """Also without the accuracy of the camera, which dominates the total and would hide a wrong sensitivity."""
+    parameters = _scene(emissivity, window)
+    inputs = replace(_inputs(window), camera_offset_K=camera_offset_K)
+    temperatures = np.array([0.0, 15.0, 30.0, 45.0, 60.0])
+    expected = _simulate(temperatures, parameters, inputs, rng)
+    np.testing.assert_allclose(
+        temperature_uncertainty(temperatures, parameters, inputs).total_u, expected, rtol=TOLERANCE
+    )
+
+
+def test_rise_uncertainty_equals_monte_carlo_and_not_twice_the_level(rng: np.random.Generator) -> None:
+    parameters, inputs = _scene(0.95, window=False), InputUncertainty()
+    before, after = 22.0, 27.0
+    counts = [counts_from_temperature(t, parameters) for t in (before, after)]
+    rises = []
+    for drawn in _draw(parameters, inputs, rng):
+        # One wrong set of parameters, one offset of the camera: both frames share them.
+        low, high = (temperature_from_counts(count, drawn) for count in counts)
+        rises.append(float(high - low))
+    budget = temperature_rise_uncertainty(after, before, parameters, inputs)
+    assert float(budget.common_u) == pytest.approx(np.std(rises, ddof=1), rel=TOLERANCE)
+    level = float(temperature_uncertainty(after, parameters, inputs).common_u)
+    assert float(budget.common_u) < 0.06 < 1.0 < level
+    # Noise of two frames: sqrt(2) of one, within the 0.6 % that its sensitivity changes over 5 K.
+    one = float(temperature_uncertainty(after, parameters, inputs).per_frame_u)
+    assert float(budget.per_frame_u) == pytest.approx(np.sqrt(2) * one, rel=0.05)
+
+
+def test_averaging_reduces_the_per_frame_part_only() -> None:
+    one = temperature_uncertainty(25.0, PARAMETERS)
+    hundred = temperature_uncertainty(25.0, PARAMETERS, frames=100)
+    assert float(hundred.common_u) == float(one.common_u)
+    assert float(hundred.per_frame_u) == pytest.approx(float(one.per_frame_u) / 10)
+
+
+def test_budget_names_its_parts_and_adds_them_up() -> None:
+    temperature = np.array([[10.0, 20.0], [30.0, 40.0]])
+    before = temperature.copy()
+    budget = temperature_uncertainty(temperature, PARAMETERS, InputUncertainty(camera_scale=0.02))
+    assert set(budget.common) == {
+        "emissivity", "reflected_temperature_K", "atmospheric_temperature_K", "relative_humidity",
+        "object_distance_m", "camera_offset", "camera_scale",
+    }  # fmt: skip
+    assert set(budget.per_frame) == {"noise", "quantisation"}
+    parts = [*budget.common.values(), *budget.per_frame.values()]
+    np.testing.assert_allclose(budget.total_u**2, np.sum(np.square(parts), axis=0), rtol=1e-12)
+    np.testing.assert_array_equal(temperature, before)
+    # A surface as warm as its surroundings radiates the same whatever its emissivity.
+    at_ambient = temperature_uncertainty(20.0, override(PARAMETERS, reflected_temperature_K=293.15))
+    assert abs(float(at_ambient.common["emissivity"])) < 1e-3
+
+
+def test_netd_is_met_on_the_black_body_on_which_it_is_stated() -> None:
+    black = override(PARAMETERS, emissivity=1.0, object_distance_m=0.0)
+    budget = temperature_uncertainty(30.0, black, InputUncertainty(netd_K=0.04, netd_temperature_degC=30.0))
+    assert float(budget.per_frame["noise"]) == pytest.approx(0.04, rel=1e-9)
+    # One count of an SC660 is about 6 mK near 20 degC; rounding to it has a standard uncertainty of a twelfth's root.
+    budget = temperature_uncertainty(20.0, PARAMETERS)
+    assert float(budget.per_frame["quantisation"]) == pytest.approx(0.006 / 12**0.5, rel=0.1)
+
+
+def test_no_distance_has_a_finite_sensitivity() -> None:
+    budget = temperature_uncertainty(50.0, override(PARAMETERS, object_distance_m=0.0))
+    assert 0 < abs(float(budget.common["object_distance_m"])) < 0.1
+
+
+def test_the_uncertainty_of_metal_is_large() -> None:
+    metal, paint = (temperature_uncertainty(25.0, override(PARAMETERS, emissivity=e)) for e in (0.1, 0.95))
+    assert float(metal.total_u) > 5 * float(paint.total_u)
+
+
+def test_negative_uncertainty_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match=r"uncertainty of emissivity = -0\.1: expected 0 or more"):
+        InputUncertainty(emissivity=-0.1)

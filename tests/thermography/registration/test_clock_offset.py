@@ -1,0 +1,157 @@
+"""One clock: offsets put in are found again with an uncertainty that covers, and what cannot be known is refused."""
+
+import numpy as np
+import pytest
+
+from thermography.registration.clock_offset import ClockError, commanded_position, estimate_clock_offset
+
+T0 = np.datetime64("2026-03-09T06:30:00", "ns")
+FEED_MM_S, DWELL_S, PAUSE_S = 5.0, 2.0, 60.0
+TARGETS = np.arange(16) * 20.0
+
+
+def positioning_test(cycles):
+    """Readings of a test there and back, the table going on right after each; and the corners of the true motion."""
+    reading_s, reading_mm, way_s, way_mm, now = [], [], [], [], 0.0
+    for _ in range(cycles):
+        for k, target in enumerate([*TARGETS, *TARGETS[::-1]]):
+            before = way_mm[-1] if way_mm else target
+            now += abs(target - before) / FEED_MM_S
+            way_s.append(now)
+            way_mm.append(target)
+            now += DWELL_S if k != 16 else 2 * DWELL_S
+            way_s.append(now)
+            way_mm.append(target)
+            reading_s.append(now)
+            reading_mm.append(target)
+        now += PAUSE_S
+    return np.array(reading_s), np.array(reading_mm), np.array(way_s), np.array(way_mm)
+
+
+def campaign(rng, *, cycles=6, offset_s=37.0, rate=0.0, interval_s=9.7, u_mm=0.1, margin_s=0.0):
+    reading_s, reading_mm, way_s, way_mm = positioning_test(cycles)
+    frame_s = np.arange(-margin_s, reading_s[-1] + margin_s, interval_s) + rng.uniform(0, 1)
+    seen = np.interp(frame_s, way_s, way_mm) - 40.0 + rng.normal(0, u_mm, frame_s.size)
+    camera_s = frame_s + offset_s + rate * (frame_s - frame_s.mean())
+    stamp = [T0 + np.round(1e3 * s).astype(np.int64) * np.timedelta64(1, "ms") for s in (camera_s, reading_s)]
+    return stamp[0], seen, np.full(seen.size, u_mm), stamp[1], reading_mm
+
+
+def test_offset_of_37_s_is_found_and_its_uncertainty_covers():
+    errors, stated = [], []
+    for seed in range(12):
+        found = estimate_clock_offset(*campaign(np.random.default_rng(seed), cycles=3), feed_mm_per_min=300)
+        errors.append(found.offset_s - 37.0)
+        stated.append(found.offset_u_s)
+    errors, stated = np.array(errors), np.array(stated)
+    assert np.abs(errors).max() < 0.2
+    # 95 % expected within two standard uncertainties: 9 or fewer of 12 would happen once in 50 times.
+    assert (np.abs(errors) < 2 * stated).sum() >= 10
+    # and it is not covered by stating too much
+    assert stated.mean() < 3 * np.sqrt(np.mean(errors**2))
+
+
+def test_frames_at_few_phases_of_the_motion_leave_the_offset_open_and_say_so():
+    """Every 10 s of a motion that repeats every 6 s: two frames of three show the table standing; feed and offset share the third."""
+    covered = 0
+    for seed in (0, 1, 2, 1004):
+        # The last one meets the motion at one phase only: offset and feed are any of a line of pairs.
+        arguments = campaign(np.random.default_rng(seed), cycles=3, interval_s=10.0)
+        found = estimate_clock_offset(*arguments)
+        covered += abs(found.offset_s - 37.0) < 2 * found.offset_u_s
+        known = estimate_clock_offset(*arguments, feed_mm_per_min=300)
+        assert known.offset_s == pytest.approx(37.0, abs=0.1)
+    assert covered == 4
+
+
+@pytest.mark.slow
+def test_uncertainty_covers_in_90_of_100_runs():
+    covered = 0
+    worst = 0.0
+    for seed in range(100):
+        found = estimate_clock_offset(*campaign(np.random.default_rng(1000 + seed), cycles=6))
+        covered += abs(found.offset_s - 37.0) < 2 * found.offset_u_s
+        worst = max(worst, abs(found.offset_s - 37.0))
+    print(f"clock offset: 2 u covers in {covered} of 100 runs, largest error {worst:.4f} s")
+    assert covered >= 90
+    assert worst < 0.2
+
+
+@pytest.mark.slow
+def test_uncertainty_covers_where_frames_and_motion_keep_step():
+    """The motion repeats every 6 s: frames every 2 to 12 s see it at one, two or three phases, some of them at rest only."""
+    errors, stated = [], []
+    for seed in range(100):
+        interval_s = (2.0, 6.0, 8.0, 10.0, 12.0)[seed % 5]
+        found = estimate_clock_offset(
+            *campaign(np.random.default_rng(1000 + seed), cycles=3, interval_s=interval_s, offset_s=37.0)
+        )
+        errors.append(found.offset_s - 37.0)
+        stated.append(found.offset_u_s)
+    errors, stated = np.abs(errors), np.array(stated)
+    covered = int((errors < 2 * stated).sum())
+    print(
+        f"clock offset in step: 2 u covers in {covered} of 100 runs, largest error {errors.max():.3f} s, largest u {stated.max():.3f} s"
+    )
+    assert covered >= 90
+    # An uncertainty of the whole standing or moving time would cover as well; where the frames tell more it must be smaller.
+    assert np.median(stated) < 0.1
+
+
+def test_feed_zero_and_rate_are_found_too(rng):
+    found = estimate_clock_offset(*campaign(rng, cycles=20, rate=50e-6))
+    assert found.feed_mm_per_min == pytest.approx(300, rel=0.005)
+    assert found.start_mm == pytest.approx(40.0, abs=0.05)
+    assert found.rate == pytest.approx(50e-6, abs=4 * found.rate_u)
+    assert found.rate_u < 20e-6
+    assert found.rms_mm == pytest.approx(0.1, rel=0.2)
+
+
+def test_given_feed_is_kept_and_short_records_have_no_rate(rng):
+    found = estimate_clock_offset(*campaign(rng, cycles=2), feed_mm_per_min=300)
+    assert found.feed_mm_per_min == 300
+    assert found.rate == found.rate_u == 0
+    assert found.offset_s == pytest.approx(37.0, abs=0.1)
+
+
+def test_commanded_position_stands_reads_and_goes_on():
+    at = np.array([-1.0, 0.0, 1.0, 4.0, 5.0, 6.0, 7.0])
+    path = commanded_position(at, np.array([0.0, 6.0]), np.array([0.0, 20.0]), FEED_MM_S)
+    np.testing.assert_allclose(path, [np.nan, 0, 5, 20, 20, 20, np.nan])
+    on_arrival = commanded_position(at, np.array([0.0, 6.0]), np.array([0.0, 20.0]), FEED_MM_S, reading_at=0.0)
+    np.testing.assert_allclose(on_arrival, [np.nan, 0, 0, 10, 15, 20, np.nan])
+
+
+def test_a_still_table_determines_nothing(rng):
+    frames, seen, u, readings, targets = campaign(rng)
+    with pytest.raises(ClockError, match=r"frames of a still table do not determine a clock offset; give clock_offset"):
+        estimate_clock_offset(frames, rng.normal(0, 0.1, seen.size), u, readings, targets)
+
+
+def test_a_periodic_test_filmed_from_long_before_to_long_after_is_ambiguous(rng):
+    """Nobody knows what the table did outside the readings, so that any whole cycle fits as well."""
+    reading_s, reading_mm, way_s, way_mm = positioning_test(12)
+    middle = (reading_s >= way_s[3 * 64]) & (reading_s < way_s[9 * 64])
+    frame_s = np.arange(0, way_s[-1], 10.0)
+    seen = np.interp(frame_s, way_s, way_mm)
+    stamps = [T0 + (1e9 * s).astype("m8[ns]") for s in (frame_s, reading_s[middle])]
+    with pytest.raises(ClockError, match=r"fits clock offsets of .* s and .* s about equally well \(a periodic test\)"):
+        estimate_clock_offset(stamps[0], seen, np.full(seen.size, 0.1), stamps[1], reading_mm[middle])
+
+
+def test_another_time_zone_is_refused(rng):
+    frames, seen, u, readings, targets = campaign(rng, offset_s=7200.0)
+    with pytest.raises(
+        ClockError, match=r"do not meet within 900 s of an offset of 0 s; check the time zones \(all times are UTC\)"
+    ):
+        estimate_clock_offset(frames, seen, u, readings, targets)
+    found = estimate_clock_offset(frames, seen, u, readings, targets, expected_s=7200.0)
+    assert found.offset_s == pytest.approx(7200.0, abs=0.2)
+
+
+def test_too_few_frames_or_readings_are_refused(rng):
+    frames, seen, u, readings, targets = campaign(rng)
+    with pytest.raises(ClockError, match="the table is found in 10 frames; 20 are needed"):
+        estimate_clock_offset(frames[:10], seen[:10], u[:10], readings, targets)
+    with pytest.raises(ClockError, match="2 readings have a time"):
+        estimate_clock_offset(frames, seen, u, readings[:2], targets[:2])

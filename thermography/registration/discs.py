@@ -1,0 +1,233 @@
+"""Disc fiducials in a temperature image: found anywhere, then located to hundredths of a pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from thermography._typing import Array
+from thermography.registration.plan import Fiducial, PlanGrid
+
+#: Kernel widths in px at which spots are lifted from their background; each finds discs of 0.2 to 0.8 of its width.
+KERNEL_WIDTHS_PX = (15, 29, 57, 113)
+#: A spot is a disc if its area differs from that of the ellipse with its moments by less than this part.
+ELLIPSE_TOLERANCE = 0.12
+#: A disc whose contrast is less than this many times the noise of one pixel is not located: its centroid would err by tenths of a pixel.
+LEAST_CONTRAST = 2.0
+#: More oblique discs than this ratio of axes are not accepted as discs.
+LARGEST_ASPECT = 4.0
+
+
+@dataclass(frozen=True)
+class Spot:
+    """An elliptic spot in the image: centre, area, and contrast to its surroundings (negative: looks colder)."""
+
+    column_px: float
+    row_px: float
+    area_px: float
+    contrast_K: float
+
+
+@dataclass(frozen=True)
+class LocatedDisc:
+    """A disc's centroid in px with its standard uncertainty, its image area and its contrast to the table around it."""
+
+    column_px: float
+    row_px: float
+    u_px: float
+    area_px: float
+    contrast_K: float
+
+
+def detect_discs(temperature: NDArray[np.floating], *, limit: int = 40) -> list[Spot]:
+    """Find elliptic spots that are colder or warmer than what surrounds them, without knowing where or how large.
+
+    Parameters
+    ----------
+    temperature
+        One frame (row, column) in degC; the mean of several where contrast is low.
+    limit
+        How many spots to return at most, strongest first.
+
+    Returns
+    -------
+    list[Spot]
+        Strongest contrast first.
+    """
+    smooth = cv2.GaussianBlur(np.nan_to_num(temperature).astype(np.float32), (0, 0), 0.8)
+    spots: list[Spot] = []
+    for width in KERNEL_WIDTHS_PX:
+        kernel = np.ones((width, width), np.uint8)
+        closed = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, kernel) - smooth
+        opened = smooth - cv2.morphologyEx(smooth, cv2.MORPH_OPEN, kernel)
+        for lifted, sign in ((closed, -1.0), (opened, 1.0)):
+            spots.extend(_spots_of(lifted, sign, width))
+    spots.sort(key=lambda spot: -abs(spot.contrast_K))
+    distinct: list[Spot] = []
+    for spot in spots:
+        reach = 0.6 * np.sqrt(spot.area_px / np.pi)
+        if all(np.hypot(spot.column_px - s.column_px, spot.row_px - s.row_px) > reach for s in distinct):
+            distinct.append(spot)
+    return distinct[:limit]
+
+
+def _spots_of(lifted: NDArray[np.float32], sign: float, width: int) -> list[Spot]:
+    median = float(np.median(lifted))
+    noise = 1.4826 * float(np.median(np.abs(lifted - median)))
+    marked = (lifted > median + 6 * max(noise, 1e-3)).astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(marked, connectivity=4)
+    spots = []
+    for label in range(1, count):
+        left, top, w, h, area = stats[label]
+        if (
+            area < 12
+            or max(w, h) > width
+            or left == 0
+            or top == 0
+            or left + w == lifted.shape[1]
+            or top + h == lifted.shape[0]
+        ):
+            continue
+        window = (slice(top, top + h), slice(left, left + w))
+        values = np.where(labels[window] == label, lifted[window], 0.0)
+        peak = float(np.percentile(values[values > 0], 80))
+        spot = _ellipse(values > peak / 2, sign * peak)
+        if spot is not None:
+            spots.append(Spot(spot.column_px + left, spot.row_px + top, spot.area_px, spot.contrast_K))
+    return spots
+
+
+def _ellipse(mask: NDArray[np.bool_], contrast_K: float) -> Spot | None:
+    """The mask as a spot, if its area is that of the ellipse with the same second moments."""
+    rows, columns = np.nonzero(mask)
+    area = len(rows)
+    if area < 12:
+        return None
+    # A pixel has a variance of 1/12 of its own, which a small disc must not be denied.
+    axes = np.linalg.eigvalsh(np.cov(np.stack([columns, rows]), bias=True) + np.eye(2) / 12)
+    expected = 4 * np.pi * np.sqrt(axes[0] * axes[1])
+    if abs(expected / area - 1) > ELLIPSE_TOLERANCE or np.sqrt(axes[1] / axes[0]) > LARGEST_ASPECT:
+        return None
+    return Spot(float(columns.mean()), float(rows.mean()), float(area), contrast_K)
+
+
+def locate_disc(
+    temperature: NDArray[np.floating],
+    fiducial: Fiducial,
+    grid: PlanGrid,
+    predicted_px: Array,
+    jacobian: Array,
+    *,
+    reach_px: float = 3.0,
+) -> LocatedDisc | str:
+    """Locate a disc near a predicted place by the centroid of its coverage, from 0 (table) to 1 (disc) in every pixel.
+
+    Coverage is taken between two planes, one fitted to the table around the disc and one to its inside, so that neither a
+    gradient on the table nor the sign of the contrast moves the centroid.
+
+    Parameters
+    ----------
+    temperature
+        Frame (row, column) in degC.
+    fiducial, grid
+        The disc, and the plan whose edge bounds the table around it.
+    predicted_px
+        Where to start, (column, row) px.
+    jacobian
+        Sensor position by plan position there, (2, 2) px/mm.
+    reach_px
+        How far from the start the centroid may end.
+
+    Returns
+    -------
+    LocatedDisc or str
+        The disc, or the reason why it was not located.
+    """
+    radius_mm = fiducial.diameter_mm / 2
+    to_mm = np.linalg.inv(jacobian)
+    half = np.ceil(2.3 * radius_mm * np.linalg.norm(jacobian, axis=1)).astype(int) + 1
+    blur_mm = 1.5 * float(np.linalg.norm(to_mm, 2))
+    centre = np.asarray(predicted_px, float)
+    for _ in range(12):
+        left, top = np.round(centre).astype(int) - half
+        right, bottom = np.round(centre).astype(int) + half + 1
+        if left < 0 or top < 0 or right > temperature.shape[1] or bottom > temperature.shape[0]:
+            return "lies at the edge of the frame"
+        columns, rows = np.meshgrid(np.arange(left, right), np.arange(top, bottom))
+        offsets = np.stack([columns - centre[0], rows - centre[1]], axis=-1)
+        plan_mm = offsets @ to_mm.T + (fiducial.x_mm, fiducial.y_mm)
+        distance = np.hypot(plan_mm[..., 0] - fiducial.x_mm, plan_mm[..., 1] - fiducial.y_mm)
+        result = _coverage_centroid(
+            temperature[top:bottom, left:right],
+            offsets,
+            distance,
+            radius_mm,
+            blur_mm,
+            grid.contains(plan_mm, margin_mm=blur_mm),
+        )
+        if isinstance(result, str):
+            return result
+        shift, located = result
+        centre = centre + shift
+        if np.hypot(*(centre - predicted_px)) > reach_px:
+            return f"no disc within {reach_px:.1f} px of where it should be"
+        if np.hypot(*shift) < 1e-3:
+            break
+    area = np.pi * radius_mm**2 * abs(np.linalg.det(jacobian))
+    if abs(located.area_px / area - 1) > 0.35:
+        return f"what is seen has {located.area_px / area:.2f} times the area of a disc of {fiducial.diameter_mm:g} mm"
+    return LocatedDisc(float(centre[0]), float(centre[1]), located.u_px, located.area_px, located.contrast_K)
+
+
+def _coverage_centroid(
+    values: NDArray[np.floating],
+    offsets: Array,
+    distance: Array,
+    radius_mm: float,
+    blur_mm: float,
+    on_table: NDArray[np.bool_],
+) -> tuple[Array, LocatedDisc] | str:
+    around = (distance > radius_mm + blur_mm) & (distance < 2.2 * radius_mm + blur_mm) & on_table
+    inside = distance < max(radius_mm - blur_mm, 0.45 * radius_mm)
+    counted = distance < radius_mm + blur_mm
+    if around.sum() < 12 or inside.sum() < 3:
+        return "is too small in the image or too near the plan's edge"
+    basis = np.concatenate([offsets, np.ones((*distance.shape, 1))], axis=-1)
+    table, noise = _robust_plane(basis, values, around)
+    if inside.sum() >= 20:
+        disc, _ = _robust_plane(basis, values, inside)
+    else:
+        disc = np.full(values.shape, np.median(values[inside]))
+    contrast = float((disc - table)[inside].mean())
+    if abs(contrast) < max(LEAST_CONTRAST * noise, 1e-3):
+        return f"has no contrast ({contrast:.3f} K with {noise:.3f} K of noise)"
+    step = disc - table
+    safe = np.where(
+        np.sign(step) == np.sign(contrast), np.maximum(np.abs(step), 0.3 * abs(contrast)), 0.3 * abs(contrast)
+    ) * np.sign(contrast)
+    coverage = np.where(counted, (values - table) / safe, 0.0)
+    area = float(coverage.sum())
+    if area <= 0:
+        return "has no contrast"
+    shift = (coverage[..., None] * offsets).sum(axis=(0, 1)) / area
+    moments = (offsets[counted] ** 2).sum(axis=0)
+    u_px = noise / abs(contrast) * float(np.sqrt(moments.mean())) / area
+    return shift, LocatedDisc(np.nan, np.nan, u_px, area, contrast)
+
+
+def _robust_plane(basis: Array, values: NDArray[np.floating], mask: NDArray[np.bool_]) -> tuple[Array, float]:
+    """Fit a plane to the masked pixels, leaving out what is more than four deviations off; plane everywhere, and noise."""
+    kept = mask.copy()
+    for _ in range(3):
+        coefficients = np.linalg.lstsq(basis[kept], values[kept], rcond=None)[0]
+        plane = basis @ coefficients
+        residual = values - plane
+        noise = 1.4826 * float(np.median(np.abs(residual[kept])))
+        keep = mask & (np.abs(residual) <= max(4 * noise, 1e-9))
+        if keep.sum() < 6 or (keep == kept).all():
+            break
+        kept = keep
+    return plane, noise
