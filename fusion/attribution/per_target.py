@@ -1,9 +1,9 @@
 """Every pixel against every target and direction, fast: whitening fixed under the null, maxima over permutations in tiles.
 
 Where :mod:`fusion.attribution.family_wise` estimates the drift anew for every candidate, this screen whitens each series once,
-by the drift that fits it best without any temperature. Series with the same drift share the whitened film, all of them the cycle's mean instant; one tile
-of the film goes through lags, series and permutations while it stays in cache. It keeps its family-wise level, at somewhat less power
-for lagged sources; Westfall and Young (1993), *Resampling-based multiple testing*.
+by the drift that fits it best without any temperature. Series with the same drift share the whitened film, all of them the cycle's mean
+instant; one tile of the film goes through lags, series and permutations while it stays in cache. It keeps its family-wise level, at
+somewhat less power for lagged sources; Westfall and Young (1993), *Resampling-based multiple testing*.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """What a residual shows, shape by shape: along time, at one instant, in frequency, along the axis, by direction.
 
 Shapes among the sites are tested on the estimated noise of every reading (:mod:`fusion.diagnosis.remainder`), those along time
-on the innovations: each reading against its prediction from all before it, in standard deviations. Where profile, effects and drift are all there is,
-innovations are exchangeable, so that permuting them gives every statistic its null, on the readings' own uneven times. Flat and linear
-shapes are what the drift is free to follow; of them the size is told, not a p-value.
+on the innovations: each reading against its prediction from all before it, in standard deviations. Where profile, effects and drift are
+all there is, innovations are exchangeable, so that permuting them gives every statistic its null, on the readings' own uneven times. Flat
+and linear shapes are what the drift is free to follow; of them the size is told, not a p-value.
 """
 
 from __future__ import annotations

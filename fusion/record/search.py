@@ -1,8 +1,8 @@
 """The closed loop on a record: what the quasi-static model of the temperatures lacks, and the error before and after.
 
-The same procedure as along an axis (:mod:`fusion.loop.closed_loop`), with what a record asks for: every channel has a drift and coefficients
-of its own, an effect enters only if it also predicts better the load cycles that follow, and the prediction is that of coefficients
-shrunk together. The last fifth of the time is sealed and touched once, at the end.
+The same procedure as along an axis (:mod:`fusion.loop.closed_loop`), with what a record asks for: every channel has a drift and
+coefficients of its own, an effect enters only if it also predicts better the load cycles that follow, and the prediction is that of
+coefficients shrunk together. The last fifth of the time is sealed and touched once, at the end.
 """
 
 from __future__ import annotations
