@@ -216,7 +216,3 @@ def _sample(seconds: Array, weights: Array, frame_seconds: Array) -> Array:
     np.add.at(sampling, (rows, before), weights * (1.0 - share))
     np.add.at(sampling, (rows, before + 1), weights * share)
     return sampling
-
-
-
-

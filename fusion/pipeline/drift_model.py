@@ -37,16 +37,6 @@ def effect_names() -> tuple[str, ...]:
     return (*library(), QUASI_STATIC)
 
 
-
-
-
-
-
-
-
-
-
-
 def model_drift(
     source: Source, fields: xr.Dataset, fused: xr.Dataset, deviations: xr.Dataset, *, report: Report
 ) -> Outcome:
@@ -199,8 +189,6 @@ def anomaly_part(anomaly: Anomaly, diagnosis: Diagnosis) -> dict[str, Any]:
             **diagnosis.evidence,
         },
     }
-
-
 
 
 def loop_variables(

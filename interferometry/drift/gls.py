@@ -340,7 +340,6 @@ def estimate(
     return _settle(fit) if settling else fit
 
 
-
 @njit(cache=True)
 def _filter(
     seconds: Array,
