@@ -13,6 +13,10 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from fusion.errors import FusionError
+from interferometry.errors import InterferometryError
+from thermography.errors import ThermographyError
+
 app = typer.Typer(
     help="Explain the thermal drift of a machine-tool axis from FLIR frames and laser readings.",
     no_args_is_help=True,
@@ -23,7 +27,6 @@ app = typer.Typer(
 console = Console()
 errors = Console(stderr=True, soft_wrap=True)
 BAD_INPUT, STOPPED = 2, 130
-_PACKAGES = ("fusion", "thermography", "interferometry")
 
 
 class ExportFormat(StrEnum):
@@ -41,9 +44,7 @@ def _answering() -> Iterator[None]:
     """Turn bad input into one paragraph and exit code 2; a fault of the program itself keeps its traceback."""
     try:
         yield
-    except ValueError as error:
-        if type(error).__module__.split(".")[0] not in _PACKAGES:
-            raise
+    except (FusionError, ThermographyError, InterferometryError) as error:
         errors.print(f"thermofuse: {error}", style="bold", highlight=False, markup=False)
         raise typer.Exit(BAD_INPUT) from None
     except OSError as error:

@@ -10,12 +10,14 @@ from pathlib import Path
 
 import pooch
 
+from fusion.errors import FusionError
+
 REGISTRY = Path(__file__).resolve().parents[1] / "data" / "registry.csv"
 #: Names a folder that holds the files under their registry names; then nothing is downloaded.
 FOLDER_VARIABLE = "THERMOFUSE_DATA"
 
 
-class DatasetError(ValueError):
+class DatasetError(FusionError):
     """A measured file that is not listed, not there, or not what the registry promises."""
 
 

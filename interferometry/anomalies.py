@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from interferometry._typing import Array
+from interferometry.errors import InterferometryError
 
 #: Share of the error probability given to each kind of anomaly (Bonferroni weights; they sum to one).
 WEIGHTS = {"scatter": 0.7, "slow": 0.1, "step": 0.1, "periodic": 0.1}
@@ -94,12 +95,12 @@ def detect_anomalies(
 
     Raises
     ------
-    ValueError
+    InterferometryError
         ``permutations`` are too few to reach ``level`` in the kind with the smallest weight.
     """
     needed = int(np.ceil(1.0 / (level * min(WEIGHTS.values()))))
     if permutations + 1 < needed:
-        raise ValueError(f"permutations={permutations} cannot reach level={level}; use at least {needed - 1}")
+        raise InterferometryError(f"permutations={permutations} cannot reach level={level}; use at least {needed - 1}")
     rng = np.random.default_rng(seed)
     found = _scatter_anomalies(estimated, level, permutations, rng)
     if estimated.sizes["cycle"] >= SHORTEST_TEST_CYCLES:

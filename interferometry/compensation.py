@@ -15,6 +15,7 @@ import ref_index
 import xarray as xr
 
 from interferometry._typing import Array
+from interferometry.errors import InterferometryError
 
 #: Vacuum wavelength of the stabilised HeNe laser in nm, as genuine files imply it (632.990616 .. 632.990634).
 VACUUM_WAVELENGTH_NM = 632.990625
@@ -25,7 +26,7 @@ LONGEST_GAP_S = 900.0
 LARGEST_SCALE = 1e-3
 
 
-class CompensationError(ValueError):
+class CompensationError(InterferometryError):
     """The compensation cannot be done with these conditions; the message says what to change."""
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from interferometry.errors import InterferometryError
 from interferometry.neighbours import build_chart, evaluate_neighbours, simulate_derived_sequence
 
 if TYPE_CHECKING:
@@ -64,13 +65,13 @@ def evaluate_best_estimate(deviations: xr.Dataset, *, link: int = 2) -> xr.Datas
 
     Raises
     ------
-    ValueError
+    InterferometryError
         The link names no target that has a neighbour before it.
     """
     links = evaluate_neighbours(deviations)
     numbers = links["link"].values.tolist()
     if link not in numbers:
-        raise ValueError(f"link={link} is not one of {numbers}")
+        raise InterferometryError(f"link={link} is not one of {numbers}")
     along = deviations["target"].values[np.argsort(deviations["position"].values, kind="stable")].tolist()
     near = deviations["deviation"].sel(target=along[along.index(link) - 1]).drop_vars("target")
     far = deviations["deviation"].sel(target=link).drop_vars("target")
@@ -119,11 +120,11 @@ def evaluate_position_history(deviations: xr.Dataset, *, target: int = 4) -> xr.
 
     Raises
     ------
-    ValueError
+    InterferometryError
         There is no such target.
     """
     if target not in deviations["target"].values:
-        raise ValueError(f"target={target} is not one of {deviations['target'].values.tolist()}")
+        raise InterferometryError(f"target={target} is not one of {deviations['target'].values.tolist()}")
     return deviations[["deviation", "time", "position"]].sel(target=target)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import xarray as xr
 
 from interferometry.deviations import DIRECTIONS
+from interferometry.errors import InterferometryError
 
 __all__ = ["QUANTITIES", "STANDARD_CYCLES", "Iso230Budget", "budget_table", "evaluate", "evaluate_windows"]
 
@@ -51,7 +52,7 @@ def evaluate(
 
     Raises
     ------
-    ValueError
+    InterferometryError
         The window names a cycle that was not measured, or no target has two readings in it.
     """
     deviations = deviations.reindex(direction=list(DIRECTIONS))
@@ -120,7 +121,7 @@ def evaluate_windows(
 
     Raises
     ------
-    ValueError
+    InterferometryError
         No target has two readings in the whole test.
     """
     numbers = deviations["cycle"].values.tolist()
@@ -165,7 +166,7 @@ def _select(deviations: xr.Dataset, cycles: Sequence[int] | None) -> tuple[np.nd
         return deviations["deviation"].values, numbers
     absent = sorted(set(cycles) - set(numbers.tolist()))
     if absent:
-        raise ValueError(f"cycles {absent} of the window were not measured; the test holds {numbers.tolist()}")
+        raise InterferometryError(f"cycles {absent} of the window were not measured; the test holds {numbers.tolist()}")
     chosen = np.isin(numbers, list(cycles))
     return deviations["deviation"].values[chosen], numbers[chosen]
 
@@ -178,7 +179,7 @@ def _leave_out_single_readings(
     single = (count < 2) & measured
     if not ((count >= 2) & measured).any():
         held = "one cycle" if x.shape[0] == 1 else f"{x.shape[0]} cycles"
-        raise ValueError(
+        raise InterferometryError(
             f"no target has two readings from one side in a window of {held}; ISO 230-2 asks for {STANDARD_CYCLES} cycles, and "
             "scatter needs two: measure more, or widen the window"
         )
@@ -247,7 +248,7 @@ class Iso230Budget:
             if one.name.split("_")[0] in ("difference", "nominal"):
                 continue
             if getattr(self, one.name) < 0:
-                raise ValueError(
+                raise InterferometryError(
                     f"{one.name}={getattr(self, one.name)} is negative; a standard uncertainty is 0 or more"
                 )
 

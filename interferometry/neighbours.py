@@ -14,6 +14,8 @@ import numpy as np
 import xarray as xr
 from scipy import optimize, stats
 
+from interferometry.errors import InterferometryError
+
 #: Probability that two standard deviations of a normal distribution cover; Student's t replaces the 2 below it.
 TWO_SIGMA_PROBABILITY = 0.9545
 #: Number of repetitions from which the normal distribution may be taken.
@@ -105,12 +107,12 @@ def evaluate_neighbours(deviations: xr.Dataset) -> xr.Dataset:
 
     Raises
     ------
-    ValueError
+    InterferometryError
         Fewer than two targets.
     """
     x = _along_axis(deviations)
     if x.sizes["target"] < 2:
-        raise ValueError(f"{x.sizes['target']} target has no neighbour; measure at least two target positions")
+        raise InterferometryError(f"{x.sizes['target']} target has no neighbour; measure at least two target positions")
     near = x.isel(target=slice(None, -1)).rename(target="link").assign_coords(link=x["target"].values[1:])
     far = x.isel(target=slice(1, None)).rename(target="link")
     difference = near - far
@@ -155,11 +157,11 @@ def build_chart(
 
     Raises
     ------
-    ValueError
+    InterferometryError
         An unknown reference.
     """
     if reference not in ("time", "first_cycle"):
-        raise ValueError(f"reference={reference!r} is neither 'time' nor 'first_cycle'")
+        raise InterferometryError(f"reference={reference!r} is neither 'time' nor 'first_cycle'")
     x = _along_axis(deviations)
     links = evaluate_neighbours(deviations)
     at = _reference_cycles(deviations, x, reference, reference_s)

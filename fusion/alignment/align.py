@@ -15,13 +15,14 @@ from scipy import ndimage
 
 from fusion._typing import Array
 from fusion.alignment.reflection_patch import find_switching_patch
+from fusion.errors import FusionError
 
 DIMS = ("cycle", "direction", "target")
 #: Half the width over which a line or point average is taken, in plan cells: enough to halve the noise of a single cell.
 _HALF_WIDTH_CELLS = 1.5
 
 
-class AlignmentError(ValueError):
+class AlignmentError(FusionError):
     """The two recordings cannot be brought together; the message names the times or places and what to do."""
 
 

@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fusion._typing import Array
+from fusion.errors import FusionError
 
 #: Names of the air and material quantities that a laser's environment unit logs.
 ENVIRONMENT = ("air_temperature", "air_pressure", "relative_humidity", "material_temperature")
@@ -24,7 +25,7 @@ ENVIRONMENT = ("air_temperature", "air_pressure", "relative_humidity", "material
 _GAP_INTERVALS = 5.0
 
 
-class ReadingsError(ValueError):
+class ReadingsError(FusionError):
     """A campaign that holds too little to be modelled; the message says what is missing."""
 
 

@@ -25,10 +25,19 @@ from numpy.typing import NDArray
 from fusion._typing import Array
 from fusion.alignment.first_order_lag import respond
 from fusion.attribution.drift_channels import DriftSeries, read_clock, reduce_channels, target_table
-from fusion.attribution.family_wise import CHECKS, LAGS_S, LEVEL, Film, Findings, Tested, evaluate_films
+from fusion.attribution.family_wise import (
+    CHECKS,
+    LAGS_S,
+    LEVEL,
+    AttributionResult,
+    FamilyTest,
+    FieldSeries,
+    evaluate_films,
+)
 from fusion.attribution.per_target import screen
 from fusion.attribution.thermal_modes import Modes, Region, localise_modes, region_courses
 from fusion.attribution.warm_up import Excitation, describe_excitation
+from fusion.errors import FusionError
 from fusion.products.grouped import joined
 
 #: Verdict codes of the maps, in the order of the CF flag meanings.
@@ -43,7 +52,7 @@ FAVOUR = {"modes": 0.25}
 _GAP_SHARE = 0.2
 
 
-class CorrelationError(ValueError):
+class CorrelationError(FusionError):
     """The field cannot be correlated with the drift; the message says what is missing."""
 
 
@@ -107,7 +116,7 @@ def correlate(
     excitation = describe_excitation(film.seconds, film.values)
     modes = localise_modes(film.values)
     courses = {"modes": modes.courses, "regions": region_courses(film.values, seen, field, regions)}
-    films = {"cells": film} | {name: Film(film.seconds, few) for name, few in courses.items() if few.shape[1]}
+    films = {"cells": film} | {name: FieldSeries(film.seconds, few) for name, few in courses.items() if few.shape[1]}
     found = evaluate_films(
         series,
         films,
@@ -143,7 +152,7 @@ def correlate(
     return dataset
 
 
-def read_film(field: xr.DataArray, frame_seconds: Array) -> tuple[Film, NDArray[np.bool_]]:
+def read_film(field: xr.DataArray, frame_seconds: Array) -> tuple[FieldSeries, NDArray[np.bool_]]:
     """Flatten a field (time, y, x) to the cells that are seen in nearly every frame; short gaps are interpolated in time."""
     values = field.values.reshape(field.sizes["time"], -1).astype(float)
     gaps = ~np.isfinite(values)
@@ -156,13 +165,13 @@ def read_film(field: xr.DataArray, frame_seconds: Array) -> tuple[Film, NDArray[
     for column in np.flatnonzero(gaps.any(axis=0)):
         known = ~gaps[:, column]
         values[~known, column] = np.interp(frame_seconds[~known], frame_seconds[known], values[known, column])
-    return Film(frame_seconds, values - values.mean(axis=0)), seen
+    return FieldSeries(frame_seconds, values - values.mean(axis=0)), seen
 
 
 def _beside_leader(
-    tested: Tested,
+    tested: FamilyTest,
     series: Sequence[DriftSeries],
-    modes: Film,
+    modes: FieldSeries,
     excitation: Excitation,
     lags_s: Sequence[float],
     draws: int,
@@ -182,7 +191,7 @@ def _beside_leader(
         given = respond(modes.seconds, lag_s, modes.values[:, [leader]])
         again = evaluate_films(
             series,
-            {"modes": Film(modes.seconds, modes.values[:, others])},
+            {"modes": FieldSeries(modes.seconds, modes.values[:, others])},
             excitation,
             lags_s=lags_s,
             draws=draws,
@@ -195,14 +204,14 @@ def _beside_leader(
     return xr.DataArray(p_value, dims=("channel", "mode"), attrs=attrs)
 
 
-def _session_verdict(found: Findings, excitation: Excitation) -> int:
+def _session_verdict(found: AttributionResult, excitation: Excitation) -> int:
     if excitation.warm_up_only:
         return NOT_SEPARABLE
     passed = any((tested.p_value <= LEVEL).any() for tested in found.sets.values())
     return ATTRIBUTABLE if passed else NOT_ATTRIBUTABLE
 
 
-def _naive(series: DriftSeries, film: Film) -> Array:
+def _naive(series: DriftSeries, film: FieldSeries) -> Array:
     """Plain correlation (columns,) of a series with the unlagged film: what a map without any of the above would show."""
     seen = series.sampling @ film.values
     seen = seen - seen.mean(axis=0)
@@ -212,7 +221,11 @@ def _naive(series: DriftSeries, film: Film) -> Array:
 
 
 def describe(
-    tested: Tested, series: Sequence[DriftSeries], film: Film, lags_s: Sequence[float], excitation: Excitation
+    tested: FamilyTest,
+    series: Sequence[DriftSeries],
+    film: FieldSeries,
+    lags_s: Sequence[float],
+    excitation: Excitation,
 ) -> Quantities:
     """What the test found per channel and column, by name: values (channels, columns) and attributes with units."""
     verdict = np.where(tested.p_value <= LEVEL, ATTRIBUTABLE, NOT_ATTRIBUTABLE)
@@ -246,7 +259,7 @@ def describe(
     }
 
 
-def describe_session(found: Findings, excitation: Excitation) -> xr.Dataset:
+def describe_session(found: AttributionResult, excitation: Excitation) -> xr.Dataset:
     """What holds for the whole session: thresholds, noise and unexplained drift per channel, false alarms, verdict."""
     cells = found.sets["cells"]
     nulls = list(found.banks) + [found.banks[0]] * (len(cells.names) - len(found.banks))
@@ -360,7 +373,7 @@ def _over_columns(leading: str, trailing: str, quantities: Quantities) -> xr.Dat
 
 def _screen_targets(
     table: tuple[list[str], Array, Array, Array],
-    film: Film,
+    film: FieldSeries,
     excitation: Excitation,
     lags_s: Sequence[float],
     draws: int,

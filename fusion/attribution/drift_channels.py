@@ -15,6 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion._typing import Array
+from fusion.errors import FusionError
 
 CHANNELS = ("common", "proportional", "reversal")
 #: Backfitting stops when no target's mean moves by more than this share of the spread of the readings.
@@ -24,7 +25,7 @@ _MAX_ROUNDS = 500
 MIN_CYCLES = 12
 
 
-class ChannelError(ValueError):
+class ChannelError(FusionError):
     """The readings cannot be reduced to drift channels; the message names the cycles and what to do."""
 
 

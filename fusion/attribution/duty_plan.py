@@ -19,6 +19,7 @@ from scipy import stats
 from fusion._typing import Array
 from fusion.alignment.first_order_lag import respond
 from fusion.attribution.randomised_duty import GRID_S, LEVEL, DutyLaw
+from fusion.errors import FusionError
 from interferometry.drift.state_space import drift_system
 
 #: Candidate mean dwells, s, and test durations, h.
@@ -29,7 +30,7 @@ _SCHEDULES = 24
 _EFFECTIVE_RESPONSES = 4.0
 
 
-class DutyPlanError(ValueError):
+class DutyPlanError(FusionError):
     """No schedule can be proposed; the message says why."""
 
 

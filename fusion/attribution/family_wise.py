@@ -51,7 +51,7 @@ _RUN_SHARE = 0.1
 
 
 @dataclass(frozen=True)
-class Film:
+class FieldSeries:
     """Temperatures to test: columns over time.
 
     Attributes
@@ -65,7 +65,7 @@ class Film:
 
 
 @dataclass(frozen=True)
-class Tested:
+class FamilyTest:
     """What the test of one set of temperatures found; columns are cells, modes or regions.
 
     Attributes
@@ -91,7 +91,7 @@ class Tested:
 
 
 @dataclass(frozen=True)
-class Findings:
+class AttributionResult:
     """What the test of all sets found.
 
     Attributes
@@ -102,7 +102,7 @@ class Findings:
     false_alarm_rate : share of fresh nulls in which anything of any set passed
     """
 
-    sets: Mapping[str, Tested]
+    sets: Mapping[str, FamilyTest]
     banks: tuple[NullBank, ...]
     draws: int
     false_alarm_rate: float
@@ -111,7 +111,7 @@ class Findings:
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def evaluate_films(
     series: Sequence[DriftSeries],
-    films: Mapping[str, Film],
+    films: Mapping[str, FieldSeries],
     excitation: Excitation,
     *,
     lags_s: Sequence[float] = LAGS_S,
@@ -121,7 +121,7 @@ def evaluate_films(
     beside: Sequence[Array] = (),
     rng: np.random.Generator,
     progress: Callable[[float], None] | None = None,
-) -> Findings:
+) -> AttributionResult:
     """Test all columns of all films as sources of all series, with one family-wise error over films, columns, lags and series.
 
     The first two series, where they are "common" and "proportional", are also tested together at the same lag. The first `draws`
@@ -164,7 +164,7 @@ def evaluate_films(
     p_values, thresholds = _family_wise([row for tally in tallies for row in tally.statistic], maxima[:, :draws], ease)
     alarms = (maxima[:, draws:] > thresholds[:, None]).reshape(len(films), len(names), checks)
     rows = [slice(k * len(names), (k + 1) * len(names)) for k in range(len(films))]
-    return Findings(
+    return AttributionResult(
         sets={
             name: tally.finish(names, np.stack(p_values[row]), thresholds[row], _rate(alarms[k]))
             for k, (name, tally, row) in enumerate(zip(films, tallies, rows, strict=True))
@@ -200,9 +200,9 @@ class _Tally:
         # Coefficient, its uncertainty, and its uncertainty under the fitted null.
         self.effects = np.zeros((3, channels, columns))
 
-    def finish(self, names: Sequence[str], p_value: Array, threshold: Array, false_alarm_rate: float) -> Tested:
+    def finish(self, names: Sequence[str], p_value: Array, threshold: Array, false_alarm_rate: float) -> FamilyTest:
         """Findings of the set, once its p values (channels, columns) and thresholds (channels,) are known."""
-        return Tested(
+        return FamilyTest(
             names=tuple(names),
             statistic=self.statistic,
             lag_index=self.lag_index,
@@ -232,7 +232,7 @@ def _seen_through(series: DriftSeries, operators: Sequence[Array]) -> Array32:
     return np.stack([series.sampling @ operator for operator in operators]).astype(np.float32)
 
 
-def _test_film(sources: Sequence[_Source], film: Film, lags: int, tally: _Tally) -> Iterator[slice]:
+def _test_film(sources: Sequence[_Source], film: FieldSeries, lags: int, tally: _Tally) -> Iterator[slice]:
     """Test a film tile by tile; yields each slice of columns that is done."""
     values = film.values.astype(np.float32)
     for tile in tiles(values.shape[1] * lags, lags):

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from fusion._typing import Array
 from fusion.alignment.first_order_lag import lag_operators
-from fusion.attribution.family_wise import LAGS_S, Film, nuisance_columns
+from fusion.attribution.family_wise import LAGS_S, FieldSeries, nuisance_columns
 from fusion.attribution.likelihood_ratio import Array32, Grid, NullBank, fit_null, whitening_grid
 from fusion.attribution.warm_up import Excitation
 
@@ -87,7 +87,7 @@ def screen(
     values: Array,
     seconds: Array,
     sampling: Array,
-    film: Film,
+    film: FieldSeries,
     excitation: Excitation,
     *,
     lags_s: Sequence[float] = LAGS_S,

@@ -21,6 +21,7 @@ from fusion._typing import Array
 from fusion.alignment.first_order_lag import respond
 from fusion.attribution.drift_channels import DriftSeries, read_clock, reduce_channels
 from fusion.attribution.likelihood_ratio import NullBank, estimate_effects, likelihood_ratios, null_bank, whiten_series
+from fusion.errors import FusionError
 
 #: Time constants of the responses to duty, s: one body, or one body behind another of the second constant.
 RESPONSES_S = tuple((first, second) for second in (0.0, 1800.0) for first in (600.0, 1800.0, 3600.0, 7200.0))
@@ -33,7 +34,7 @@ _LEVEL_TOLERANCE = 0.05
 _IMPOSSIBLE = 1e-4
 
 
-class RandomisationError(ValueError):
+class RandomisationError(FusionError):
     """Duty cannot be tested; the message says what is missing."""
 
 

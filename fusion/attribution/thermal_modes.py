@@ -24,6 +24,7 @@ from skimage.measure import points_in_poly
 from fusion._typing import Array
 from fusion.attribution.family_wise import nuisance_columns
 from fusion.attribution.warm_up import describe_excitation, thermal_modes
+from fusion.errors import FusionError
 
 #: Rotation stops when the varimax criterion grows by less than this share.
 _ROTATION_TOLERANCE = 1e-6
@@ -33,7 +34,7 @@ _DISC_CORNERS = 48
 _COLUMNS = ("name", "x_mm", "y_mm")
 
 
-class RegionError(ValueError):
+class RegionError(FusionError):
     """A region that cannot be used; the message names file or place and what to do."""
 
 

@@ -16,6 +16,7 @@ from fusion._typing import Array
 from fusion.attribution.attribute import ATTRIBUTABLE, NOT_ATTRIBUTABLE, NOT_SEPARABLE
 from fusion.attribution.family_wise import LEVEL
 from fusion.attribution.leading_source import find_source
+from fusion.errors import FusionError
 
 Mask = NDArray[np.bool_]
 #: Strongest candidates near every place, per session.
@@ -29,7 +30,7 @@ _BLANK = {"statistic": -1.0, "p_value": 1.0, "sensitivity": 0.0, "sensitivity_u"
 _DISAGREEMENT = 3.0
 
 
-class ConjunctionError(ValueError):
+class ConjunctionError(FusionError):
     """Two campaigns cannot be compared; the message says in what they differ."""
 
 
@@ -57,7 +58,7 @@ class Common:
 
 
 @dataclass(frozen=True)
-class Agreement:
+class SourceAgreement:
     """One source that either session shows, and what the other one shows there.
 
     Attributes
@@ -87,7 +88,7 @@ class Agreement:
         return self.agrees and self.separate
 
 
-def compare_sources(first: xr.Dataset, second: xr.Dataset) -> list[Agreement]:
+def compare_sources(first: xr.Dataset, second: xr.Dataset) -> list[SourceAgreement]:
     """Return every source that passes in either of two sessions, once, and whether the other session agrees.
 
     A session's sources are its thermal modes that pass, each with the part of the drift that it goes with most; where none passes, its
@@ -104,7 +105,7 @@ def compare_sources(first: xr.Dataset, second: xr.Dataset) -> list[Agreement]:
         channel: [_strongest_nearby(_candidates(one, channel), reach) for one in (first, second)]
         for channel in _shared_channels(first, second)
     }
-    found: list[Agreement] = []
+    found: list[SourceAgreement] = []
     for at, session in enumerate((first, second)):
         for channel, x_mm, y_mm, separate in _passing(session):
             if channel not in near or _already(found, channel, x_mm, y_mm):
@@ -115,7 +116,7 @@ def compare_sources(first: xr.Dataset, second: xr.Dataset) -> list[Agreement]:
             p_value = _at(places, "p_value", row, column)
             agrees = max(p_value) <= LEVEL and bool(_consistent(*places)[row, column])
             found.append(
-                Agreement(
+                SourceAgreement(
                     channel=channel,
                     x_mm=x_mm,
                     y_mm=y_mm,
@@ -155,7 +156,7 @@ def _passing(session: xr.Dataset) -> list[tuple[str, float, float, bool]]:
     return sources
 
 
-def _already(found: list[Agreement], channel: str, x_mm: float, y_mm: float) -> bool:
+def _already(found: list[SourceAgreement], channel: str, x_mm: float, y_mm: float) -> bool:
     """Whether a source at this place is listed as one on which both sessions agree."""
     return any(
         one.agrees and one.channel == channel and np.hypot(one.x_mm - x_mm, one.y_mm - y_mm) <= SAME_PLACE_MM

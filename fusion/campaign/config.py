@@ -22,6 +22,7 @@ from pydantic_core import PydanticCustomError
 
 from fusion.campaign.messages import Place, describe, find_line, key_lines, suggest
 from fusion.campaign.quantities import QuantityError, read_quantity
+from fusion.errors import FusionError
 
 #: Names of the effects that a campaign may declare; a user's own are added by the entry point of `fusion.effects.library`.
 EFFECT_NAMES = (
@@ -31,7 +32,7 @@ EFFECT_NAMES = (
 )  # fmt: skip
 
 
-class CampaignError(ValueError):
+class CampaignError(FusionError):
     """A campaign that cannot be run; the message names file, line, key, value and remedy."""
 
 

@@ -21,6 +21,7 @@ from fusion.attribution.thermal_modes import Region, read_regions
 from fusion.campaign.config import Campaign, InterferometryTable, PlanTable, ThermographyTable, relative_name
 from fusion.campaign.logged_tables import read_drivers, split_heading
 from fusion.campaign.recompensation import compensate_readings, see_material
+from fusion.errors import FusionError
 from fusion.products.contracts import check
 from fusion.products.results import Notice
 from interferometry.contract import DEVIATIONS
@@ -183,7 +184,7 @@ def _refuse_too_few(source: Source) -> None:
         )
 
 
-class SourceError(ValueError):
+class SourceError(FusionError):
     """The inputs of a campaign cannot be used together; the message says which and what to do."""
 
 

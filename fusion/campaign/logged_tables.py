@@ -16,6 +16,7 @@ import xarray as xr
 
 from fusion.campaign.config import Campaign, CampaignError, RecordTable
 from fusion.campaign.quantities import QuantityError, conversion, unit_name
+from fusion.errors import FusionError
 from interferometry.io.delimited import (
     BadReading,
     Rejected,
@@ -189,7 +190,7 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, list[Rejected]]:
             encoding="utf-8-sig",
         )
     if any("loss of data" in str(one.message) for one in told):
-        raise ValueError("the lines hold more fields than the header names; name every column")
+        raise FusionError("the lines hold more fields than the header names; name every column")
     # Lines are counted in the file.
     frame.index += before
     skipped = [found for one in told for found in _SKIPPED.findall(str(one.message))]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import re
 
+from fusion.errors import FusionError
+
 #: Accepted units per canonical unit, as ``(factor, offset)``: canonical = value * factor + offset.
 UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "mm": {
@@ -38,7 +40,7 @@ _KINDS = {
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*")
 
 
-class QuantityError(ValueError):
+class QuantityError(FusionError):
     """A value whose number or unit cannot be understood; the message says what to write instead."""
 
 

@@ -27,6 +27,7 @@ from fusion.attribution.likelihood_ratio import (
     whitening_grid,
 )
 from fusion.attribution.warm_up import warm_up_columns
+from fusion.errors import FusionError
 
 #: Lags of the local temperature, s.
 LAGS_S = (0.0, 600.0, 1800.0, 3600.0)
@@ -35,7 +36,7 @@ _STEP_MARGIN = 5
 _LEVELS = 499
 
 
-class DiagnosisError(ValueError):
+class DiagnosisError(FusionError):
     """An anomaly cannot be diagnosed; the message names the target and what is missing."""
 
 

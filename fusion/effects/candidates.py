@@ -1,4 +1,4 @@
-"""The members of the effects: columns per reading for given time constants, instants, periods.
+"""The candidates of the effects: columns per reading for given time constants, instants, periods.
 
 Units: every column is in um per unit of its coefficient. Sources stand with the effects in :mod:`fusion.effects.library`.
 """
@@ -39,7 +39,7 @@ class Prior:
 
 
 @dataclass(frozen=True)
-class Member:
+class Candidate:
     """One way an effect could enter: columns (n, q) in um per unit coefficient, and the parameters that made them.
 
     ``prior`` is what is known of the first coefficient beforehand, None where nothing is. The last ``beside`` columns may be there without
@@ -68,16 +68,16 @@ def table_offset_column(readings: Readings) -> Array:
     return readings.at(readings.series["mean_rise"])
 
 
-def declared_members(name: str) -> Callable[[Readings, Mapping[str, float], Member | None], Iterator[Member]]:
-    """Return the one member of a declared effect."""
+def declared_candidates(name: str) -> Callable[[Readings, Mapping[str, float], Candidate | None], Iterator[Candidate]]:
+    """Return the one candidate of a declared effect."""
 
-    def members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+    def candidates(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
         if name == "axis_expansion":
-            yield Member(_column(axis_expansion_column(readings)), {}, ("ppm/K",))
+            yield Candidate(_column(axis_expansion_column(readings)), {}, ("ppm/K",))
         else:
-            yield Member(_column(table_offset_column(readings)), {}, ("um/K",))
+            yield Candidate(_column(table_offset_column(readings)), {}, ("um/K",))
 
-    return members
+    return candidates
 
 
 def warm_up(readings: Readings, minutes: float) -> Array:
@@ -87,7 +87,7 @@ def warm_up(readings: Readings, minutes: float) -> Array:
     return 1.0 - np.exp(-readings.seconds / (60.0 * minutes))
 
 
-def _near(near: Member | None, parameter: str, grid: Iterable[float], *, ratio: float) -> tuple[float, ...]:
+def _near(near: Candidate | None, parameter: str, grid: Iterable[float], *, ratio: float) -> tuple[float, ...]:
     """The grid of a parameter, or a finer one within a factor of what was found and of the grid's ends.
 
     Zero has no factor, and so no finer grid.
@@ -109,7 +109,7 @@ _SECOND_BODY_TRIED = (0.25,)
 
 def _responses(
     series: Series,
-    near: Member | None,
+    near: Candidate | None,
     grid: Iterable[float],
     *,
     ratio: float,
@@ -126,7 +126,7 @@ def _responses(
             yield first.lagged(60.0 * behind), found
 
 
-def _states(readings: Readings, near: Member | None) -> Iterator[tuple[Array, Parameters]]:
+def _states(readings: Readings, near: Candidate | None) -> Iterator[tuple[Array, Parameters]]:
     """Thermal states that a part of the machine may follow: lagged table, lagged drivers, a plain warm-up."""
     if "mean_rise" in readings.series:
         for lagged, found in _responses(readings.series["mean_rise"], near, (0.0, *_STATE_LAGS_MIN), ratio=2.0):
@@ -140,7 +140,7 @@ def _states(readings: Readings, near: Member | None) -> Iterator[tuple[Array, Pa
         yield warm_up(readings, minutes), {"follows": "warm_up", "time_constant_min": minutes}
 
 
-def thermal_lag_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+def thermal_lag_candidates(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Lagged copies of the seen temperatures."""
     # Between two frames the field is a straight line; a shorter lag is not in the data.
     frames_min = float(np.median(np.diff(readings.series["mean_rise"].seconds))) / 60.0
@@ -149,13 +149,15 @@ def thermal_lag_members(readings: Readings, _: Mapping[str, float], near: Member
             continue
         axis = readings.at(readings.series["axis_integral"].lagged(60.0 * minutes)) * 1e-3
         offset = readings.at(readings.series["mean_rise"].lagged(60.0 * minutes))
-        yield Member(_column(offset), {"time_constant_min": minutes, "shape": "flat"}, ("um/K",))
-        yield Member(_column(axis), {"time_constant_min": minutes, "shape": "linear"}, ("ppm/K",))
+        yield Candidate(_column(offset), {"time_constant_min": minutes, "shape": "flat"}, ("um/K",))
+        yield Candidate(_column(axis), {"time_constant_min": minutes, "shape": "linear"}, ("ppm/K",))
         both: Parameters = {"time_constant_min": minutes, "shape": "flat and linear"}
-        yield Member(_column(offset, axis), both, ("um/K", "ppm/K"))
+        yield Candidate(_column(offset, axis), both, ("um/K", "ppm/K"))
 
 
-def unseen_heat_source_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+def unseen_heat_source_candidates(
+    readings: Readings, _: Mapping[str, float], near: Candidate | None
+) -> Iterator[Candidate]:
     """Responses to the logged drivers."""
     for name in readings.drivers:
         unit = readings.series[name].units
@@ -172,9 +174,9 @@ def unseen_heat_source_members(readings: Readings, _: Mapping[str, float], near:
                 known = [settled * factor for factor in along]
                 start = [memory * factor for factor in along]
                 per = (_per(unit),) * len(along)
-                yield Member(_column(*known), {**found, "start": "settled"}, per)
+                yield Candidate(_column(*known), {**found, "start": "settled"}, per)
                 units = per + ("um",) * len(along)
-                yield Member(_column(*known, *start), {**found, "start": "free"}, units, beside=len(along))
+                yield Candidate(_column(*known, *start), {**found, "start": "free"}, units, beside=len(along))
 
 
 def refractivity_change_ppm(readings: Readings) -> Array:
@@ -184,32 +186,38 @@ def refractivity_change_ppm(readings: Readings) -> Array:
     return np.asarray((index - index[0]) * 1e6, float)
 
 
-def dead_path_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+def dead_path_candidates(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """The index of air, the same at all positions."""
-    yield Member(_column(refractivity_change_ppm(readings) * 1e-3), {}, ("mm",))
+    yield Candidate(_column(refractivity_change_ppm(readings) * 1e-3), {}, ("mm",))
 
 
-def air_index_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+def air_index_candidates(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """The index of air, along the axis."""
-    yield Member(_column(refractivity_change_ppm(readings) * 1e-3 * readings.position_mm), {}, ("1",))
+    yield Candidate(_column(refractivity_change_ppm(readings) * 1e-3 * readings.position_mm), {}, ("1",))
 
 
-def material_compensation_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+def material_compensation_candidates(
+    readings: Readings, _: Mapping[str, float], near: Candidate | None
+) -> Iterator[Candidate]:
     """The material probe, along the axis."""
     material = readings.at(readings.series["material_temperature"])
-    yield Member(_column((material - material[0]) * readings.position_mm * 1e-3), {}, ("ppm/K",))
+    yield Candidate(_column((material - material[0]) * readings.position_mm * 1e-3), {}, ("ppm/K",))
 
 
-def angular_growth_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+def angular_growth_candidates(
+    readings: Readings, _: Mapping[str, float], near: Candidate | None
+) -> Iterator[Candidate]:
     """States times the square of the position."""
     for state, found in _states(readings, near):
-        yield Member(_column(state * readings.share**2), found, (_state_unit(readings, found),))
+        yield Candidate(_column(state * readings.share**2), found, (_state_unit(readings, found),))
 
 
-def reversal_drift_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+def reversal_drift_candidates(
+    readings: Readings, _: Mapping[str, float], near: Candidate | None
+) -> Iterator[Candidate]:
     """States times half the direction of approach."""
     for state, found in _states(readings, near):
-        yield Member(_column(state * 0.5 * readings.sign), found, (_state_unit(readings, found),))
+        yield Candidate(_column(state * 0.5 * readings.sign), found, (_state_unit(readings, found),))
 
 
 def _state_unit(readings: Readings, found: Mapping[str, float | str]) -> str:
@@ -222,13 +230,15 @@ def _per(unit: str) -> str:
     return "um" if unit == "1" else f"um/({unit})"
 
 
-def step_event_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+def step_event_candidates(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Steps at the instants that can be tried."""
     instants = (
         event_instants(readings) if near is None or near.event_s is None else instants_near(readings, near.event_s)
     )
     for instant in instants:
-        yield Member(_column((readings.seconds >= instant).astype(float)), {"time_s": float(instant)}, ("um",), instant)
+        yield Candidate(
+            _column((readings.seconds >= instant).astype(float)), {"time_s": float(instant)}, ("um",), instant
+        )
 
 
 def periods_min(readings: Readings) -> Array:
@@ -251,7 +261,9 @@ def off_the_cycle(readings: Readings, frequencies: Array) -> Array:
     return np.asarray(frequencies[np.abs(frequencies - order * cycle) > 4.0 / _span_min(readings)])
 
 
-def periodic_disturbance_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+def periodic_disturbance_candidates(
+    readings: Readings, _: Mapping[str, float], near: Candidate | None
+) -> Iterator[Candidate]:
     """Waves in time, flat or along the axis."""
     # A long campaign tells so many periods apart that the shortest are left out: the search stays linear in the readings.
     periods = (
@@ -262,9 +274,9 @@ def periodic_disturbance_members(readings: Readings, _: Mapping[str, float], nea
     for period in periods:
         phase = 2 * np.pi * readings.seconds / (60.0 * period)
         waves = _column(np.cos(phase), np.sin(phase))
-        yield Member(waves, {"period_min": float(period), "shape": "flat"}, ("um", "um"))
+        yield Candidate(waves, {"period_min": float(period), "shape": "flat"}, ("um", "um"))
         linear = waves * readings.share[:, None]
-        yield Member(linear, {"period_min": float(period), "shape": "linear"}, ("um", "um"))
+        yield Candidate(linear, {"period_min": float(period), "shape": "linear"}, ("um", "um"))
 
 
 def spatial_frequencies(readings: Readings) -> Array:
@@ -313,7 +325,7 @@ def _close_periods(readings: Readings, found_min: float) -> Array:
     return np.asarray(1.0 / off_the_cycle(readings, near))
 
 
-def pitch_error_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+def pitch_error_candidates(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Waves along the axis times slow states."""
     states = list(_states(readings, near))
     if near is None:
@@ -335,28 +347,28 @@ def pitch_error_members(readings: Readings, _: Mapping[str, float], near: Member
                 "period_mm": float(1 / frequency),
                 "possible_leads": aliased_lead_mm(readings, frequency),
             }
-            yield Member(waves * state[:, None], parameters, (_state_unit(readings, found),) * 2)
+            yield Candidate(waves * state[:, None], parameters, (_state_unit(readings, found),) * 2)
 
 
-def laser_warm_up_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+def laser_warm_up_candidates(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Exponentials along the axis, with or without dead path."""
     for minutes in _near(near, "time_constant_min", LASER_WARM_UPS_MIN, ratio=2.0):
         settling = 1.0 - warm_up(readings, minutes)
         linear = settling * readings.position_mm * 1e-3
-        yield Member(_column(linear), {"time_constant_min": minutes, "shape": "linear"}, ("ppm",))
+        yield Candidate(_column(linear), {"time_constant_min": minutes, "shape": "linear"}, ("ppm",))
         both: Parameters = {"time_constant_min": minutes, "shape": "linear with dead path"}
-        yield Member(_column(linear, settling), both, ("ppm", "um"))
+        yield Candidate(_column(linear, settling), both, ("ppm", "um"))
 
 
-def camera_offset_members(
-    readings: Readings, coefficients: Mapping[str, float], near: Member | None
-) -> Iterator[Member]:
+def camera_offset_candidates(
+    readings: Readings, coefficients: Mapping[str, float], near: Candidate | None
+) -> Iterator[Candidate]:
     """What a jump of the field does to the prediction of the model."""
     weight = _field_weight(readings, coefficients)
     for before, after, size in jumps(readings.series["mean_rise"]):
         seen = np.clip((readings.seconds - before) / (after - before), 0.0, 1.0)
         parameters: Parameters = {"time_s": after, "jump_of_the_field_K": size}
-        yield Member(_column(seen * weight), parameters, ("K",), event_s=after)
+        yield Candidate(_column(seen * weight), parameters, ("K",), event_s=after)
 
 
 def _field_weight(readings: Readings, coefficients: Mapping[str, float]) -> Array:
@@ -365,25 +377,25 @@ def _field_weight(readings: Readings, coefficients: Mapping[str, float]) -> Arra
     return -(offset + coefficients.get("axis_expansion", 0.0) * readings.position_mm * 1e-3)
 
 
-def reflected_source_members(
-    readings: Readings, coefficients: Mapping[str, float], near: Member | None
-) -> Iterator[Member]:
+def reflected_source_candidates(
+    readings: Readings, coefficients: Mapping[str, float], near: Candidate | None
+) -> Iterator[Candidate]:
     """What a switching patch does to the prediction of the model."""
     false_rise = readings.at(readings.series["patch_mean_rise"])
     false_integral = readings.at(readings.series["patch_axis_integral"]) * 1e-3
     wrong = (
         coefficients.get("table_offset", 0.0) * false_rise + coefficients.get("axis_expansion", 0.0) * false_integral
     )
-    yield Member(_column(-wrong), {}, ("1",))
+    yield Candidate(_column(-wrong), {}, ("1",))
 
 
-def sensor_fault_members(readings: Readings, _: Mapping[str, float], near: Member | None) -> Iterator[Member]:
+def sensor_fault_candidates(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Steps and ramps along the axis where a sensor jumps or sticks."""
     for name, before, after, size in sensor_jumps(readings):
         late = (readings.seconds >= 0.5 * (before + after)).astype(float)
         jumped: Parameters = {"sensor": name, "time_s": after, "jump": size}
-        yield Member(_column(late * readings.position_mm * 1e-3), jumped, ("ppm",), event_s=after)
+        yield Candidate(_column(late * readings.position_mm * 1e-3), jumped, ("ppm",), event_s=after)
     for name, start in stuck_sensors(readings):
         since = np.clip(readings.seconds - start, 0.0, None) / 3600.0
         stuck: Parameters = {"sensor": name, "time_s": start, "jump": 0.0}
-        yield Member(_column(since * readings.position_mm * 1e-3), stuck, ("ppm/h",), event_s=start)
+        yield Candidate(_column(since * readings.position_mm * 1e-3), stuck, ("ppm/h",), event_s=start)

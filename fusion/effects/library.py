@@ -1,6 +1,6 @@
 """The library of effects: what a measured drift may contain, each with its physics, its columns and its parameters.
 
-An effect offers *members*: columns per reading for given nonlinear parameters (a time constant, an instant, a period). Which member
+An effect offers *candidates*: columns per reading for given nonlinear parameters (a time constant, an instant, a period). Which candidate
 fits, and whether the effect deserves to be named at all, is decided in :mod:`fusion.loop.closed_loop`. Signatures: effects.md of the facts
 (shape along the axis, sign with the direction of approach, course in time); physics by the sources named with each effect.
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from fusion.alignment.readings import Readings
 from fusion.effects import candidates as of
-from fusion.effects.candidates import Member, Prior
+from fusion.effects.candidates import Candidate, Prior
 from fusion.effects.jumps import jumps, sensor_jumps, stuck_sensors
 
 
@@ -30,8 +30,8 @@ class Effect:
     name : as in results.json
     physics : one paragraph for the report
     source : where the signature comes from
-    members : from the readings, the coefficients of the current model and, for a closer look, a member near which to search, to the
-        members that can be tried
+    candidates : from the readings, the coefficients of the current model and, for a closer look, a candidate near which to search, to the
+        candidates that can be tried
     needs : why it cannot be tried with these readings, or None
     prior : what is known of the first coefficient where the effect is declared
     excited_by : ``"field"`` or ``"driver"`` where the effect is only told apart by switching of that kind, else ``""``
@@ -40,7 +40,7 @@ class Effect:
     name: str
     physics: str
     source: str
-    members: Callable[[Readings, Mapping[str, float], Member | None], Iterator[Member]]
+    candidates: Callable[[Readings, Mapping[str, float], Candidate | None], Iterator[Candidate]]
     needs: Callable[[Readings], str | None] = field(default=lambda readings: None)
     excited_by: str = ""
     prior: Prior | None = None
@@ -97,7 +97,7 @@ LIBRARY: tuple[Effect, ...] = (
         "axis_expansion",
         "The table lengthens along the measured line as it warms: one coefficient times the integral of the seen rise.",
         "ISO/TR 16015; steel 11.7 ppm/K",
-        of.declared_members("axis_expansion"),
+        of.declared_candidates("axis_expansion"),
         _needs_field,
         prior=Prior(11.7, EXPANSION_U_PPM_PER_K),
     ),
@@ -105,14 +105,14 @@ LIBRARY: tuple[Effect, ...] = (
         "table_offset",
         "Everything between table and laser moves together with the table's mean temperature: the same shift at all positions.",
         "ISO 230-3, thermal distortion",
-        of.declared_members("table_offset"),
+        of.declared_candidates("table_offset"),
         _needs_field,
     ),
     Effect(
         "thermal_lag",
         "A remote or massive part follows the seen table late, with a time constant of its own, and goes on moving after it.",
         "first-order response of a lumped heat capacity",
-        of.thermal_lag_members,
+        of.thermal_lag_candidates,
         _needs_field,
         excited_by="field",
     ),
@@ -121,7 +121,7 @@ LIBRARY: tuple[Effect, ...] = (
         "A source out of the camera's sight (spindle, motor, bearing) warms with the logged load and moves the reading with its "
         "own time constant.",
         "Mayr et al. 2012, CIRP Annals 61, 771",
-        of.unseen_heat_source_members,
+        of.unseen_heat_source_candidates,
         _needs_driver,
         excited_by="driver",
     ),
@@ -129,79 +129,79 @@ LIBRARY: tuple[Effect, ...] = (
         "dead_path",
         "Air between the interferometer and its zero is not compensated: the reading shifts with the index of air.",
         "Ciddor 1996; ISO 230-1",
-        of.dead_path_members,
+        of.dead_path_candidates,
         _needs_air,
     ),
     Effect(
         "air_index",
         "The index of air is not, or wrongly, compensated along the measured length.",
         "Ciddor 1996: -0.955 ppm/K, +0.268 ppm/hPa",
-        of.air_index_members,
+        of.air_index_candidates,
         _needs_air,
     ),
     Effect(
         "material_compensation",
         "The expansion coefficient or the place of the material probe is wrong: a stretch that follows the probe.",
         "ISO 230-2, 7.1; ISO/TR 16015",
-        of.material_compensation_members,
+        of.material_compensation_candidates,
         _needs_material,
     ),
     Effect(
         "angular_growth",
         "Guide or table bends as it warms; the Abbe offset turns the growing angle into an error that is quadratic along the axis.",
         "Abbe principle, Bryan 1979: 1 arcsec x 100 mm = 0.48 um",
-        of.angular_growth_members,
+        of.angular_growth_candidates,
     ),
     Effect(
         "reversal_drift",
         "Backlash or wind-up changes with temperature: both directions move apart by the same amount at every position.",
         "ISO 230-2, reversal value B",
-        of.reversal_drift_members,
+        of.reversal_drift_candidates,
         _needs_both_directions,
     ),
     Effect(
         "step_event",
         "A mount, clamp or optic slips once: all readings after that instant are shifted.",
         "level shift at one instant",
-        of.step_event_members,
+        of.step_event_candidates,
     ),
     Effect(
         "periodic_disturbance",
         "Cooling, coolant or air conditioning switches in a fixed rhythm.",
         "line in the spectrum of the readings' own times",
-        of.periodic_disturbance_members,
+        of.periodic_disturbance_candidates,
     ),
     Effect(
         "pitch_error",
         "The cyclic error of the screw changes as it warms: a wave along the axis whose size follows a thermal state.",
         "periodic error of the lead; aliased where the spacing is a multiple of the lead",
-        of.pitch_error_members,
+        of.pitch_error_candidates,
     ),
     Effect(
         "camera_offset",
         "The camera's zero steps between two frames (flat-field correction): the field is wrong from then on, the machine did not move.",
         "uniform jump of the field without a jump of the readings",
-        of.camera_offset_members,
+        of.camera_offset_candidates,
         _needs_jump,
     ),
     Effect(
         "reflected_source",
         "A warm body mirrors in the table: a patch of the field changes faster than heat can flow, and the readings do not follow.",
         "reflection of (1 - emissivity) of the surroundings",
-        of.reflected_source_members,
+        of.reflected_source_candidates,
         _needs_patch,
     ),
     Effect(
         "laser_warm_up",
         "The laser's wavelength settles during the first minutes: a stretch, and a shift by the dead path, that die away.",
         "frequency stabilisation of a He-Ne laser",
-        of.laser_warm_up_members,
+        of.laser_warm_up_candidates,
     ),
     Effect(
         "sensor_fault",
         "A sensor of the environment unit jumps or sticks, and the instrument's own compensation believes it.",
         "jump or frozen value in the environment log",
-        of.sensor_fault_members,
+        of.sensor_fault_candidates,
         _needs_sensor_episode,
     ),
 )

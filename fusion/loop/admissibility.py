@@ -10,7 +10,7 @@ import numpy as np
 
 from fusion._typing import Array
 from fusion.alignment.readings import Readings, Series, sample_noise
-from fusion.effects.candidates import Member, warm_up
+from fusion.effects.candidates import Candidate, warm_up
 from fusion.effects.library import Effect
 from fusion.model.fit import ModelFit
 from fusion.model.least_squares import residual_squares
@@ -26,18 +26,18 @@ _SMOOTH_GAIN = 2.0
 _PROTECTION_MIN = (10.0, 30.0, 90.0, 170.0)
 
 
-def blocked_reason(effect: Effect, member: Member, part: Readings, model: ModelFit) -> str | None:
+def blocked_reason(effect: Effect, candidate: Candidate, part: Readings, model: ModelFit) -> str | None:
     """Why this effect must not be named although it fits, or None.
 
     Parameters
     ----------
-    effect, member : the candidate, with columns for the readings the model was fitted to
+    effect, candidate : the candidate, with columns for the readings the model was fitted to
     part : those readings
     model : the model without the candidate
     """
     if not effect.excited_by:
         return None
-    share = warm_up_share(part, member)
+    share = warm_up_share(part, candidate)
     single = share > WARM_UP_SHARE
     if effect.excited_by == "field":
         noise = noise_share(part.series["mean_rise"])
@@ -47,20 +47,20 @@ def blocked_reason(effect: Effect, member: Member, part: Readings, model: ModelF
                 f"the noise of the mean rise is {100 * noise:.2f} % of its range; above {100 * limit:.1f} % a lagged, smoother copy "
                 "wins by its smoothness alone"
             )
-    gain = _gain(model, member, protection(part) if single else None)
+    gain = _gain(model, candidate, protection(part) if single else None)
     if single and gain < _PROTECTED_GAIN:
         return (
             f"one warm-up only excited the machine ({100 * share:.1f} % of the candidate is a plain warm-up), and beside free "
             f"warm-ups it gains only {gain:.1f} in log-likelihood; switch the load on purpose to tell"
         )
-    if effect.excited_by == "field" and _follows_the_rate(model, member):
+    if effect.excited_by == "field" and _follows_the_rate(model, candidate):
         return (
             "beside it the field's own coefficient takes the opposite sign and nearly cancels it: the readings follow the rate at "
             "which the table warms, which is the power of a source, not a lag"
         )
     if effect.excited_by == "field":
-        smoothed = smoothed_copy(part, float(member.parameters["time_constant_min"]))
-        advantage = _gain(model, member, None) - _gain(model, smoothed, None)
+        smoothed = smoothed_copy(part, float(candidate.parameters["time_constant_min"]))
+        advantage = _gain(model, candidate, None) - _gain(model, smoothed, None)
         if advantage < _SMOOTH_GAIN:
             return (
                 f"a copy of the field that is only smoothed, not delayed, fits as well (log-likelihood {advantage:+.1f}): the lag "
@@ -83,13 +83,13 @@ def protection(part: Readings) -> Array:
     return np.column_stack([*curves, *(curve * part.share for curve in curves)])
 
 
-def smoothed_copy(part: Readings, minutes: float) -> Member:
+def smoothed_copy(part: Readings, minutes: float) -> Candidate:
     """The seen temperatures averaged over a centred window as wide as the lag's memory, without delay."""
     columns = [
         part.at(_centred_mean(part.series[name], 60.0 * minutes)) * factor
         for name, factor in (("mean_rise", 1.0), ("axis_integral", 1e-3))
     ]
-    return Member(np.column_stack(columns), {}, ("um/K", "ppm/K"))
+    return Candidate(np.column_stack(columns), {}, ("um/K", "ppm/K"))
 
 
 def _centred_mean(series: Series, half_width_s: float) -> Series:
@@ -98,11 +98,11 @@ def _centred_mean(series: Series, half_width_s: float) -> Series:
     return Series(series.seconds, smoothed.reshape(series.values.shape), series.units)
 
 
-def warm_up_share(part: Readings, member: Member) -> float:
+def warm_up_share(part: Readings, candidate: Candidate) -> float:
     """Share of the candidate's course at the far end of the travel that one plain warm-up explains (least of its columns)."""
     far = np.abs(part.position_mm) == np.abs(part.position_mm).max()
     curves = [warm_up(part, minutes)[far] for minutes in np.geomspace(5.0, 400.0, 40)]
-    return min(1.0 - min(_residual_share(course, curve) for curve in curves) for course in member.columns[far].T)
+    return min(1.0 - min(_residual_share(course, curve) for curve in curves) for course in candidate.columns[far].T)
 
 
 def _residual_share(course: Array, curve: Array) -> float:
@@ -111,26 +111,28 @@ def _residual_share(course: Array, curve: Array) -> float:
     return float(left @ left) / max(float(((course - course.mean()) ** 2).sum()), 1e-300)
 
 
-def _follows_the_rate(model: ModelFit, member: Member) -> bool:
+def _follows_the_rate(model: ModelFit, candidate: Candidate) -> bool:
     """True where the field and its delayed copy enter with opposite signs and little is left in the long run."""
-    fit = fit_fixed_effects(model.fit.system, model.fit.response, np.column_stack([model.fit.design, member.columns]))
+    fit = fit_fixed_effects(
+        model.fit.system, model.fit.response, np.column_stack([model.fit.design, candidate.columns])
+    )
     at_once = dict(zip(("table_offset", "axis_expansion"), ("um/K", "ppm/K"), strict=True))
     for term in model.terms:
         unit = at_once.get(term.effect)
-        if unit not in member.units:
+        if unit not in candidate.units:
             continue
         direct = float(fit.coefficients[model.place(term)][0])
-        delayed = float(fit.coefficients[model.fit.design.shape[1] + member.units.index(unit)])
+        delayed = float(fit.coefficients[model.fit.design.shape[1] + candidate.units.index(unit)])
         if direct * delayed < 0.0 and abs(direct + delayed) < 0.5 * max(abs(direct), abs(delayed)):
             return True
     return False
 
 
-def _gain(model: ModelFit, member: Member, beside: Array | None) -> float:
+def _gain(model: ModelFit, candidate: Candidate, beside: Array | None) -> float:
     """Log-likelihood that the candidate gains beside the model and further columns, the drift's variances kept."""
     base = model.fit.design if beside is None else np.column_stack([model.fit.design, beside])
-    whitened, _ = model.fit.system.whiten(np.column_stack([model.fit.response, base, member.columns]))
+    whitened, _ = model.fit.system.whiten(np.column_stack([model.fit.response, base, candidate.columns]))
     y, x = whitened[:, 0], whitened[:, 1:]
     # A copy that is smoothed over the whole campaign is a constant, which the model has already.
-    without, with_member = residual_squares(y, x[:, : base.shape[1]]), residual_squares(y, x)
-    return 0.5 * y.size * float(np.log(without / with_member))
+    without, with_candidate = residual_squares(y, x[:, : base.shape[1]]), residual_squares(y, x)
+    return 0.5 * y.size * float(np.log(without / with_candidate))

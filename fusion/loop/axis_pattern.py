@@ -32,7 +32,7 @@ def wrong_patterns(model: ModelFit, terms: Sequence[Term]) -> dict[int, str]:
     one pattern that the library does not have.
     """
     wrong = {}
-    courses = {k: _course(model, term) for k, term in enumerate(terms) if term.member.event_s is None}
+    courses = {k: _course(model, term) for k, term in enumerate(terms) if term.candidate.event_s is None}
     for k in courses:
         p_value = pattern_p_value(model, terms[k])
         if p_value < LEVEL:
@@ -110,7 +110,7 @@ def _course(model: ModelFit, term: Term) -> Array:
     """Course in time of a term's largest column, read at the site where it moves most, at all used readings (n,)."""
     readings = model.readings.subset(model.used)
     site = readings.target_index * 2 + (readings.sign < 0)
-    columns = term.member.columns[model.used]
+    columns = term.candidate.columns[model.used]
     largest = int(np.argmax(columns.std(axis=0) * np.abs(model.fit.coefficients[model.place(term)])))
     column = columns[:, largest]
     most = site == max(np.unique(site), key=lambda number: column[site == number].std())

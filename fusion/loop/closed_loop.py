@@ -19,10 +19,11 @@ from fusion.alignment.readings import Readings
 from fusion.diagnosis import remainder
 from fusion.effects.jumps import cycle_starts
 from fusion.effects.library import Effect, library
+from fusion.errors import FusionError
 from fusion.loop.axis_pattern import wrong_patterns
 from fusion.loop.result import LoopResult, Step, coefficients_of, make_step, nuisance_size, persistence, rmse
 from fusion.loop.scoring import FamilyScore
-from fusion.loop.search import SECOND_LEVEL, Search, member_of
+from fusion.loop.search import SECOND_LEVEL, Search, candidate_of
 from fusion.model.fit import ModelFit, Term, again, fit_model, refit_fixed, settled
 
 SEALED_SHARE = 0.2
@@ -37,7 +38,7 @@ Progress = Callable[[int, int, str], None]
 Chosen = list[tuple[FamilyScore, list[FamilyScore]]]
 
 
-class LoopError(ValueError):
+class LoopError(FusionError):
     """The campaign cannot be modelled; the message says what is missing."""
 
 
@@ -125,10 +126,10 @@ def _search_before_seal(
             asked = search.ask_sealed(scores, models[-1])
             if asked is not None:
                 chosen.append((asked, scores))
-                models.append(search.fit([*models[-1].terms, Term(asked.name, member_of(asked))]))
+                models.append(search.fit([*models[-1].terms, Term(asked.name, candidate_of(asked))]))
             break
         chosen.append((best, scores))
-        models.append(search.fit([*models[-1].terms, Term(best.name, member_of(best))]))
+        models.append(search.fit([*models[-1].terms, Term(best.name, candidate_of(best))]))
         models, chosen = _re_examine(search, models, chosen)
         if sum(score.name == "step_event" for score, _ in chosen) > MOST_EVENTS:
             models, chosen = _without_events(search, models, chosen)
@@ -220,13 +221,13 @@ def _declare(readings: Readings, declared: Sequence[str], effects: Mapping[str, 
         reason = effects[name].needs(readings)
         if reason is not None:
             raise LoopError(f"declared effect {name!r} cannot be computed: {reason}")
-        members = list(effects[name].members(readings, {}, None))
-        if len(members) != 1:
+        candidates = list(effects[name].candidates(readings, {}, None))
+        if len(candidates) != 1:
             raise LoopError(
                 f"declared effect {name!r} has parameters that are not known beforehand; leave it out of [model] declared, the "
                 "search tries it anyway"
             )
-        terms.append(Term(name, replace(members[0], prior=effects[name].prior)))
+        terms.append(Term(name, replace(candidates[0], prior=effects[name].prior)))
     return terms
 
 
@@ -238,7 +239,7 @@ def _open_seal(search: Search, models: list[ModelFit], chosen: Chosen) -> tuple[
     back in the look at all cycles, where its time constant is known better.
     """
     errors = [rmse(model.open_loop_errors()[0]) for model in models]
-    lasting = [k for k, (score, _) in enumerate(chosen) if member_of(score).event_s is None]
+    lasting = [k for k, (score, _) in enumerate(chosen) if candidate_of(score).event_s is None]
     without = {k: _rebuild(search, models[0], [pair for j, pair in enumerate(chosen) if j != k]) for k in lasting}
     error_without = {k: rmse(rebuilt[-1].open_loop_errors()[0]) for k, (rebuilt, _) in without.items()}
     worst = min(error_without, key=lambda k: error_without[k], default=None)
@@ -274,7 +275,7 @@ def _rebuild(search: Search, declared: ModelFit, kept: Chosen) -> tuple[list[Mod
     """Fit the declared model and the kept effects again, one after the other."""
     models = [declared]
     for score, _ in kept:
-        models.append(search.fit([*models[-1].terms, Term(score.name, member_of(score))]))
+        models.append(search.fit([*models[-1].terms, Term(score.name, candidate_of(score))]))
     return models, kept
 
 
@@ -291,7 +292,7 @@ def _second_look(
         best = search.choose(scores, whole, level=SECOND_LEVEL)
         if best is None or _events(steps) + (best.name == "step_event") > MOST_EVENTS:
             return whole, steps
-        term = Term(best.name, member_of(best))
+        term = Term(best.name, candidate_of(best))
         before = whole
         whole = settled(fit_model(search.readings, [*whole.terms, term]), search.effects)
         term = whole.terms[-1]
@@ -370,7 +371,7 @@ def _cycle_length(readings: Readings) -> float:
 def _is_late(readings: Readings, used: NDArray[np.bool_], term: Term) -> bool:
     """Whether a term is an event among the sealed cycles, of which the cycles before tell nothing."""
     sealed_from = readings.seconds[~used].min()
-    return term.member.event_s is not None and term.member.event_s >= sealed_from - _cycle_length(readings)
+    return term.candidate.event_s is not None and term.candidate.event_s >= sealed_from - _cycle_length(readings)
 
 
 def _sealed_error(readings: Readings, used: NDArray[np.bool_], terms: Sequence[Term]) -> float:

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.effects.candidates import Member, hidden_leads_mm
+from fusion.effects.candidates import Candidate, hidden_leads_mm
 from fusion.effects.library import Effect
 from fusion.loop.admissibility import WARM_UP_SHARE, warm_up_share
-from fusion.loop.scoring import FamilyScore, Judge
+from fusion.loop.scoring import CandidateScorer, FamilyScore
 from fusion.model.fit import ModelFit
 from fusion.model.least_squares import by_width, reductions
 
@@ -37,10 +37,10 @@ class Identifiable:
     Attributes
     ----------
     effect : its name
-    detectable_um : rms that is found with 80 % power, um: median over the effect's members; None where none can be told from the model
-    best_um, worst_um : the same for the members that show best and worst
+    detectable_um : rms that is found with 80 % power, um: median over the effect's candidates; None where none can be told from the model
+    best_um, worst_um : the same for the candidates that show best and worst
     visible_share : share of the effect's rms that is left beside static profile and declared effects (median)
-    looks_like : other effects of which a member explains at least 90 % of its visible variance
+    looks_like : other effects of which a candidate explains at least 90 % of its visible variance
     note : what stands in the way, empty where nothing does
     """
 
@@ -54,9 +54,9 @@ class Identifiable:
 
 
 def identify(
-    judge: Judge,
+    judge: CandidateScorer,
     model: ModelFit,
-    families: Mapping[str, Sequence[Member]],
+    families: Mapping[str, Sequence[Candidate]],
     scores: Sequence[FamilyScore],
     effects: Mapping[str, Effect],
 ) -> list[Identifiable]:
@@ -65,12 +65,12 @@ def identify(
     Parameters
     ----------
     judge, model : the declared model on the training readings, with simulated campaigns in which it is complete
-    families : members of every effect that can be tried
+    families : candidates of every effect that can be tried
     scores : of the first round of the search; only the gain that chance makes is used
     effects : the library
     """
-    named = [(name, member) for name, members in families.items() for member in members]
-    first = np.column_stack([member.columns[judge.used, 0] for _, member in named])
+    named = [(name, candidate) for name, candidates in families.items() for candidate in candidates]
+    first = np.column_stack([candidate.columns[judge.used, 0] for _, candidate in named])
     names = np.array([name for name, _ in named])
     critical = {score.name: score.critical for score in scores}
     wanted = np.array([0.5 * (np.sqrt(2.0 * critical[name]) + _POWER_QUANTILE) ** 2 for name in names])
@@ -80,7 +80,7 @@ def identify(
     sizes = np.where(own > 0.0, own, np.inf) * smallest
     share = left / np.maximum(own, 1e-300)
     typical = {name: _typical(sizes, names == name) for name in families}
-    alike = _alike(judge, first, [member for _, member in named], names, list(typical.values()))
+    alike = _alike(judge, first, [candidate for _, candidate in named], names, list(typical.values()))
     found = []
     for row, name in enumerate(families):
         here = sizes[names == name]
@@ -102,13 +102,13 @@ def identify(
 
 
 def _typical(sizes: Array, of_effect: NDArray[np.bool_]) -> int:
-    """Place of the member that shows like the median of its effect."""
+    """Place of the candidate that shows like the median of its effect."""
     places = np.flatnonzero(of_effect)
     return int(places[np.argsort(sizes[places])[places.size // 2]])
 
 
 def _beside(model: ModelFit, columns: Array) -> tuple[Array, Array]:
-    """Rms of columns freed of their mean at every site, and of what is left of them beside the model's columns, (members,) each."""
+    """Rms of columns freed of their mean at every site, and of what is left of them beside the model's columns, (candidates,) each."""
     readings = model.readings.subset(model.used)
     site = readings.target_index * 2 + (readings.sign < 0)
     number = np.maximum(np.bincount(site), 1)
@@ -118,8 +118,8 @@ def _beside(model: ModelFit, columns: Array) -> tuple[Array, Array]:
     return np.sqrt(np.mean((columns - means[site]) ** 2, axis=0)), np.sqrt(np.mean(left**2, axis=0))
 
 
-def _smallest(judge: Judge, columns: Array, wanted: Array) -> Array:
-    """Coefficient of every column at which its expected gain is as wanted, the drift being free with it and without it, (members,)."""
+def _smallest(judge: CandidateScorer, columns: Array, wanted: Array) -> Array:
+    """Coefficient of every column at which its expected gain is as wanted, the drift being free with it and without it, (candidates,)."""
     n, draws = columns.shape[0], judge.draws[:, :_DRAWS]
     energy, noise, penalty = [], [], []
     for system in judge.systems():
@@ -151,10 +151,14 @@ def _smallest(judge: Judge, columns: Array, wanted: Array) -> Array:
 
 
 def _alike(
-    judge: Judge, first: Array, members: Sequence[Member], names: NDArray[np.str_], typical: Sequence[int]
+    judge: CandidateScorer,
+    first: Array,
+    candidates: Sequence[Candidate],
+    names: NDArray[np.str_],
+    typical: Sequence[int],
 ) -> list[set[str]]:
-    """For every effect's typical member the effects of which some member explains nearly all that is visible of it."""
-    groups = by_width(members, judge.used)
+    """For every effect's typical candidate the effects of which some candidate explains nearly all that is visible of it."""
+    groups = by_width(candidates, judge.used)
     columns = np.concatenate([group.columns for group in groups], axis=1)
     system = judge.fit.system
     errors, spread = system.innovations(np.column_stack([first[:, list(typical)], judge.fit.design, columns]))
@@ -167,12 +171,12 @@ def _alike(
     return [set(names[row].tolist()) for row in alike]
 
 
-def _note(effect: Effect, member: Member, model: ModelFit, seen: int) -> str:
+def _note(effect: Effect, candidate: Candidate, model: ModelFit, seen: int) -> str:
     """What stands in the way of an effect in this campaign."""
     part = model.readings.subset(model.used)
     if not seen:
         return "the declared model contains it, or nothing excites it"
-    on_used = Member(member.columns[model.used], member.parameters, member.units, member.event_s)
+    on_used = Candidate(candidate.columns[model.used], candidate.parameters, candidate.units, candidate.event_s)
     if effect.excited_by and warm_up_share(part, on_used) > WARM_UP_SHARE:
         return "one warm-up is all that excites it; switch the load on purpose to tell it from others"
     if effect.name == "pitch_error":

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fusion._typing import Array
 from fusion.alignment.readings import Readings
 from fusion.diagnosis.remainder import Remainder
-from fusion.effects.candidates import Member
+from fusion.effects.candidates import Candidate
 from fusion.loop.detectability import Identifiable
 from fusion.loop.scoring import FamilyScore, Range
 from fusion.loop.search import CONFIRMATION_LEVEL, SEARCH_LEVEL, TIE_GAIN, SealedQuestion
@@ -109,10 +109,10 @@ class LoopResult:
     def _nearest(self) -> dict[str, object]:
         """The effect that explains the largest share of what is left, its p-value in the search, and that share."""
         added = {step.effect for step in self.steps}
-        rivals = [score for scores in self.rounds for score in scores if score.member and score.name not in added]
+        rivals = [score for scores in self.rounds for score in scores if score.candidate and score.name not in added]
         if not self.remainder.shape or not rivals:
             return {"nearest": "", "nearest_p": None, "nearest_share": None}
-        shares = [self.remainder.share_of(score.member.columns) for score in rivals if score.member]
+        shares = [self.remainder.share_of(score.candidate.columns) for score in rivals if score.candidate]
         best = int(np.argmax(shares))
         return {
             "nearest": rivals[best].name,
@@ -128,7 +128,7 @@ def _step_json(step: Step) -> dict[str, object]:
 def _score_json(score: FamilyScore) -> dict[str, object]:
     return {
         "effect": score.name,
-        "parameters": dict(score.member.parameters) if score.member else {},
+        "parameters": dict(score.candidate.parameters) if score.candidate else {},
         "gain": score.gain,
         "excess_gain": score.excess,
         "p_value": score.p_value,
@@ -145,10 +145,10 @@ def coefficients_of(model: ModelFit, term: Term) -> list[dict[str, float | str]]
     values, u = model.fit.coefficients[place], model.fit.coefficients_u[place]
     found: list[dict[str, float | str]] = [
         {"value": float(value), "u": float(spread), "unit": unit}
-        for value, spread, unit in zip(values, u, term.member.units, strict=True)
+        for value, spread, unit in zip(values, u, term.candidate.units, strict=True)
     ]
-    if term.member.prior is not None:
-        found[0] |= {"prior": term.member.prior.mean, "prior_u": term.member.prior.u}
+    if term.candidate.prior is not None:
+        found[0] |= {"prior": term.candidate.prior.mean, "prior_u": term.candidate.prior.u}
     return found
 
 
@@ -169,8 +169,8 @@ class Scored(Protocol):
         """Effect."""
 
     @property
-    def member(self) -> Member | None:
-        """Its best member, None where none can be told from the model."""
+    def candidate(self) -> Candidate | None:
+        """Its best candidate, None where none can be told from the model."""
 
     @property
     def excess(self) -> float:
@@ -187,7 +187,7 @@ class Scored(Protocol):
 
 def rivals(score: Scored, scores: Sequence[Scored]) -> tuple[list[str], dict[str, float | str]]:
     """Effects of a round (best excess first) that these data cannot tell from the chosen one; the next best, how far behind."""
-    others = [other for other in scores if other.name != score.name and other.member is not None]
+    others = [other for other in scores if other.name != score.name and other.candidate is not None]
     tied = [other.name for other in others if other.p_value < _RIVAL_LEVEL and score.excess - other.excess < TIE_GAIN]
     if not others:
         return tied, {}
@@ -202,7 +202,7 @@ def make_step(
     tied, runner_up = rivals(score, scores)
     return Step(
         effect=term.effect,
-        parameters=term.member.parameters,
+        parameters=term.candidate.parameters,
         parameter_ranges=score.ranges,
         coefficients=coefficients_of(model, term),
         p_value=_entry_p(score),
@@ -231,15 +231,15 @@ def _confirmation(term: Term, score: FamilyScore) -> str:
     if score.held_out_p > CONFIRMATION_LEVEL:
         undecided = f"later blocks of cycles do not decide (p = {score.held_out_p:.2g})"
         return f"{undecided}; its evidence in all of them does, and the sealed cycles agree"
-    way = "on the other half of the targets" if term.member.event_s is not None else "on later blocks of cycles"
+    way = "on the other half of the targets" if term.candidate.event_s is not None else "on later blocks of cycles"
     return f"confirmed {way}, coefficients frozen"
 
 
 def _event_cycle(readings: Readings, term: Term) -> int | None:
     """The cycle of the first reading at or after an event."""
-    if term.member.event_s is None:
+    if term.candidate.event_s is None:
         return None
-    later = np.flatnonzero(readings.seconds >= term.member.event_s)
+    later = np.flatnonzero(readings.seconds >= term.candidate.event_s)
     return int(readings.cycle[later[0] if later.size else -1])
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.effects.candidates import Member
+from fusion.effects.candidates import Candidate
 from fusion.model.fit import ModelFit
 from fusion.model.least_squares import (
     by_width,
@@ -33,8 +33,8 @@ from fusion.model.null_simulation import (
     DRAWS,
     critical_gain,
     least_ratio,
-    of_all,
-    of_each,
+    sidak,
+    sidak_level,
     simulate_null,
     tail_probability,
 )
@@ -61,25 +61,25 @@ _GRID = (
 
 @dataclass(frozen=True)
 class FamilyScore:
-    """What the best member of an effect explains.
+    """What the best candidate of an effect explains.
 
     Attributes
     ----------
     name : the effect
-    member : its best member, or None where no member can be told from the model
-    gain : gain in log-likelihood of the best member
+    candidate : its best candidate, or None where no candidate can be told from the model
+    gain : gain in log-likelihood of the best candidate
     excess : gain minus the mean gain the same search finds where nothing is missing
     p_value : chance of such a gain where nothing is missing, for this effect alone
     family_wise_p : the same for the best of all effects that were tried
     held_out_gain, held_out_p : gain on readings that were not used for the coefficients, and its chance where nothing is missing
-    collinear : share of members that the model already contains
-    drift_place : which drift of the grid suits the member best
+    collinear : share of candidates that the model already contains
+    drift_place : which drift of the grid suits the candidate best
     critical : gain from which on the effect enters, as far as chance is concerned
     ranges : values of the parameters that fit as well, where they were looked at closely
     """
 
     name: str
-    member: Member | None
+    candidate: Candidate | None
     gain: float
     excess: float
     p_value: float
@@ -93,7 +93,7 @@ class FamilyScore:
 
 
 @dataclass(frozen=True)
-class Known:
+class PriorRows:
     """Priors of a model's coefficients as further whitened readings, one each, without drift.
 
     Attributes
@@ -114,7 +114,7 @@ class Known:
         return np.vstack([y, responses]), np.vstack([x, design])
 
 
-def known_of(model: ModelFit, rng: np.random.Generator, *, draws: int = DRAWS) -> Known:
+def prior_rows(model: ModelFit, rng: np.random.Generator, *, draws: int = DRAWS) -> PriorRows:
     """What the model's priors say, in units of the noise; in a draw every coefficient is zero and its prior off by chance."""
     priors = model.priors()
     design = np.zeros((len(priors), model.fit.design.shape[1]))
@@ -122,11 +122,11 @@ def known_of(model: ModelFit, rng: np.random.Generator, *, draws: int = DRAWS) -
     for row, (place, prior) in enumerate(priors):
         design[row, place] = model.fit.sigma / prior.u
         response[row] = model.fit.sigma * prior.mean / prior.u
-    return Known(design, response, model.fit.sigma * rng.standard_normal((len(priors), draws)))
+    return PriorRows(design, response, model.fit.sigma * rng.standard_normal((len(priors), draws)))
 
 
 @dataclass(frozen=True)
-class Judge:
+class CandidateScorer:
     """A fitted model with simulated campaigns in which it is complete.
 
     Attributes
@@ -135,7 +135,7 @@ class Judge:
     draws : (n, draws) responses simulated from its drift and noise alone
     early : (n,) True for the cycles from which the others are predicted when an effect is confirmed in time
     halves : (n,) True for one half of the targets, for events that cannot be confirmed in time
-    used : (all readings,) the training readings among those that members have columns for
+    used : (all readings,) the training readings among those that candidates have columns for
     known : what is known of the model's coefficients beforehand
     """
 
@@ -144,16 +144,16 @@ class Judge:
     early: NDArray[np.bool_]
     halves: NDArray[np.bool_]
     used: NDArray[np.bool_]
-    known: Known
+    known: PriorRows
 
-    def score(self, families: Mapping[str, Sequence[Member]], *, level: float = 0.05) -> list[FamilyScore]:
-        """Score all members of all effects; none is confirmed yet. ``level`` is the chance that any enters where nothing is missing."""
-        named = [(name, member) for name, members in families.items() for member in members]
+    def score(self, families: Mapping[str, Sequence[Candidate]], *, level: float = 0.05) -> list[FamilyScore]:
+        """Score all candidates of all effects; none is confirmed yet. ``level`` is the chance that any enters where nothing is missing."""
+        named = [(name, candidate) for name, candidates in families.items() for candidate in candidates]
         if not named:
             return []
-        gains, places, separable = self._gains([member for _, member in named], self.draws)
+        gains, places, separable = self._gains([candidate for _, candidate in named], self.draws)
         scores: list[FamilyScore] = []
-        tried = sum(bool(members) for members in families.values())
+        tried = sum(bool(candidates) for candidates in families.values())
         for name in families:
             rows = np.array([k for k, (family, _) in enumerate(named) if family == name], int)
             if rows.size == 0:
@@ -171,25 +171,25 @@ class Judge:
             found = FamilyScore(
                 name, named[best][1], gain, excess, p_value, 1.0, 0.0, 1.0, collinear, drift_place=place
             )
-            scores.append(replace(found, critical=critical_gain(of_each(level, tried), null)))
-        return [replace(score, family_wise_p=of_all(score.p_value, tried)) for score in scores]
+            scores.append(replace(found, critical=critical_gain(sidak_level(level, tried), null)))
+        return [replace(score, family_wise_p=sidak(score.p_value, tried)) for score in scores]
 
-    def refine(self, score: FamilyScore, near: Sequence[Member]) -> FamilyScore:
-        """The best of some members near the one that was found; the p-value stays that of the search."""
+    def refine(self, score: FamilyScore, near: Sequence[Candidate]) -> FamilyScore:
+        """The best of some candidates near the one that was found; the p-value stays that of the search."""
         gains, places, separable = self._gains(near, np.empty((self.fit.response.size, 0)))
         best = int(np.argmax(np.where(separable, gains[:, 0], -np.inf)))
         gain = float(gains[best, 0])
         if separable[best] and gain >= score.gain:
             excess = score.excess + gain - score.gain
-            score = replace(score, member=near[best], gain=gain, excess=excess, drift_place=int(places[best]))
-        if score.member is None:
+            score = replace(score, candidate=near[best], gain=gain, excess=excess, drift_place=int(places[best]))
+        if score.candidate is None:
             return score
-        return replace(score, ranges=parameter_ranges(near, gains[:, 0], score.member, score.gain))
+        return replace(score, ranges=parameter_ranges(near, gains[:, 0], score.candidate, score.gain))
 
-    def confirm(self, scores: Sequence[FamilyScore], families: Mapping[str, Sequence[Member]]) -> list[FamilyScore]:
+    def confirm(self, scores: Sequence[FamilyScore], families: Mapping[str, Sequence[Candidate]]) -> list[FamilyScore]:
         """The same scores with the gain in predictive log-density on unused readings, and its chance where nothing is missing.
 
-        Which member of an effect is confirmed is decided without those readings, or their chance would be understated.
+        Which candidate of an effect is confirmed is decided without those readings, or their chance would be understated.
         """
         lasting = [score for score in scores if not _is_event(score)]
         early = [self._strongest_early(families[score.name]) for score in lasting]
@@ -202,8 +202,8 @@ class Judge:
             confirmed.append(replace(score, held_out_gain=float(gain[0]), held_out_p=chance))
         return confirmed
 
-    def _strongest_early(self, members: Sequence[Member]) -> Member:
-        """The member with the largest gain on the early readings alone."""
+    def _strongest_early(self, candidates: Sequence[Candidate]) -> Candidate:
+        """The candidate with the largest gain on the early readings alone."""
         system, early = self.fit.system, self.early
         cut = replace(
             system,
@@ -216,8 +216,8 @@ class Judge:
         used = self.used.copy()
         used[self.used] = early
         judge = replace(self, fit=fit, draws=np.empty((int(early.sum()), 0)), used=used)
-        gains, _, separable = judge._gains(members, judge.draws)
-        return members[int(np.argmax(np.where(separable, gains[:, 0], -np.inf)))]
+        gains, _, separable = judge._gains(candidates, judge.draws)
+        return candidates[int(np.argmax(np.where(separable, gains[:, 0], -np.inf)))]
 
     def systems(self) -> list[DriftSystem]:
         """The fit's drift with every set of variances of the grid."""
@@ -229,19 +229,21 @@ class Judge:
         """The response and every draw, (n, 1 + draws)."""
         return np.column_stack([self.fit.response, self.draws])
 
-    def _gains(self, members: Sequence[Member], draws: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
-        """Log-likelihood gain of every member for the response and every draw (members, 1 + draws)."""
-        groups = by_width(members, self.used)
+    def _gains(
+        self, candidates: Sequence[Candidate], draws: Array
+    ) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
+        """Log-likelihood gain of every candidate for the response and every draw (candidates, 1 + draws)."""
+        groups = by_width(candidates, self.used)
         columns = np.concatenate([group.columns for group in groups], axis=1)
         known = np.column_stack([self.fit.response, draws, self.fit.design])
         n, count = known.shape[0], known.shape[1] - self.fit.design.shape[1]
         best_null = np.full(count, -np.inf)
-        best = np.full((count, len(members)), -np.inf)
-        known_beside = np.array([member.beside for member in members])
+        best = np.full((count, len(candidates)), -np.inf)
+        known_beside = np.array([candidate.beside for candidate in candidates])
         started = np.flatnonzero(known_beside)
         best_started = np.full((count, started.size), -np.inf)
-        best_grid = np.zeros(len(members), int)
-        separable = np.zeros(len(members), bool)
+        best_grid = np.zeros(len(candidates), int)
+        separable = np.zeros(len(candidates), bool)
         for place, system in enumerate(self.systems()):
             c, spread = system.innovations(columns)
             root, log_determinant = np.sqrt(spread)[:, None], float(np.log(spread).sum())
@@ -259,16 +261,16 @@ class Judge:
             best_grid[better] = place
             np.maximum(best, likelihood, out=best)
             separable |= separate
-        # A further coefficient must earn its keep (Akaike): the simpler of two members that fit alike is preferred.
-        widths = np.array([member.columns.shape[1] for member in members])
-        without = np.repeat(best_null[:, None], len(members), axis=1)
+        # A further coefficient must earn its keep (Akaike): the simpler of two candidates that fit alike is preferred.
+        widths = np.array([candidate.columns.shape[1] for candidate in candidates])
+        without = np.repeat(best_null[:, None], len(candidates), axis=1)
         without[:, started] = np.maximum(without[:, started], best_started - known_beside[started])
         return (best - without - (widths - 1.0)).T, best_grid, separable
 
-    def _event_gain(self, members: Sequence[Member], place: int) -> Array:
+    def _event_gain(self, candidates: Sequence[Candidate], place: int) -> Array:
         """Gain of an event whose instant and size come from one half of the targets on the other half, and back, (1 + draws,)."""
         responses = self._responses()
-        columns = np.column_stack([member.columns[self.used, 0] for member in members])
+        columns = np.column_stack([candidate.columns[self.used, 0] for candidate in candidates])
         whitened, _ = self.systems()[place].whiten(np.column_stack([responses, self.fit.design, columns]))
         y, x, c = np.split(whitened, [responses.shape[1], responses.shape[1] + self.fit.design.shape[1]], axis=1)
         n = c.shape[0]
@@ -277,17 +279,19 @@ class Judge:
         y, c = without(x, y)[:n], without(x, c)[:n]
         return gain_across(y, c, self.halves) / (2.0 * y[:, :1].var())
 
-    def _gains_in_time(self, members: Sequence[Member]) -> list[Array]:
-        """Gain in log-density of the later half, predicted forward from the readings before, of every member (1 + draws,).
+    def _gains_in_time(self, candidates: Sequence[Candidate]) -> list[Array]:
+        """Gain in log-density of the later half, predicted forward from the readings before, of every candidate (1 + draws,).
 
         Each model has the drift that suits it best, so that a wandering drift is not punished for explaining what it can.
         """
         responses = self._responses()
         count, p = responses.shape[1], self.fit.design.shape[1]
-        widths = [member.columns.shape[1] for member in members]
+        widths = [candidate.columns.shape[1] for candidate in candidates]
         ends = p + np.cumsum(widths)
         designs = [np.arange(p), *(np.r_[:p, end - width : end] for end, width in zip(ends, widths, strict=True))]
-        columns = np.column_stack([responses, self.fit.design, *(member.columns[self.used] for member in members)])
+        columns = np.column_stack(
+            [responses, self.fit.design, *(candidate.columns[self.used] for candidate in candidates)]
+        )
         known: list[list[Array]] = [[] for _ in designs]
         ahead: list[list[Array]] = [[] for _ in designs]
         for system in self.systems():
@@ -308,7 +312,7 @@ class Judge:
 
 
 def _likelihood(squares: Array, reduced: Array, readings: int, log_determinant: float) -> Array:
-    """Log-likelihood (responses, members) once ``reduced`` is taken from the sums of squares (responses,); overwrites ``reduced``."""
+    """Log-likelihood (responses, candidates) once ``reduced`` is taken from the sums of squares (responses,); overwrites ``reduced``."""
     # In place: these matrices are large, and fetching memory for new ones takes as long as the sums.
     likelihood = np.subtract(squares[:, None], reduced, out=reduced)
     np.log(np.maximum(likelihood, 1e-12 * squares[:, None], out=likelihood), out=likelihood)
@@ -318,16 +322,16 @@ def _likelihood(squares: Array, reduced: Array, readings: int, log_determinant: 
 
 
 def _is_event(score: FamilyScore) -> bool:
-    return score.member is not None and score.member.event_s is not None
+    return score.candidate is not None and score.candidate.event_s is not None
 
 
-def ask_sealed(model: ModelFit, member: Member, rng: np.random.Generator) -> tuple[float, float, float]:
+def ask_sealed(model: ModelFit, candidate: Candidate, rng: np.random.Generator) -> tuple[float, float, float]:
     """Put one candidate to the sealed readings, predicted in open loop.
 
     Parameters
     ----------
     model : without the candidate, fitted to the readings before the seal
-    member : the candidate, with columns for all readings
+    candidate : the candidate, with columns for all readings
 
     Returns
     -------
@@ -337,7 +341,7 @@ def ask_sealed(model: ModelFit, member: Member, rng: np.random.Generator) -> tup
     """
     fit, whole, design = model.fit, model.whole_system(), model.whole_design()
     train = whole.observed
-    known = known_of(model, rng)
+    known = prior_rows(model, rng)
     null = simulate_null(fit, rng, over=replace(whole, observed=np.ones_like(train)))
     responses = np.column_stack([model.readings.response, null])
     p, count = design.shape[1], responses.shape[1]
@@ -346,15 +350,15 @@ def ask_sealed(model: ModelFit, member: Member, rng: np.random.Generator) -> tup
     error: dict[bool, list[Array]] = {False: [], True: []}
     for pair in _GRID:
         system = replace(whole, ratios=centre * np.resize(10.0 ** np.asarray(pair), centre.size))
-        errors, spread = system.innovations(np.column_stack([responses, design, member.columns]))
+        errors, spread = system.innovations(np.column_stack([responses, design, candidate.columns]))
         root = np.sqrt(spread[train])[:, None]
-        for with_member in (False, True):
-            used = slice(count, count + p + (member.columns.shape[1] if with_member else 0))
+        for with_candidate in (False, True):
+            used = slice(count, count + p + (candidate.columns.shape[1] if with_candidate else 0))
             y, x = known.append(errors[train, :count] / root, errors[train, used] / root)
             beta = solve(x.T @ x, x.T @ y)
             variance = ((y - x @ beta) ** 2).mean(axis=0)
-            likelihood[with_member].append(-0.5 * (y.shape[0] * np.log(variance) + np.log(spread[train]).sum()))
-            error[with_member].append(((errors[~train, :count] - errors[~train, used] @ beta) ** 2).mean(axis=0))
+            likelihood[with_candidate].append(-0.5 * (y.shape[0] * np.log(variance) + np.log(spread[train]).sum()))
+            error[with_candidate].append(((errors[~train, :count] - errors[~train, used] @ beta) ** 2).mean(axis=0))
     before, after = (
         np.sqrt(np.take_along_axis(np.array(error[key]), np.argmax(likelihood[key], axis=0)[None, :], axis=0)[0])
         for key in (False, True)
@@ -373,12 +377,12 @@ _DERIVED = frozenset({"possible_leads", "chain"})
 Range = list[float | None] | list[str]
 
 
-def parameter_ranges(near: Sequence[Member], gains: Array, best: Member, best_gain: float) -> dict[str, Range]:
+def parameter_ranges(near: Sequence[Candidate], gains: Array, best: Candidate, best_gain: float) -> dict[str, Range]:
     """Values of the parameters that fit as well as the best, by profile likelihood (95 %).
 
     Parameters
     ----------
-    near : members around the best one
+    near : candidates around the best one
     gains : (near,) gain in log-likelihood of each
     best, best_gain : the one that was chosen
 
@@ -388,18 +392,20 @@ def parameter_ranges(near: Sequence[Member], gains: Array, best: Member, best_ga
         A number's range holds for the words that were chosen (what is followed, and how it started). A parameter that was not varied, and
         a word beside which no other fits as well, are left out.
     """
-    alike = [member for member, gain in zip(near, gains, strict=True) if gain >= best_gain - _WITHIN]
+    alike = [candidate for candidate, gain in zip(near, gains, strict=True) if gain >= best_gain - _WITHIN]
     found: dict[str, Range] = {}
     for name, value in best.parameters.items():
         if name in _DERIVED:
             continue
         if isinstance(value, str):
-            words = sorted({str(member.parameters[name]) for member in alike if name in member.parameters} - {value})
+            words = sorted(
+                {str(candidate.parameters[name]) for candidate in alike if name in candidate.parameters} - {value}
+            )
             if words:
                 found[name] = words
             continue
-        tried = [_number(member, name) for member in near if _same_words(member, best)]
-        fitting = [float(value), *(_number(member, name) for member in alike if _same_words(member, best))]
+        tried = [_number(candidate, name) for candidate in near if _same_words(candidate, best)]
+        fitting = [float(value), *(_number(candidate, name) for candidate in alike if _same_words(candidate, best))]
         if len(set(tried)) > 1:
             found[name] = _enclosed(np.array(tried), min(fitting), max(fitting))
     return found
@@ -412,13 +418,13 @@ def _enclosed(tried: Array, low: float, high: float) -> list[float | None]:
     return [lowest, float(above.min()) if above.size else None]
 
 
-def _number(member: Member, name: str) -> float:
+def _number(candidate: Candidate, name: str) -> float:
     """A parameter's value; a body that is not there has a time constant of zero."""
-    return float(member.parameters.get(name, 0.0))
+    return float(candidate.parameters.get(name, 0.0))
 
 
-def _same_words(member: Member, best: Member) -> bool:
-    return _words(member.parameters) == _words(best.parameters)
+def _same_words(candidate: Candidate, best: Candidate) -> bool:
+    return _words(candidate.parameters) == _words(best.parameters)
 
 
 def _words(parameters: Mapping[str, float | str]) -> dict[str, str]:

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.alignment.readings import Readings
-from fusion.effects.candidates import Member
+from fusion.effects.candidates import Candidate
 from fusion.effects.jumps import cycle_starts
 from fusion.effects.library import LIBRARY, Effect
+from fusion.errors import FusionError
 from fusion.loop.admissibility import blocked_reason
 from fusion.loop.detectability import Identifiable, identify
-from fusion.loop.scoring import FamilyScore, Judge, ask_sealed, known_of
+from fusion.loop.scoring import CandidateScorer, FamilyScore, ask_sealed, prior_rows
 from fusion.model.fit import ModelFit, Term, fit_model
 from fusion.model.null_simulation import simulate_null
 
@@ -58,7 +59,7 @@ class SealedQuestion:
     entered: bool
 
 
-class SearchError(ValueError):
+class SearchError(FusionError):
     """An effect does not keep its promises; the message names it."""
 
 
@@ -84,10 +85,10 @@ class Search:
         """Fit terms to the readings that are not sealed."""
         return fit_model(self.readings, terms, used=self.used)
 
-    def _families(self, model: ModelFit) -> dict[str, list[Member]]:
+    def _families(self, model: ModelFit) -> dict[str, list[Candidate]]:
         present = {term.effect for term in model.terms}
         # One event happens once, however its column was weighed when it was found.
-        happened = {(term.effect, term.member.event_s) for term in model.terms if term.member.event_s is not None}
+        happened = {(term.effect, term.candidate.event_s) for term in model.terms if term.candidate.event_s is not None}
         families = {}
         for name, effect in self.effects.items():
             if name in self.not_tried:
@@ -95,8 +96,8 @@ class Search:
             if name in present and name not in _MAY_REPEAT:
                 continue
             try:
-                offered = effect.members(self.readings, model.coefficients(), None)
-                families[name] = [member for member in offered if (name, member.event_s) not in happened]
+                offered = effect.candidates(self.readings, model.coefficients(), None)
+                families[name] = [candidate for candidate in offered if (name, candidate.event_s) not in happened]
                 _check_columns(families[name], self.readings)
             except Exception as fault:
                 # A user's effect must not end the search for the others; a fault of our own must be seen.
@@ -112,41 +113,47 @@ class Search:
         Effects that are worth it are looked at more closely before they are compared, each at its best, and are confirmed.
         """
         judge = self._judge(model)
-        families = {name: self._inside(members, model) for name, members in self._families(model).items()}
-        families = {name: members for name, members in families.items() if members}
+        families = {name: self._inside(candidates, model) for name, candidates in self._families(model).items()}
+        families = {name: candidates for name, candidates in families.items() if candidates}
         if not families:
             return []
         scores = judge.score(families, level=SEARCH_LEVEL)
         if not self.identifiable:
             self.identifiable = identify(judge, model, families, scores, self.effects)
         for score in scores:
-            if score.member is None:
+            if score.candidate is None:
                 self.blocked[score.name] = (
                     "nothing of it is left beside the model: its columns are constant or collinear with the static profile, the declared "
                     "effects and what was added"
                 )
-        worth = [k for k, score in enumerate(scores) if score.member is not None and score.p_value < _WORTH_CONFIRMING]
+        worth = [
+            k for k, score in enumerate(scores) if score.candidate is not None and score.p_value < _WORTH_CONFIRMING
+        ]
         closer = judge.confirm([self._refined(scores[k], judge, model) for k in worth], families)
         for k, score in zip(worth, closer, strict=True):
             scores[k] = score
         return sorted(scores, key=lambda score: -score.excess)
 
-    def _inside(self, members: Iterable[Member], model: ModelFit) -> list[Member]:
-        """Members whose event, if they have one, has enough cycles on both sides."""
+    def _inside(self, candidates: Iterable[Candidate], model: ModelFit) -> list[Candidate]:
+        """Candidates whose event, if they have one, has enough cycles on both sides."""
         starts = cycle_starts(self.readings.subset(model.used))
-        return [member for member in members if member.event_s is None or starts[2] <= member.event_s <= starts[-2]]
+        return [
+            candidate
+            for candidate in candidates
+            if candidate.event_s is None or starts[2] <= candidate.event_s <= starts[-2]
+        ]
 
-    def _judge(self, model: ModelFit) -> Judge:
+    def _judge(self, model: ModelFit) -> CandidateScorer:
         part = self.readings.subset(model.used)
         numbers = np.unique(part.cycle)
         early = np.searchsorted(numbers, part.cycle) < _EARLY_SHARE * numbers.size
-        return Judge(
+        return CandidateScorer(
             model.fit,
             simulate_null(model.fit, self.rng),
             early,
             part.target_index % 2 == 0,
             model.used,
-            known_of(model, self.rng),
+            prior_rows(model, self.rng),
         )
 
     def choose(
@@ -155,7 +162,7 @@ class Search:
         """Best effect that is significant, confirmed and not blocked."""
         strongest = -np.inf
         for score in scores:
-            if score.member is None or score.family_wise_p > level or self._withdrawn(score):
+            if score.candidate is None or score.family_wise_p > level or self._withdrawn(score):
                 continue
             # Where a stronger effect could not be confirmed, a much weaker one only stands in for it.
             if score.excess < strongest - TIE_GAIN:
@@ -174,7 +181,7 @@ class Search:
 
     def _blocked(self, score: FamilyScore, model: ModelFit) -> str | None:
         part = self.readings.subset(model.used)
-        return blocked_reason(self.effects[score.name], _on(member_of(score), model.used), part, model)
+        return blocked_reason(self.effects[score.name], _on(candidate_of(score), model.used), part, model)
 
     def ask_sealed(self, scores: Sequence[FamilyScore], model: ModelFit) -> FamilyScore | None:
         """Put the strongest candidate that the search could not decide on to the sealed readings, as a single question.
@@ -182,20 +189,20 @@ class Search:
         One question, chosen before the seal is opened, needs no correction for the search.
         """
         for score in scores:
-            if score.member is None or score.p_value > _WORTH_ASKING or score.name in self.blocked:
+            if score.candidate is None or score.p_value > _WORTH_ASKING or score.name in self.blocked:
                 continue
             reason = self._blocked(score, model)
             if reason is not None:
                 self.blocked[score.name] = reason
                 continue
-            before, after, p_value = ask_sealed(model, member_of(score), self.rng)
+            before, after, p_value = ask_sealed(model, candidate_of(score), self.rng)
             entered = after < before and p_value <= ASKED_LEVEL
-            self.question = SealedQuestion(score.name, member_of(score).parameters, before, after, p_value, entered)
+            self.question = SealedQuestion(score.name, candidate_of(score).parameters, before, after, p_value, entered)
             return replace(score, held_out_p=p_value) if entered else None
         return None
 
-    def _refined(self, score: FamilyScore, judge: Judge, model: ModelFit) -> FamilyScore:
-        """The best member in the neighbourhood of the one that was found, and in that one's, as long as it moves."""
+    def _refined(self, score: FamilyScore, judge: CandidateScorer, model: ModelFit) -> FamilyScore:
+        """The best candidate in the neighbourhood of the one that was found, and in that one's, as long as it moves."""
         for _ in range(_CLOSER_LOOKS):
             before = score.gain
             score = self._best_near(score, judge, model)
@@ -203,30 +210,32 @@ class Search:
                 break
         return score
 
-    def _best_near(self, score: FamilyScore, judge: Judge, model: ModelFit) -> FamilyScore:
-        """The best member next to the one that was found, or the same score where none is better."""
-        found = member_of(score)
-        offered = self.effects[score.name].members(self.readings, model.coefficients(), found)
-        near = self._inside((member for member in offered if _same_kind(member, found)), model)
+    def _best_near(self, score: FamilyScore, judge: CandidateScorer, model: ModelFit) -> FamilyScore:
+        """The best candidate next to the one that was found, or the same score where none is better."""
+        found = candidate_of(score)
+        offered = self.effects[score.name].candidates(self.readings, model.coefficients(), found)
+        near = self._inside((candidate for candidate in offered if _same_kind(candidate, found)), model)
         if not near:
             raise SearchError(
-                f"effect {score.name!r} offers no member near one it offered before: {dict(found.parameters)}"
+                f"effect {score.name!r} offers no candidate near one it offered before: {dict(found.parameters)}"
             )
         return judge.refine(score, near)
 
 
-def _check_columns(members: Sequence[Member], readings: Readings) -> None:
+def _check_columns(candidates: Sequence[Candidate], readings: Readings) -> None:
     """Refuse columns that are not one finite number per reading, which a user's effect may offer."""
-    for member in members:
-        columns = np.asarray(member.columns)
+    for candidate in candidates:
+        columns = np.asarray(candidate.columns)
         if columns.ndim != 2 or columns.shape[0] != readings.seconds.size:
             raise SearchError(f"columns have shape {columns.shape}; expected ({readings.seconds.size}, columns)")
         if not np.isfinite(columns).all():
             raise SearchError(
-                f"{int((~np.isfinite(columns)).sum())} values are not finite at {dict(member.parameters)}"
+                f"{int((~np.isfinite(columns)).sum())} values are not finite at {dict(candidate.parameters)}"
             )
-        if len(member.units) != columns.shape[1]:
-            raise SearchError(f"{columns.shape[1]} columns but {len(member.units)} units at {dict(member.parameters)}")
+        if len(candidate.units) != columns.shape[1]:
+            raise SearchError(
+                f"{columns.shape[1]} columns but {len(candidate.units)} units at {dict(candidate.parameters)}"
+            )
 
 
 #: Words that a closer look may change: what a lead may be mistaken for, the state that scales a pattern, and what the machine did
@@ -234,20 +243,20 @@ def _check_columns(members: Sequence[Member], readings: Readings) -> None:
 _OPEN_WORDS = frozenset({"possible_leads", "follows", "start"})
 
 
-def _same_kind(member: Member, found: Member) -> bool:
+def _same_kind(candidate: Candidate, found: Candidate) -> bool:
     """Alike in what is a word (shape, sensor); numbers may differ."""
     words = {
         name: value for name, value in found.parameters.items() if isinstance(value, str) and name not in _OPEN_WORDS
     }
-    return all(member.parameters.get(name) == value for name, value in words.items())
+    return all(candidate.parameters.get(name) == value for name, value in words.items())
 
 
-def _on(member: Member, used: NDArray[np.bool_]) -> Member:
-    return Member(member.columns[used], member.parameters, member.units, member.event_s)
+def _on(candidate: Candidate, used: NDArray[np.bool_]) -> Candidate:
+    return Candidate(candidate.columns[used], candidate.parameters, candidate.units, candidate.event_s)
 
 
-def member_of(score: FamilyScore) -> Member:
-    """Best member of a scored effect."""
-    if score.member is None:
-        raise SearchError(f"effect {score.name!r} has no member that can be told from the model")
-    return score.member
+def candidate_of(score: FamilyScore) -> Candidate:
+    """Best candidate of a scored effect."""
+    if score.candidate is None:
+        raise SearchError(f"effect {score.name!r} has no candidate that can be told from the model")
+    return score.candidate

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fusion._typing import Array
 from fusion.alignment.readings import Readings
-from fusion.effects.candidates import Member, Prior
+from fusion.effects.candidates import Candidate, Prior
 from fusion.effects.library import Effect
 from interferometry.drift.gls import DriftFit, estimate, fit_fixed_effects
 from interferometry.drift.state_space import DriftSystem
@@ -24,15 +24,15 @@ _SHRINKAGE_READINGS = 20
 
 @dataclass(frozen=True)
 class Term:
-    """One effect of the model with the member that was chosen."""
+    """One effect of the model with the candidate that was chosen."""
 
     effect: str
-    member: Member
+    candidate: Candidate
 
     @property
     def width(self) -> int:
         """Number of coefficients."""
-        return self.member.columns.shape[1]
+        return self.candidate.columns.shape[1]
 
 
 def place_of(terms: Sequence[Term], term: Term, start: int = 0) -> slice:
@@ -69,7 +69,7 @@ class ModelFit:
 
     def priors(self) -> list[tuple[int, Prior]]:
         """Places of the coefficients that something is known of beforehand, and what."""
-        known = [(self.place(term).start, term.member.prior) for term in self.terms]
+        known = [(self.place(term).start, term.candidate.prior) for term in self.terms]
         return [(place, prior) for place, prior in known if prior is not None]
 
     def coefficients(self) -> dict[str, float]:
@@ -82,13 +82,13 @@ class ModelFit:
     def series(self, term: Term) -> tuple[Array, Array]:
         """Predicted contribution of a term to every reading, um, and its standard uncertainty (n,), (n,)."""
         place = self.place(term)
-        columns = term.member.columns
+        columns = term.candidate.columns
         covariance = self.fit.covariance[place, place]
         return columns @ self.fit.coefficients[place], np.sqrt(np.einsum("ni,ij,nj->n", columns, covariance, columns))
 
     def whole_design(self) -> Array:
         """Columns of the fit for all readings, (n, p)."""
-        columns = [self.profile, *(term.member.columns for term in self.terms)]
+        columns = [self.profile, *(term.candidate.columns for term in self.terms)]
         design = np.column_stack(columns)
         if self.fit.system.order == 2:
             hours = (self.readings.seconds / 3600.0)[:, None]
@@ -138,7 +138,7 @@ def fit_model(
     used = np.ones(readings.seconds.size, bool) if used is None else used
     profile = readings.profile
     profile = profile[:, _determined(profile[used])]
-    design = np.column_stack([profile, *(term.member.columns for term in terms)])[used]
+    design = np.column_stack([profile, *(term.candidate.columns for term in terms)])[used]
     seconds, loadings, response = readings.seconds[used], readings.loadings[used], readings.response[used]
     first = estimate(seconds, loadings, response, design, robust=True)
     variance = _site_variance(readings.subset(used), first) * first.system.variance
@@ -183,7 +183,7 @@ def condition(fit: DriftFit, place: int, prior: Prior) -> DriftFit:
 
 def refit_fixed(model: ModelFit, terms: Sequence[Term]) -> DriftFit:
     """Fit another set of terms with the drift's variances kept (for comparing likelihoods of nested models)."""
-    design = np.column_stack([model.profile, *(term.member.columns for term in terms)])[model.used]
+    design = np.column_stack([model.profile, *(term.candidate.columns for term in terms)])[model.used]
     if model.fit.system.order == 2:
         hours = (model.readings.seconds[model.used] / 3600.0)[:, None]
         design = np.column_stack([design, model.readings.loadings[model.used] * hours])
@@ -240,11 +240,11 @@ def settled(model: ModelFit, effects: Mapping[str, Effect]) -> ModelFit:
 
 def again(term: Term, readings: Readings, coefficients: Mapping[str, float], effects: Mapping[str, Effect]) -> Term:
     """A term with the columns that the same parameters give now; one that does not offer them again stays."""
-    near = term.member if term.member.parameters else None
-    offered = effects[term.effect].members(readings, coefficients, near)
-    same = (member for member in offered if _same_parameters(member.parameters, term.member.parameters))
-    member = next(same, term.member)
-    return Term(term.effect, replace(member, prior=term.member.prior))
+    near = term.candidate if term.candidate.parameters else None
+    offered = effects[term.effect].candidates(readings, coefficients, near)
+    same = (candidate for candidate in offered if _same_parameters(candidate.parameters, term.candidate.parameters))
+    candidate = next(same, term.candidate)
+    return Term(term.effect, replace(candidate, prior=term.candidate.prior))
 
 
 def _same_parameters(one: Mapping[str, float | str], other: Mapping[str, float | str]) -> bool:

@@ -1,4 +1,4 @@
-"""What columns explain of responses: many members against many responses at once, and block by block in time.
+"""What columns explain of responses: many candidates against many responses at once, and block by block in time.
 
 Everything here works on whitened columns, so that plain least squares is generalised least squares.
 """
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from fusion._typing import Array
-from fusion.effects.candidates import Member
+from fusion.effects.candidates import Candidate
 
 #: A candidate of which the model explains all but this share adds nothing that these data can show.
 _SEPARABLE_SHARE = 1e-4
@@ -117,9 +117,9 @@ def _evidence(moments: Moments, prior: Array, flat: int) -> Array:
 
 @dataclass(frozen=True)
 class Group:
-    """Members with as many columns: their places, and the first column of each, then the second of each (n, width * size).
+    """Candidates with as many columns: their places, and the first column of each, then the second of each (n, width * size).
 
-    The columns that are no evidence for a member stand before its others.
+    The columns that are no evidence for a candidate stand before its others.
     """
 
     places: NDArray[np.int64]
@@ -128,22 +128,22 @@ class Group:
     columns: Array
 
 
-def by_width(members: Sequence[Member], used: NDArray[np.bool_]) -> list[Group]:
-    """Members at the used readings in groups of equal width, laid out so that products of their columns are products of whole matrices."""
-    kinds = np.array([(member.columns.shape[1], member.beside) for member in members]).reshape(-1, 2)
+def by_width(candidates: Sequence[Candidate], used: NDArray[np.bool_]) -> list[Group]:
+    """Group candidates of equal width at the used readings, so that products of their columns are products of whole matrices."""
+    kinds = np.array([(candidate.columns.shape[1], candidate.beside) for candidate in candidates]).reshape(-1, 2)
     groups = []
     for width, beside in np.unique(kinds, axis=0):
         places = np.flatnonzero((kinds == (width, beside)).all(axis=1))
-        stacked = np.stack([np.roll(members[k].columns[used], beside, axis=1) for k in places], axis=2)
+        stacked = np.stack([np.roll(candidates[k].columns[used], beside, axis=1) for k in places], axis=2)
         groups.append(Group(places, int(width), int(beside), stacked.reshape(stacked.shape[0], -1)))
     return groups
 
 
 def reductions(c: Array, y: Array, q: Array, groups: Sequence[Group]) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Reduction of the residual sum of squares by every member (responses, members), and which members are separable.
+    """Reduction of the residual sum of squares by every candidate (responses, candidates), and which candidates are separable.
 
-    Between them, the reduction by what is no evidence for a member. All whitened: c the members' columns by group, y the responses freed
-    of the model, q an orthonormal basis of the model.
+    Between them, the reduction by what is no evidence for a candidate. All whitened: c the candidates' columns by group, y the
+    responses freed of the model, q an orthonormal basis of the model.
     """
     total = sum(group.places.size for group in groups)
     count = y.shape[1]
@@ -165,7 +165,7 @@ def reductions(c: Array, y: Array, q: Array, groups: Sequence[Group]) -> tuple[A
             own[i] = np.maximum(np.sqrt(whole), 1e-300)
         gram /= own.T[:, :, None] * own.T[:, None, :]
         good = np.linalg.eigvalsh(gram)[:, 0] > _SEPARABLE_SHARE
-        # A member that is not separable explains nothing: its factor is replaced, its moment made zero.
+        # A candidate that is not separable explains nothing: its factor is replaced, its moment made zero.
         gram[~good] = np.eye(width)
         scaled = [moments[:, slot] * (good / own[k]) for k, slot in enumerate(slots)]
         reduced[:, group.places], given[:, group.places] = _explained(
@@ -176,9 +176,9 @@ def reductions(c: Array, y: Array, q: Array, groups: Sequence[Group]) -> tuple[A
 
 
 def _explained(lower: Array, moment: list[Array], first: int) -> tuple[Array, Array]:
-    """Squared length of every response along each member and along its first columns, by forward substitution.
+    """Squared length of every response along each candidate and along its first columns, by forward substitution.
 
-    ``lower`` (members, width, width) are the Cholesky factors.
+    ``lower`` (candidates, width, width) are the Cholesky factors.
     """
     total = np.zeros_like(moment[0])
     along_first = total

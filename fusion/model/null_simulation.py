@@ -32,13 +32,13 @@ def critical_gain(p_value: float, null: Array) -> float:
     return threshold + _mean_excess(null, threshold) * float(np.log(0.1 / min(p_value, 0.1)))
 
 
-def of_all(p_value: float, tried: int) -> float:
+def sidak(p_value: float, tried: int) -> float:
     """Chance that the best of so many effects does as well as one alone with this p-value (Sidak), exact for tiny ones."""
     return float(-np.expm1(tried * np.log1p(-min(p_value, 1.0 - 1e-12))))
 
 
-def of_each(level: float, tried: int) -> float:
-    """The p-value that one of so many effects must reach for a level over all of them: the inverse of :func:`of_all`."""
+def sidak_level(level: float, tried: int) -> float:
+    """The p-value that one of so many effects must reach for a level over all of them: the inverse of :func:`sidak`."""
     return float(-np.expm1(np.log1p(-level) / tried))
 
 

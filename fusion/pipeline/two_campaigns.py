@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from fusion.attribution.two_sessions import Agreement, Common, agree, compare_sources
+from fusion.attribution.two_sessions import Common, SourceAgreement, agree, compare_sources
 from fusion.products.grouped import correlation_of
 from fusion.products.store import read_dataset, write_dataset, write_json, write_text
 from fusion.report.html import render_report
@@ -68,7 +68,7 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
     ]
 
 
-def source_row(one: Agreement, titles: Sequence[str]) -> list[str]:
+def source_row(one: SourceAgreement, titles: Sequence[str]) -> list[str]:
     """Return one source as cells of a table: place, part of the drift, what each session shows there, and whether it is a cause."""
     shown = [
         f"p {p_value(p)}, {measured(value, u, 'µm/K')}, lag {duration(lag)}"

@@ -6,8 +6,10 @@ from collections.abc import Mapping
 
 import xarray as xr
 
+from fusion.errors import FusionError
 
-class ContractError(ValueError):
+
+class ContractError(FusionError):
     """A Dataset that breaks its contract; the message lists every broken promise."""
 
 

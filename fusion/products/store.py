@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from fusion.errors import FusionError
+
 STAMPS = ".stages/stamps.json"
 _PARTIAL = ".partial"
 
 
-class OutputError(ValueError):
+class OutputError(FusionError):
     """A results folder that cannot be written to as asked; the message says what to do."""
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from fusion._typing import Array
 from fusion.alignment.readings import Readings, Series, sample_noise
+from fusion.errors import FusionError
 
 #: Blocks that a record is averaged to at most: more cost time and hold no more of what is slow.
 MOST_BLOCKS = 600
@@ -32,7 +33,7 @@ _MOST_CHAINED = 8
 _LEAST_CHAINED = 4
 
 
-class RecordError(ValueError):
+class RecordError(FusionError):
     """A record that cannot be modelled; the message says what is missing and what to do."""
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion.alignment.readings import Series
-from fusion.effects.candidates import LAGS_MIN, Member, periods_min
+from fusion.effects.candidates import LAGS_MIN, Candidate, periods_min
 from fusion.effects.jumps import jumps
 from fusion.effects.library import LIBRARY, Effect, library
 from fusion.record.blocks import EXPONENTS, Record
@@ -43,22 +43,22 @@ class RecordEffect:
     Attributes
     ----------
     name : as in the library of :mod:`fusion.effects.library`
-    members : from the record (and a member near which to look closer) to columns (blocks, q) that every channel follows with its
+    candidates : from the record (and a candidate near which to look closer) to columns (blocks, q) that every channel follows with its
         own coefficients
     needs : why it cannot be tried with this record, or None
     """
 
     name: str
-    members: Callable[[Record, Member | None], Iterator[Member]]
+    candidates: Callable[[Record, Candidate | None], Iterator[Candidate]]
     needs: Callable[[Record], str | None]
 
 
-def quasi_static_columns(record: Record) -> Member:
+def quasi_static_columns(record: Record) -> Candidate:
     """Rise of every sensor, K: the declared model of a record."""
-    return Member(record.rise, {}, ("um/K",) * len(record.sensors))
+    return Candidate(record.rise, {}, ("um/K",) * len(record.sensors))
 
 
-def thermal_lag_members(record: Record, near: Member | None) -> Iterator[Member]:
+def thermal_lag_candidates(record: Record, near: Candidate | None) -> Iterator[Candidate]:
     """Lagged copies of one sensor, or of the mean of all."""
     block_min = record.block_s / 60.0
     named = {name: record.rise[:, k] for k, name in enumerate(record.sensors)}
@@ -69,10 +69,10 @@ def thermal_lag_members(record: Record, near: Member | None) -> Iterator[Member]
         for minutes in _around(near, LAGS_MIN):
             if minutes >= 2.0 * block_min:
                 lagged = Series(record.seconds, rise, "K").lagged(60.0 * minutes).values
-                yield Member(lagged[:, None], {"sensor": name, "time_constant_min": minutes}, ("um/K",))
+                yield Candidate(lagged[:, None], {"sensor": name, "time_constant_min": minutes}, ("um/K",))
 
 
-def unseen_heat_source_members(record: Record, near: Member | None) -> Iterator[Member]:
+def unseen_heat_source_candidates(record: Record, near: Candidate | None) -> Iterator[Candidate]:
     """States of a chain of parts that a driver heats, in proportion to the driver and to its square."""
     for name, powers in record.drivers.items():
         if near is not None and near.parameters["follows"] != name:
@@ -88,10 +88,10 @@ def unseen_heat_source_members(record: Record, near: Member | None) -> Iterator[
                 "time_constant_min": minutes,
                 "chain": "at once, " + ", ".join(f"{minutes * share:.3g} min" for share in _CHAIN[1:]),
             }
-            yield Member(np.column_stack(states), parameters, ("um",) * len(states))
+            yield Candidate(np.column_stack(states), parameters, ("um",) * len(states))
 
 
-def step_event_members(record: Record, near: Member | None) -> Iterator[Member]:
+def step_event_candidates(record: Record, near: Candidate | None) -> Iterator[Candidate]:
     """A level shift at one instant, in every channel by its own amount."""
     first, last = record.seconds[0], record.seconds[-1]
     margin = _EVENT_MARGIN * (last - first)
@@ -103,10 +103,10 @@ def step_event_members(record: Record, near: Member | None) -> Iterator[Member]:
     for instant in instants:
         if first + margin <= instant <= last - margin:
             late = (record.seconds >= instant).astype(float)
-            yield Member(late[:, None], {"time_s": float(instant)}, ("um",), float(instant))
+            yield Candidate(late[:, None], {"time_s": float(instant)}, ("um",), float(instant))
 
 
-def periodic_disturbance_members(record: Record, near: Member | None) -> Iterator[Member]:
+def periodic_disturbance_candidates(record: Record, near: Candidate | None) -> Iterator[Candidate]:
     """Waves in time."""
     shortest = 4.0 * record.block_s / 60.0
     if near is None:
@@ -117,7 +117,7 @@ def periodic_disturbance_members(record: Record, near: Member | None) -> Iterato
     longest = float(record.seconds[-1] - record.seconds[0]) / 60.0 / _LEAST_PERIODS
     for period in periods[(periods >= shortest) & (periods <= longest)]:
         phase = 2 * np.pi * record.seconds / (60.0 * period)
-        yield Member(np.column_stack([np.cos(phase), np.sin(phase)]), {"period_min": float(period)}, ("um", "um"))
+        yield Candidate(np.column_stack([np.cos(phase), np.sin(phase)]), {"period_min": float(period)}, ("um", "um"))
 
 
 def sensor_faults(record: Record) -> list[tuple[int, float, float]]:
@@ -141,16 +141,16 @@ def sensor_faults(record: Record) -> list[tuple[int, float, float]]:
     return found
 
 
-def sensor_fault_members(record: Record, near: Member | None) -> Iterator[Member]:
+def sensor_fault_candidates(record: Record, near: Candidate | None) -> Iterator[Candidate]:
     """What the jump of a sensor does to the prediction: a step, since the displacement does not follow it."""
     for k, instant, size in sensor_faults(record):
         if near is None or near.event_s == instant:
             late = (record.seconds >= instant).astype(float)
             parameters: dict[str, float | str] = {"sensor": record.sensors[k], "time_s": instant, "jump_K": size}
-            yield Member(late[:, None], parameters, ("um",), instant)
+            yield Candidate(late[:, None], parameters, ("um",), instant)
 
 
-def _around(near: Member | None, grid: tuple[float, ...]) -> tuple[float, ...]:
+def _around(near: Candidate | None, grid: tuple[float, ...]) -> tuple[float, ...]:
     if near is None:
         return grid
     found = float(near.parameters["time_constant_min"])
@@ -158,11 +158,11 @@ def _around(near: Member | None, grid: tuple[float, ...]) -> tuple[float, ...]:
 
 
 _MEMBERS = {
-    "thermal_lag": thermal_lag_members,
-    "unseen_heat_source": unseen_heat_source_members,
-    "step_event": step_event_members,
-    "periodic_disturbance": periodic_disturbance_members,
-    "sensor_fault": sensor_fault_members,
+    "thermal_lag": thermal_lag_candidates,
+    "unseen_heat_source": unseen_heat_source_candidates,
+    "step_event": step_event_candidates,
+    "periodic_disturbance": periodic_disturbance_candidates,
+    "sensor_fault": sensor_fault_candidates,
 }
 
 
@@ -196,8 +196,8 @@ def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[st
     return found, not_tried
 
 
-def _as_it_is(effect: Effect) -> Callable[[Record, Member | None], Iterator[Member]]:
-    return lambda record, near: effect.members(record.view(), {}, near)
+def _as_it_is(effect: Effect) -> Callable[[Record, Candidate | None], Iterator[Candidate]]:
+    return lambda record, near: effect.candidates(record.view(), {}, near)
 
 
 def _own_needs(effect: Effect) -> Callable[[Record], str | None]:

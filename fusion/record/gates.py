@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from fusion._typing import Array
-from fusion.effects.candidates import Member
+from fusion.effects.candidates import Candidate
 from fusion.record.blocks import Record
 from fusion.record.effects import RecordEffect
 from fusion.record.model import RecordFit, gains
@@ -22,14 +22,14 @@ _ONE_SWITCHING = 0.99
 _SMOOTH_GAIN = 2.0
 
 
-def blocked_reason(effect: RecordEffect, member: Member, model: RecordFit) -> str | None:
+def blocked_reason(effect: RecordEffect, candidate: Candidate, model: RecordFit) -> str | None:
     """Why this effect must not be named although it fits, or None."""
     record = model.record
-    if member.event_s is not None and record.switched()[np.searchsorted(record.seconds, member.event_s)]:
-        hours = f"{member.event_s / 3600.0:.2f} h"
+    if candidate.event_s is not None and record.switched()[np.searchsorted(record.seconds, candidate.event_s)]:
+        hours = f"{candidate.event_s / 3600.0:.2f} h"
         return f"at {hours} a driver was switched: a shift there is a response to the load, not an event of its own"
     if effect.name == "unseen_heat_source":
-        driver = str(member.parameters["follows"])
+        driver = str(candidate.parameters["follows"])
         share = one_switching_share(record.drivers[driver][1][model.used])
         if share > _ONE_SWITCHING:
             return (
@@ -37,20 +37,22 @@ def blocked_reason(effect: RecordEffect, member: Member, model: RecordFit) -> st
                 "other; switch the load on purpose to tell"
             )
     if effect.name == "thermal_lag":
-        rise = sensor_rise(record, str(member.parameters["sensor"]))
-        noise = sensor_noise(record, str(member.parameters["sensor"])) / max(float(np.ptp(rise[model.used])), 1e-12)
+        rise = sensor_rise(record, str(candidate.parameters["sensor"]))
+        noise = sensor_noise(record, str(candidate.parameters["sensor"])) / max(float(np.ptp(rise[model.used])), 1e-12)
         if noise > _NOISE_SHARE:
             return (
-                f"the noise of {member.parameters['sensor']} is {100 * noise:.1f} % of its range; above {100 * _NOISE_SHARE:g} % a "
+                f"the noise of {candidate.parameters['sensor']} is {100 * noise:.1f} % of its range; above {100 * _NOISE_SHARE:g} % a "
                 "lagged, smoother copy wins by its smoothness alone"
             )
-        if _follows_the_rate(model, rise, member):
+        if _follows_the_rate(model, rise, candidate):
             return (
-                f"with the delayed copy of {member.parameters['sensor']} the displacement follows the rate of the sensor or leads it, as "
-                "with a late sensor or a source nearby; that is not a lag"
+                f"with the delayed copy of {candidate.parameters['sensor']} the displacement follows the rate of the sensor or leads it, "
+                "as with a late sensor or a source nearby; that is not a lag"
             )
-        smooth = Member(smoothed(record, rise, float(member.parameters["time_constant_min"]))[:, None], {}, ("um/K",))
-        found, _ = gains(model, [member, smooth])
+        smooth = Candidate(
+            smoothed(record, rise, float(candidate.parameters["time_constant_min"]))[:, None], {}, ("um/K",)
+        )
+        found, _ = gains(model, [candidate, smooth])
         advantage = float(found[0, 0] - found[1, 0])
         if advantage < _SMOOTH_GAIN:
             return (
@@ -60,7 +62,7 @@ def blocked_reason(effect: RecordEffect, member: Member, model: RecordFit) -> st
     return None
 
 
-def _follows_the_rate(model: RecordFit, rise: Array, member: Member) -> bool:
+def _follows_the_rate(model: RecordFit, rise: Array, candidate: Candidate) -> bool:
     """True where most of what a delayed copy explains is the sensor's rate, or acts before the sensor.
 
     Alike sensors share their coefficients in any way, so the sensitivity to a sensor is that of all columns to its course. A rate is
@@ -70,7 +72,7 @@ def _follows_the_rate(model: RecordFit, rise: Array, member: Member) -> bool:
     for fit, rows in zip(model.channels, model.rows, strict=True):
         course = rise[rows] - rise[rows].mean()
         size = fit.design.shape[1]
-        found = fit_fixed_effects(fit.system, fit.response, np.column_stack([fit.design, member.columns[rows]]))
+        found = fit_fixed_effects(fit.system, fit.response, np.column_stack([fit.design, candidate.columns[rows]]))
         delayed = float(found.coefficients[-1])
         alone, beside = (
             float((fit.design[:, 1:] @ coefficients[1:size]) @ course) / max(float(course @ course), 1e-300)

@@ -24,9 +24,9 @@ from fusion.record.search import (
     Progress,
     Round,
     Search,
+    candidate_of,
     chain_forward,
     declare,
-    member_of,
     seal,
     search,
 )
@@ -122,7 +122,7 @@ class RecordResult:
         before, after = np.nanmean(self.errors[k]), np.nanmean(self.errors[k + 1])
         return {
             "effect": term.effect,
-            "parameters": dict(term.member.parameters),
+            "parameters": dict(term.candidate.parameters),
             "parameter_ranges": dict(score.ranges),
             "p_value": score.family_wise_p,
             "rmse_before_um": float(before),
@@ -138,13 +138,13 @@ class RecordResult:
             "runner_up": runner_up,
             "rejected": dict(turn.rejected),
             "confirmed": "parts of the record before the seal, each predicted from those before it, are predicted better with it",
-            "event_s": term.member.event_s,
+            "event_s": term.candidate.event_s,
         }
 
     def contribution(self, term: Term) -> Array:
         """What a term contributes to the prediction by the final model, about its mean, um (blocks, channels)."""
         place = place_of(self.found.terms, term)
-        series = term.member.columns @ self.predictions[-1].coefficients[place]
+        series = term.candidate.columns @ self.predictions[-1].coefficients[place]
         return np.asarray(series - series.mean(axis=0))
 
 
@@ -152,7 +152,7 @@ def _round_json(turn: Round) -> list[dict[str, Any]]:
     return [
         {
             "effect": one.name,
-            "parameters": dict(one.member.parameters) if one.member else {},
+            "parameters": dict(one.candidate.parameters) if one.candidate else {},
             "gain": one.gain,
             "excess_gain": one.excess,
             "p_value": one.p_value,
@@ -237,7 +237,7 @@ def without_unrepeated(found: Search, chained: Sequence[Chained]) -> Search:
     """
     for k, (score, _) in enumerate(found.entries):
         tried = [one for one in chained if score.name in one.effects]
-        if not tried or member_of(score).event_s is not None:
+        if not tried or candidate_of(score).event_s is not None:
             continue
         before, after = (
             float(np.nanmean([np.nanmean(one) for one in errors]))

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.effects.candidates import Member
+from fusion.effects.candidates import Candidate
 from fusion.model.fit import Term
 from fusion.model.least_squares import Group, by_width, reductions
 from fusion.model.null_simulation import least_ratio, plausible_ratios
 from fusion.record.blocks import Record, RecordError, independent
 from interferometry.drift.gls import DriftFit, estimate
 
-#: Drift variances that are tried for every member, as factors of the estimated one: from none to ten times as much.
+#: Drift variances that are tried for every candidate, as factors of the estimated one: from none to ten times as much.
 _DRIFT_FACTORS = (1e-6, 10**-2.5, 0.1, 1.0, 10**0.5, 10.0)
 #: Readings per coefficient that a chained block needs before it, or its prediction says nothing.
 _LEAST_PER_COEFFICIENT = 2
@@ -56,7 +56,7 @@ class RecordFit:
 
 def columns_of(record: Record, terms: Sequence[Term]) -> Array:
     """Columns of all terms side by side, (blocks, p)."""
-    return np.concatenate([np.empty((record.seconds.size, 0)), *(term.member.columns for term in terms)], axis=1)
+    return np.concatenate([np.empty((record.seconds.size, 0)), *(term.candidate.columns for term in terms)], axis=1)
 
 
 def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -> RecordFit:
@@ -68,7 +68,7 @@ def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -
         if a channel has too few blocks for the columns.
     """
     most = int(used.sum()) // _PER_COLUMN
-    parts = [_leading(term.member.columns, used, most) for term in terms]
+    parts = [_leading(term.candidate.columns, used, most) for term in terms]
     columns = np.concatenate([columns_of(record, []), *parts], axis=1)
     design = np.column_stack([np.ones(record.seconds.size), columns[:, independent(columns[used])]])
     rng = np.random.default_rng(0)
@@ -144,29 +144,33 @@ def _walk(fit: DriftFit, normal: Array) -> Array:
     return np.asarray(np.cumsum((before + own) * steps, axis=0))
 
 
-def gains(model: RecordFit, members: Sequence[Member], draws: Sequence[Array] = ()) -> tuple[Array, NDArray[np.bool_]]:
-    """Gain in log-likelihood of every member, all channels together, for the record and every draw (members, 1 + draws).
+def gains(
+    model: RecordFit, candidates: Sequence[Candidate], draws: Sequence[Array] = ()
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Gain in log-likelihood of every candidate, all channels together, for the record and every draw (candidates, 1 + draws).
 
-    Every channel has its own drift, whose variance is chosen anew for every member, and for the model without one. A further
+    Every channel has its own drift, whose variance is chosen anew for every candidate, and for the model without one. A further
     coefficient must earn its keep (Akaike).
     """
     draws = draws or [np.empty((rows.size, 0)) for rows in model.rows]
-    total = np.zeros((len(members), 1 + draws[0].shape[1]))
-    separable = np.zeros(len(members), bool)
+    total = np.zeros((len(candidates), 1 + draws[0].shape[1]))
+    separable = np.zeros(len(candidates), bool)
     for fit, rows, drawn in zip(model.channels, model.rows, draws, strict=True):
         here = np.zeros(model.record.seconds.size, bool)
         here[rows] = True
-        gain, tells = _channel_gains(fit, np.column_stack([fit.response, drawn]), by_width(members, here), len(members))
+        gain, tells = _channel_gains(
+            fit, np.column_stack([fit.response, drawn]), by_width(candidates, here), len(candidates)
+        )
         total += np.where(tells[:, None], gain, 0.0)
         separable |= tells
-    widths = np.array([member.columns.shape[1] for member in members])
+    widths = np.array([candidate.columns.shape[1] for candidate in candidates])
     return total - len(model.channels) * (widths - 1.0)[:, None], separable
 
 
 def _channel_gains(
     fit: DriftFit, responses: Array, groups: Sequence[Group], size: int
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Gain of every member in one channel (members, responses), and which members the model does not contain already."""
+    """Gain of every candidate in one channel (candidates, responses), and which candidates the model does not contain already."""
     n, count = responses.shape
     columns = np.concatenate([group.columns for group in groups], axis=1)
     centre = np.maximum(fit.system.ratios, least_ratio(fit.system))

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from fusion._typing import Array
-from fusion.effects.candidates import Member
+from fusion.effects.candidates import Candidate
 from fusion.effects.library import Effect
 from fusion.loop.scoring import Range, parameter_ranges
 from fusion.model.fit import Term
-from fusion.model.null_simulation import DRAWS, of_all, tail_probability
+from fusion.model.null_simulation import DRAWS, sidak, tail_probability
 from fusion.record.blocks import Record, RecordError
 from fusion.record.effects import QUASI_STATIC, RecordEffect, quasi_static_columns, record_library
 from fusion.record.gates import blocked_reason
@@ -43,11 +43,11 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class RecordScore:
-    """What the best member of an effect explains in a record.
+    """What the best candidate of an effect explains in a record.
 
     Attributes
     ----------
-    name, member : the effect and its best member, None where none can be told from the model
+    name, candidate : the effect and its best candidate, None where none can be told from the model
     gain, excess : gain in log-likelihood over all channels, and that minus the mean gain where nothing is missing
     p_value, family_wise_p : chance of such a gain where nothing is missing, for this effect alone and for the best of all tried
     chained_rmse : error of the forward-chained training blocks with it, um; NaN where it was not worth trying
@@ -55,7 +55,7 @@ class RecordScore:
     """
 
     name: str
-    member: Member | None
+    candidate: Candidate | None
     gain: float
     excess: float
     p_value: float
@@ -165,7 +165,7 @@ def search(
         if chosen is None:
             break
         entries.append((chosen, found))
-        terms.append(Term(chosen.name, member_of(chosen)))
+        terms.append(Term(chosen.name, candidate_of(chosen)))
         terms, entries = _re_examine(record, train, terms, entries)
     return Search(record, train, tuple(terms), tuple(entries), tuple(rounds), not_tried, blocked)
 
@@ -186,32 +186,32 @@ def _one_round(
     scores = []
     for name, effect in tried.items():
         try:
-            members = [member for member in effect.members(record, None) if _varies(member, train)]
+            candidates = [candidate for candidate in effect.candidates(record, None) if _varies(candidate, train)]
         except Exception as fault:
             # A user's effect must not end the search for the others.
             not_tried[name] = f"its columns cannot be computed: {type(fault).__name__}: {fault}"
             continue
-        if members:
-            scores.append(_score(name, members, model, draws))
-    scores = [replace(one, family_wise_p=of_all(one.p_value, len(scores))) for one in scores]
+        if candidates:
+            scores.append(_score(name, candidates, model, draws))
+    scores = [replace(one, family_wise_p=sidak(one.p_value, len(scores))) for one in scores]
     scores.sort(key=lambda one: -one.excess)
     rejected: dict[str, str] = {}
     for place, one in enumerate(scores):
-        if one.member is None:
+        if one.candidate is None:
             continue
-        if one.family_wise_p > (ENTRY_LEVEL if one.member.event_s is None else EVENT_LEVEL):
+        if one.family_wise_p > (ENTRY_LEVEL if one.candidate.event_s is None else EVENT_LEVEL):
             continue
-        reason = blocked_reason(tried[one.name], one.member, model)
+        reason = blocked_reason(tried[one.name], one.candidate, model)
         if reason is not None:
             blocked[one.name] = reason
             continue
         refined = _refined(one, tried[one.name], model)
         after = predict(
-            record, np.column_stack([columns_of(record, terms), member_of(refined).columns]), train
+            record, np.column_stack([columns_of(record, terms), candidate_of(refined).columns]), train
         ).chained_rmse
         refined = scores[place] = replace(refined, chained_rmse=after)
         # A level shift is re-learnt by the coefficients of the next part, so an event must only not harm.
-        event = member_of(refined).event_s is not None
+        event = candidate_of(refined).event_s is not None
         if after < EARNED * start or (event and after <= _HARMLESS * start) or not np.isfinite(after):
             return Round(start, tuple(scores), one.name, rejected), refined
         rejected[one.name] = (
@@ -221,38 +221,40 @@ def _one_round(
     return Round(start, tuple(scores), "", rejected), None
 
 
-def _score(name: str, members: Sequence[Member], model: RecordFit, draws: Sequence[Array]) -> RecordScore:
-    gain, separable = gains(model, members, draws)
+def _score(name: str, candidates: Sequence[Candidate], model: RecordFit, draws: Sequence[Array]) -> RecordScore:
+    gain, separable = gains(model, candidates, draws)
     if not separable.any():
         return RecordScore(name, None, 0.0, 0.0, 1.0, 1.0)
     gain = gain[separable]
     best = int(np.argmax(gain[:, 0]))
     null = gain[:, 1:].max(axis=0)
-    member = members[int(np.flatnonzero(separable)[best])]
+    candidate = candidates[int(np.flatnonzero(separable)[best])]
     value = float(gain[best, 0])
-    return RecordScore(name, member, value, value - float(null.mean()), tail_probability(value, null), np.nan)
+    return RecordScore(name, candidate, value, value - float(null.mean()), tail_probability(value, null), np.nan)
 
 
 def _refined(score: RecordScore, effect: RecordEffect, model: RecordFit) -> RecordScore:
-    """The best member in the neighbourhood of the one that was found."""
-    near = [member for member in effect.members(model.record, score.member) if _varies(member, model.used)]
+    """The best candidate in the neighbourhood of the one that was found."""
+    near = [
+        candidate for candidate in effect.candidates(model.record, score.candidate) if _varies(candidate, model.used)
+    ]
     if not near:
         return score
     gain, _ = gains(model, near)
     best = int(np.argmax(gain[:, 0]))
     return replace(
-        score, member=near[best], ranges=parameter_ranges(near, gain[:, 0], near[best], float(gain[best, 0]))
+        score, candidate=near[best], ranges=parameter_ranges(near, gain[:, 0], near[best], float(gain[best, 0]))
     )
 
 
-def _varies(member: Member, train: NDArray[np.bool_]) -> bool:
-    return bool((np.ptp(member.columns[train], axis=0) > 0.0).all())
+def _varies(candidate: Candidate, train: NDArray[np.bool_]) -> bool:
+    return bool((np.ptp(candidate.columns[train], axis=0) > 0.0).all())
 
 
-def member_of(score: RecordScore) -> Member:
-    """Best member of a scored effect."""
-    assert score.member is not None
-    return score.member
+def candidate_of(score: RecordScore) -> Candidate:
+    """Best candidate of a scored effect."""
+    assert score.candidate is not None
+    return score.candidate
 
 
 def _re_examine(
@@ -263,7 +265,7 @@ def _re_examine(
     for k in range(len(entries) - 1):
         others = [term for j, term in enumerate(terms) if j != first + k]
         without = fit_record(record, others, train)
-        gain, separable = gains(without, [terms[first + k].member])
+        gain, separable = gains(without, [terms[first + k].candidate])
         if not separable[0] or gain[0, 0] < _SUPERFLUOUS_GAIN:
             return _re_examine(record, train, others, [pair for j, pair in enumerate(entries) if j != k])
     return terms, entries

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from fusion.errors import FusionError
 from fusion.products.grouped import group
 from fusion.products.store import read_dataset, write_atomically, write_text
 
@@ -22,7 +23,7 @@ LINUXCNC_POINTS = 256
 _SPACING_TOLERANCE_MM = 1e-3
 
 
-class ExportError(ValueError):
+class ExportError(FusionError):
     """Results that cannot be exported in the format asked for; the message says why and what to do."""
 
 

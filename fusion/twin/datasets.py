@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from fusion.errors import FusionError
 from fusion.twin.camera import counts_of, make_view
 from fusion.twin.machine.effects import EFFECTS
 from fusion.twin.machine.streams import stream
@@ -51,12 +52,12 @@ def fields_of(truth: Truth, *, cell_size_mm: float = 5.0, noise_K: float | None 
 
     Raises
     ------
-    ValueError
+    FusionError
         The table moves in the camera's view.
     """
     camera, plan = truth.recipe.camera, truth.recipe.plan
     if camera.table != "still":
-        raise ValueError(
+        raise FusionError(
             "fields_of needs camera.table = 'still'; write the campaign and reduce its frames for a moving table"
         )
     centre_x = (np.arange(round(plan.width_mm / cell_size_mm)) + 0.5) * cell_size_mm

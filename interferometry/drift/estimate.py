@@ -26,6 +26,7 @@ from interferometry._typing import Array
 from interferometry.deviations import DIMS, OUTLIER, set_flag, sort_readings
 from interferometry.drift.gls import DriftFit, average_drift, estimate
 from interferometry.drift.state_space import Order
+from interferometry.errors import InterferometryError
 
 __all__ = [
     "DriftDataError",
@@ -386,7 +387,7 @@ COMPONENT_LEVEL = 1e-3
 GROSS_LIMIT = 50.0
 
 
-class DriftDataError(ValueError):
+class DriftDataError(InterferometryError):
     """The deviations cannot be fitted jointly; the message says what is missing."""
 
 

@@ -11,6 +11,7 @@ from scipy import optimize, stats
 
 from interferometry._typing import Array
 from interferometry.drift.estimate import loadings_of
+from interferometry.errors import InterferometryError
 
 #: Shares of the final drift whose times are named t63 and t95.
 SHARES = {"t63": 1 - math.exp(-1), "t95": 0.95}
@@ -89,16 +90,18 @@ def plan_cycles(
 
     Raises
     ------
-    ValueError
+    InterferometryError
         ``wanted_u_um`` is not above 0, or needs more than 100,000 cycles.
     """
     if not wanted_u_um > 0:
-        raise ValueError(f"wanted_u_um={wanted_u_um} is not above 0")
+        raise InterferometryError(f"wanted_u_um={wanted_u_um} is not above 0")
     measured = int(np.isfinite(deviations["deviation"].values).any(axis=(1, 2)).sum())
     worst = _relative_u_both_directions(estimated)
     cycles = max(2, math.ceil(measured * (worst / wanted_u_um) ** 2))
     if cycles > LONGEST_SEARCH_CYCLES:
-        raise ValueError(f"wanted_u_um={wanted_u_um} would need {cycles} cycles with this scatter; ask for more")
+        raise InterferometryError(
+            f"wanted_u_um={wanted_u_um} would need {cycles} cycles with this scatter; ask for more"
+        )
     period = _cycle_period_s(deviations)
     warnings = [] if lead_mm is None else spacing_warnings(deviations["position"].values, lead_mm=lead_mm)
     return Plan(cycles, cycles * period, worst * math.sqrt(measured / cycles), tuple(warnings))
@@ -113,7 +116,7 @@ def spacing_warnings(position_mm: Array, *, lead_mm: float) -> list[str]:
     lead_mm : float
     """
     if not lead_mm > 0:
-        raise ValueError(f"lead_mm={lead_mm} is not above 0")
+        raise InterferometryError(f"lead_mm={lead_mm} is not above 0")
     leads = np.diff(np.sort(position_mm)) / lead_mm
     whole = np.abs(leads - np.round(leads)) < SPACING_TOLERANCE
     if whole.all() and np.all(np.round(leads) >= 1):
@@ -130,7 +133,7 @@ def _relative_u_both_directions(estimated: xr.Dataset) -> float:
     directions, targets = covariance.shape[:2]
     measured = [d for d in range(directions) if np.isfinite(covariance[d, :, d, :]).all()]
     if not measured:
-        raise ValueError("no direction holds every target; planning needs a trial with all targets")
+        raise InterferometryError("no direction holds every target; planning needs a trial with all targets")
     block = covariance[np.ix_(measured, range(targets), measured, range(targets))].mean(axis=(0, 2))
     variance = np.diag(block) + block[0, 0] - 2 * block[0]
     return float(np.sqrt(variance.max()))

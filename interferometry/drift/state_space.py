@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from interferometry._typing import Array
 from interferometry.drift import kalman
+from interferometry.errors import InterferometryError
 
 Order = Literal[1, 2]
 
 
-class DriftModelError(ValueError):
+class DriftModelError(InterferometryError):
     """The readings or columns cannot be fitted; the message names what is wrong and what to do."""
 
 

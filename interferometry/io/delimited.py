@@ -14,11 +14,13 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from interferometry.errors import InterferometryError
+
 #: Values that instruments write for "no reading"; Renishaw's is -1e20.
 SENTINEL_MAGNITUDE = 1e19
 
 
-class LaserFormatError(ValueError):
+class LaserFormatError(InterferometryError):
     """A laser or environment file that cannot be used; the message names file, place, value and remedy."""
 
 
@@ -32,7 +34,7 @@ class Rejected:
     reason: str
 
 
-class BadReading(ValueError):
+class BadReading(InterferometryError):
     """One line that cannot be used; carries the value and the reason that the list of readings left out shows."""
 
     def __init__(self, value: str, reason: str) -> None:

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from interferometry.errors import InterferometryError
+
 #: Lines of the ENVIRONMENT block: key of the argument, label in the file, factor to the file's unit.
 _ENVIRONMENT = (
     ("air_temperature_degC", "Air temp   ", 1.0),
@@ -55,7 +57,7 @@ def write_rtl(
 
     Raises
     ------
-    ValueError
+    InterferometryError
         An unknown name stands in ``environment`` or ``user_text``.
     """
     environment, user_text = environment or {}, user_text or {}
@@ -82,7 +84,9 @@ def write_rtl(
 def _refuse_unknown(argument: str, given: Mapping[str, object], known: list[str]) -> None:
     unknown = sorted(set(given) - set(known))
     if unknown:
-        raise ValueError(f"{argument}: {', '.join(unknown)} has no place in a .rtl; known are {', '.join(known)}")
+        raise InterferometryError(
+            f"{argument}: {', '.join(unknown)} has no place in a .rtl; known are {', '.join(known)}"
+        )
 
 
 def _deviation_rows(deviations: xr.Dataset) -> list[str]:

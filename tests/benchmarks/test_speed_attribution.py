@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from fusion.attribution.family_wise import LAGS_S, Film
+from fusion.attribution.family_wise import LAGS_S, FieldSeries
 from fusion.attribution.per_target import screen
 from fusion.attribution.warm_up import Excitation
 
@@ -20,11 +20,11 @@ SECONDS = np.arange(CYCLES) * 252.0
 VARIED = Excitation(0.5, False, 3)
 
 
-def film(columns: int, rng: np.random.Generator) -> Film:
+def film(columns: int, rng: np.random.Generator) -> FieldSeries:
     courses = np.cumsum(rng.standard_normal((CYCLES, 6), dtype=np.float32), axis=0)
     patterns = rng.standard_normal((6, columns), dtype=np.float32)
     values = courses @ patterns + np.float32(0.1) * rng.standard_normal((CYCLES, columns), dtype=np.float32)
-    return Film(SECONDS, values - values.mean(axis=0))
+    return FieldSeries(SECONDS, values - values.mean(axis=0))
 
 
 def drifts(rng: np.random.Generator, series: int = SERIES) -> np.ndarray:
@@ -39,7 +39,9 @@ def cost(work: Callable[[], object]) -> tuple[float, float]:
     return time.perf_counter() - wall, time.process_time() - processor
 
 
-def run(values: np.ndarray, seen: Film, permutations: int, lags: tuple[float, ...] = LAGS_S) -> Callable[[], object]:
+def run(
+    values: np.ndarray, seen: FieldSeries, permutations: int, lags: tuple[float, ...] = LAGS_S
+) -> Callable[[], object]:
     return lambda: screen(
         values,
         SECONDS,

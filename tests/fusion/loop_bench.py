@@ -107,7 +107,7 @@ def without(seed: int, jitter_mm: float) -> tuple[Readings, float, ModelFit]:
     """The same campaign with nothing missing, the declared model's error on its sealed cycles, and its fit."""
     readings = readings_of(seed=seed, jitter_mm=jitter_mm)
     used, _ = seal(readings)
-    terms = [Term(name, next(iter(library()[name].members(readings, {}, None)))) for name in DECLARED]
+    terms = [Term(name, next(iter(library()[name].candidates(readings, {}, None)))) for name in DECLARED]
     fit = fit_model(readings, terms, used=used)
     return readings, rmse(fit.open_loop_errors()[0]), fit
 
@@ -119,10 +119,10 @@ def visible_rms(readings: Readings, clean: Readings, fit: ModelFit) -> float:
         # The readings are right and the field is wrong: what is missing is what the declared model says falsely.
         true = fit.coefficients()
         for name in DECLARED:
-            columns = [next(iter(library()[name].members(one, {}, None))).columns[:, 0] for one in (clean, readings)]
+            columns = [next(iter(library()[name].candidates(one, {}, None))).columns[:, 0] for one in (clean, readings)]
             difference = difference + true[name] * (columns[0] - columns[1])
     design = np.column_stack(
-        [readings.profile, *(next(iter(library()[n].members(readings, {}, None))).columns for n in DECLARED)]
+        [readings.profile, *(next(iter(library()[n].candidates(readings, {}, None))).columns for n in DECLARED)]
     )
     left = difference - design @ np.linalg.lstsq(design, difference, rcond=None)[0]
     return float(np.sqrt(np.mean(left**2)))

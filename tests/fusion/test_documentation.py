@@ -52,9 +52,9 @@ def test_the_effect_of_contributing_is_a_whole_effect() -> None:
         seconds = np.array([0.0, 600.0, 1200.0])
         share = np.array([0.0, 0.5, 1.0])
 
-    members = list(effect.members(Readings(), {}, None))  # type: ignore[arg-type]
-    assert [member.columns.shape for member in members] == [(3, 1)] * 3
-    assert len(list(effect.members(Readings(), {}, members[1]))) == 11  # type: ignore[arg-type]
+    candidates = list(effect.candidates(Readings(), {}, None))  # type: ignore[arg-type]
+    assert [candidate.columns.shape for candidate in candidates] == [(3, 1)] * 3
+    assert len(list(effect.candidates(Readings(), {}, candidates[1]))) == 11  # type: ignore[arg-type]
 
 
 def test_the_layout_of_contributing_names_real_files() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 
 from thermography._typing import Array
+from thermography.errors import ThermographyError
 from thermography.fields.cycle_fields import CyclePart, assemble, position_covariance
 from thermography.fields.resampling import plan_weights
 from thermography.fields.scheduling import THREADS
@@ -30,7 +31,7 @@ _CELLS = ("mean", "spread", "noise_variance", "fell_back", "count")
 _SUMS = ("total", "squares", "lowest", "highest")
 
 
-class CheckpointError(ValueError):
+class CheckpointError(ThermographyError):
     """A folder of finished cycles does not belong to this reduction; the message names it and what to do."""
 
 

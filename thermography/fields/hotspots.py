@@ -13,6 +13,7 @@ from scipy import ndimage
 from skimage import measure, morphology
 
 from thermography._typing import Array
+from thermography.errors import ThermographyError
 
 #: Smoothing before peaks are looked for, cells: single cells are noise.
 SMOOTHING_CELLS = 1.0
@@ -68,11 +69,11 @@ def detect_hotspots(rise: xr.DataArray, *, least_prominence_K: float = 0.1, limi
 
     Raises
     ------
-    ValueError
+    ThermographyError
         The field is not (y, x) with at least 3 x 3 cells.
     """
     if rise.dims != ("y", "x") or min(rise.shape) < 3:
-        raise ValueError(
+        raise ThermographyError(
             f"rise has dims {rise.dims} and shape {rise.shape}; give one field (y, x) of at least 3 x 3 cells"
         )
     values = rise.values.astype(float)

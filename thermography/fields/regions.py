@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from skimage.measure import points_in_poly
 
 from thermography._typing import Array
+from thermography.errors import ThermographyError
 from thermography.fields.cycle_fields import pixel_noise
 
 #: Points per cell and side by which a region's share of a cell is counted.
@@ -18,7 +19,7 @@ PARTS = 10
 INSIDE = 0.5
 
 
-class RegionError(ValueError):
+class RegionError(ThermographyError):
     """A region or line does not lie on the seen plan; the message names it and its place."""
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 
 from thermography._typing import Array
+from thermography.errors import ThermographyError
 from thermography.fields.scheduling import THREADS
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration
@@ -95,7 +96,7 @@ def plan_window(registration: Registration, grid: PlanGrid) -> tuple[slice, slic
 
     Raises
     ------
-    ValueError
+    ThermographyError
         No pixel lies on the plan.
     """
     outline = registration.to_sensor(_outline(grid))
@@ -103,7 +104,7 @@ def plan_window(registration: Registration, grid: PlanGrid) -> tuple[slice, slic
     top = max(int(np.floor(outline[:, 1].min())), 0)
     bottom = min(int(np.ceil(outline[:, 1].max())), rows - 1)
     if bottom < top:
-        raise ValueError("no pixel of the frame lies on the plan; check the fiducials and the plan's size")
+        raise ThermographyError("no pixel of the frame lies on the plan; check the fiducials and the plan's size")
     return slice(top, bottom + 1), slice(0, columns)
 
 
@@ -125,7 +126,7 @@ def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float
 
     Raises
     ------
-    ValueError
+    ThermographyError
         No pixel lies on the plan.
     """
     window = plan_window(registration, grid)
@@ -141,7 +142,7 @@ def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float
         )
         cell, pixel, area, x, y = (np.concatenate(both) for both in zip(*halves, strict=True))
     if len(cell) == 0:
-        raise ValueError("no pixel of the frame lies on the plan; check the fiducials and the plan's size")
+        raise ThermographyError("no pixel of the frame lies on the plan; check the fiducials and the plan's size")
     cells = grid.shape[0] * grid.shape[1]
     seen = np.bincount(cell, area, cells)
     coverage = (seen / grid.cell_size_mm**2).reshape(grid.shape).clip(0, 1)

@@ -10,13 +10,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from thermography.errors import ThermographyError
+
 Task = TypeVar("Task")
 
 #: Threads without a cluster: reading and the sums release the interpreter, and two keep a disk and a core busy.
 THREADS = 2
 
 
-class SchedulerError(ValueError):
+class SchedulerError(ThermographyError):
     """The cluster cannot be used; the message names its address and what to do."""
 
 

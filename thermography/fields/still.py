@@ -16,6 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from thermography._typing import Array
+from thermography.errors import ThermographyError
 from thermography.fields.blocks import Block, BlockResult, Camera, Override, cut_blocks, reduce_block
 from thermography.fields.checkpoint import Checkpoint, Finished, Group, describe
 from thermography.fields.cycle_fields import NOT_NUMBERED, CyclePart, assemble, position_covariance
@@ -50,7 +51,7 @@ __all__ = [
 BLOCK_S = 10.0
 
 
-class FieldError(ValueError):
+class FieldError(ThermographyError):
     """The frames cannot be reduced to fields; the message names the frame or cycle and what to do."""
 
 

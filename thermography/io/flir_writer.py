@@ -13,6 +13,7 @@ import imagecodecs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from thermography.errors import ThermographyError
 from thermography.io.fff_record import CAMERA_RECORD, ENTRY_SIZE, HEADER_SIZE, MAGIC, RAW_HEADER_SIZE, RAW_RECORD
 from thermography.io.frame import CalibratedRange, CameraIdentity, CameraParameters, Encoding, Frame
 
@@ -57,14 +58,14 @@ def write_jpeg(
 
     Raises
     ------
-    ValueError
+    ThermographyError
         Where counts, time or housekeeping do not fit the format.
     """
     frame = _frame(counts, parameters, time, camera, limits, housekeeping, utc_offset_minutes)
     record = encode_record(frame, encoding=encoding)
     pieces = [record[at : at + _SEGMENT_PAYLOAD] for at in range(0, len(record), _SEGMENT_PAYLOAD)]
     if len(pieces) > 256:
-        raise ValueError(
+        raise ThermographyError(
             f"{path}: a frame of {len(record)} bytes does not fit the 256 segments of a JPEG; use write_sequence, or encoding='png'"
         )
     segments = [_segment(_exif(frame))]
@@ -141,9 +142,11 @@ def encode_record(frame: Frame, *, encoding: Encoding = "raw") -> bytes:
 def _check_counts(counts: NDArray[np.uint16]) -> None:
     """Refuse what is no picture of 16-bit counts."""
     if counts.ndim != 2 or counts.dtype.kind != "u" or counts.dtype.itemsize != 2:
-        raise ValueError(f"counts: expected uint16 with dims (row, column), got {counts.dtype} of shape {counts.shape}")
+        raise ThermographyError(
+            f"counts: expected uint16 with dims (row, column), got {counts.dtype} of shape {counts.shape}"
+        )
     if not all(0 < length < 65536 for length in counts.shape):
-        raise ValueError(f"counts: expected 1 to 65535 rows and columns, got shape {counts.shape}")
+        raise ThermographyError(f"counts: expected 1 to 65535 rows and columns, got shape {counts.shape}")
 
 
 def _camera_info(frame: Frame) -> bytes:
@@ -219,7 +222,7 @@ def _pack_time(info: bytearray, frame: Frame) -> None:
         return
     milliseconds = int(frame.time.astype("datetime64[ms]").astype(np.int64))
     if not 1000 <= milliseconds < 2**32 * 1000:
-        raise ValueError(f"time {frame.time}: a FLIR file holds times from 1970 to 2106 only")
+        raise ThermographyError(f"time {frame.time}: a FLIR file holds times from 1970 to 2106 only")
     struct.pack_into("<2Ih", info, 0x384, milliseconds // 1000, milliseconds % 1000, -frame.utc_offset_minutes)
 
 
@@ -228,10 +231,10 @@ def _pack_housekeeping(info: bytearray, frame: Frame) -> None:
     seconds, milliseconds = struct.unpack_from("<2I", info, 0x384)
     room = (_CAMERA_INFO_SIZE - 0x47C) // 28
     if len(frame.housekeeping) > room:
-        raise ValueError(f"housekeeping: a FLIR file holds {room} readings, not {len(frame.housekeeping)}")
+        raise ThermographyError(f"housekeeping: a FLIR file holds {room} readings, not {len(frame.housekeeping)}")
     for slot, (name, value) in enumerate(frame.housekeeping.items()):
         if not (name.isascii() and 0 < len(name) < 16 and 150 < value < 450):
-            raise ValueError(
+            raise ThermographyError(
                 f"housekeeping {name!r} = {value}: expected an ASCII name of 1 to 15 letters and 150 to 450 K"
             )
         struct.pack_into("<f16s2I", info, 0x47C + 28 * slot, value, name.encode(), seconds, milliseconds)
@@ -254,7 +257,7 @@ def _raw_record(counts: NDArray[np.uint16], encoding: Encoding) -> bytes:
         samples = _without_spiff(bytes(imagecodecs.jpegls_encode(native)))
         samples += bytes(-len(samples) % 8)
     else:
-        raise ValueError(f"encoding {encoding!r}: expected 'raw', 'png' or 'jpegls'")
+        raise ThermographyError(f"encoding {encoding!r}: expected 'raw', 'png' or 'jpegls'")
     return bytes(head) + samples
 
 

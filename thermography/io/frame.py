@@ -8,11 +8,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from thermography.errors import ThermographyError
+
 Encoding = Literal["raw", "png", "jpegls"]
 Segments = tuple[tuple[int, int], ...]
 
 
-class FlirFormatError(ValueError):
+class FlirFormatError(ThermographyError):
     """A FLIR file breaks a promise of its format; the message names file, offset, what was expected and what was found."""
 
 

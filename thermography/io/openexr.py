@@ -12,6 +12,8 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
+from thermography.errors import ThermographyError
+
 Map = NDArray[np.float32]
 
 #: Part that tells viewers which cells hold a value (1) and which are NaN (0).
@@ -19,7 +21,7 @@ MASK = "mask"
 _RECORD = "thermofuse"
 
 
-class ExrError(ValueError):
+class ExrError(ThermographyError):
     """A map cannot be written or read as it should; the message names the file and the quantity."""
 
 

@@ -13,12 +13,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from thermography.errors import ThermographyError
+
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _GREY_16_BIT = (16, 0, 0, 0, 0)
 _BYTES_PER_PIXEL = 2
 
 
-class PngError(ValueError):
+class PngError(ThermographyError):
     """A PNG that is damaged or not the promised one; the arguments are what was expected and what was found."""
 
 

@@ -9,11 +9,13 @@ import numpy as np
 import xarray as xr
 from zarr.codecs import BloscCodec
 
+from thermography.errors import ThermographyError
+
 #: Fields per chunk: one field costs one chunk, and the series of one cell reads time / 64 of them.
 CHUNK_TIMES = 64
 
 
-class StackError(ValueError):
+class StackError(ThermographyError):
     """A stack cannot be written or read; the message names the folder and what to do."""
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermography._typing import Array
+from thermography.errors import ThermographyError
 from thermography.io.frame import CameraParameters
 from thermography.radiometry.planck import ZERO_CELSIUS_K, count_line
 
@@ -109,7 +110,7 @@ def accumulate(counts: NDArray[np.uint16]) -> CountStatistics:
 
     Raises
     ------
-    ValueError
+    ThermographyError
         Not uint16, no frame, or more than `MOST_FRAMES`.
     """
     sums = Accumulator(counts.shape[1:])
@@ -141,9 +142,11 @@ class Accumulator:
     def add(self, counts: NDArray[np.uint16]) -> None:
         """Add frames of counts, shape (time, ...)."""
         if counts.dtype != np.uint16 or len(counts) == 0 or counts.shape[1:] != self.shape:
-            raise ValueError(f"counts: expected frames of {self.shape} uint16, got {counts.shape} {counts.dtype}")
+            raise ThermographyError(
+                f"counts: expected frames of {self.shape} uint16, got {counts.shape} {counts.dtype}"
+            )
         if self.frames + len(counts) > MOST_FRAMES:
-            raise ValueError(
+            raise ThermographyError(
                 f"counts: {self.frames + len(counts)} frames, but the sums hold {MOST_FRAMES}; merge the statistics of several"
             )
         flat = np.ascontiguousarray(counts).reshape(len(counts), -1)
@@ -156,7 +159,7 @@ class Accumulator:
     def statistics(self) -> CountStatistics:
         """What has been added so far."""
         if self.frames == 0:
-            raise ValueError("no frame has been added")
+            raise ThermographyError("no frame has been added")
         total, squares = _sums(self.frames, self.first, self.steps, self.squares, self.far_squares)
         shape = self.shape
         return CountStatistics(

@@ -14,12 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from thermography.errors import ThermographyError
 from thermography.io.frame import CameraParameters
 
 ZERO_CELSIUS_K = 273.15
 
 
-class RadiometryError(ValueError):
+class RadiometryError(ThermographyError):
     """Parameters with which no temperature can be calculated; the message names the parameter, its value and the remedy."""
 
 

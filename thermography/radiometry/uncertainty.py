@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from thermography.errors import ThermographyError
 from thermography.io.frame import CameraParameters
 from thermography.radiometry.planck import ZERO_CELSIUS_K, black_body_signal, count_line, override, signal_slope
 
@@ -61,7 +62,7 @@ class InputUncertainty:
         for each in fields(self):
             value = getattr(self, each.name)
             if each.name != "netd_temperature_degC" and not (np.isfinite(value) and value >= 0):
-                raise ValueError(f"uncertainty of {each.name} = {value}: expected 0 or more")
+                raise ThermographyError(f"uncertainty of {each.name} = {value}: expected 0 or more")
 
 
 @dataclass(frozen=True, eq=False)

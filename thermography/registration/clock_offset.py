@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
 from thermography._typing import Array
+from thermography.errors import ThermographyError
 
 #: The seen table must travel at least this many times the uncertainty of its place.
 LEAST_TRAVEL = 20.0
@@ -25,7 +26,7 @@ ONE_MINIMUM_S = 5.0
 GROUPS = 20
 
 
-class ClockError(ValueError):
+class ClockError(ThermographyError):
     """Nothing determines the clock offset; the message says why and what to give instead."""
 
 

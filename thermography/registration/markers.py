@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from thermography._typing import Array
+from thermography.errors import ThermographyError
 from thermography.registration.plan import Fiducial
 
 #: The markers' dictionary: 50 patterns of 4 x 4 squares, the coarsest there is, for thermal pictures are small.
@@ -17,7 +18,7 @@ DICTIONARY = cv2.aruco.DICT_4X4_50
 LEAST_MARKERS = 3
 
 
-class MarkerError(ValueError):
+class MarkerError(ThermographyError):
     """The markers in the picture belong to another plan; the message names both and what to do."""
 
 

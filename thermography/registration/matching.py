@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from thermography._typing import Array
+from thermography.errors import ThermographyError
 from thermography.registration.discs import Spot
 from thermography.registration.plan import Fiducial
 from thermography.registration.projection import Projection, Sightings, fit_homography, fit_projection
@@ -21,7 +22,7 @@ ARRANGEMENT_TOLERANCE_PX = 16.0
 LARGEST_ARRANGEMENT = 22
 
 
-class MatchError(ValueError):
+class MatchError(ThermographyError):
     """The spots in the image cannot be told apart; the message says why and what to add."""
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermography._typing import Array
+from thermography.errors import ThermographyError
 
 REQUIRED_COLUMNS = ("name", "x_mm", "y_mm", "diameter_mm")
 HINT_COLUMNS = ("column_px", "row_px")
@@ -19,7 +20,7 @@ MARKER_COLUMN = "marker"
 MARKERS = 50
 
 
-class FiducialError(ValueError):
+class FiducialError(ThermographyError):
     """A fiducial file does not hold what a registration needs; the message names file, line, value and remedy."""
 
 
@@ -29,7 +30,7 @@ class PlanGrid:
 
     Raises
     ------
-    ValueError
+    ThermographyError
         A size is not positive or is not a whole number of cells.
     """
 
@@ -40,11 +41,11 @@ class PlanGrid:
     def __post_init__(self) -> None:
         for name in ("width_mm", "height_mm", "cell_size_mm"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"{name} = {getattr(self, name)} mm; the plan needs a positive length")
+                raise ThermographyError(f"{name} = {getattr(self, name)} mm; the plan needs a positive length")
         for name in ("width_mm", "height_mm"):
             cells = getattr(self, name) / self.cell_size_mm
             if abs(cells - round(cells)) > 1e-6:
-                raise ValueError(
+                raise ThermographyError(
                     f"{name} = {getattr(self, name)} mm is not a whole number of cells of {self.cell_size_mm} mm; "
                     "choose a cell size that divides both sides of the plan"
                 )

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from thermography._typing import Array
+from thermography.errors import ThermographyError
 
 #: The ladder of lens models: name and number of distortion coefficients (k1, k2, p1, p2) that it leaves free.
 LADDER: tuple[tuple[str, int], ...] = (("homography", 0), ("homography+k1", 1), ("homography+k1,k2,p1,p2", 4))
@@ -125,12 +126,14 @@ def fit_homography(seen: Sightings, ideal: Projection) -> Projection:
 
     Raises
     ------
-    ValueError
+    ThermographyError
         The points lie on a line, so that no homography is determined.
     """
     matrix, _ = cv2.findHomography(seen.centres_mm.astype(float), ideal.undistort(seen.points_px).astype(float), 0)
     if matrix is None or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-9:
-        raise ValueError("the fiducials lie on a line or on one spot; spread at least four over both sides of the plan")
+        raise ThermographyError(
+            "the fiducials lie on a line or on one spot; spread at least four over both sides of the plan"
+        )
     return replace(ideal, plan_to_sensor=matrix)
 
 

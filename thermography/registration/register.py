@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermography._typing import Array
+from thermography.errors import ThermographyError
 from thermography.registration.discs import LocatedDisc, detect_discs, locate_disc
 from thermography.registration.markers import identify
 from thermography.registration.matching import MatchError, match_by_arrangement, match_by_hints
@@ -49,7 +50,7 @@ PICKED_U_PX = 0.5
 MISPLACED_MM = 1.0
 
 
-class RegistrationError(ValueError):
+class RegistrationError(ThermographyError):
     """The table cannot be located in the image; the message says which fiducials were found and what to do."""
 
 

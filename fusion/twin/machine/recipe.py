@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from fusion.errors import FusionError
 
-class RecipeError(ValueError):
+
+class RecipeError(FusionError):
     """A recipe that cannot be simulated; the message names file, key, value and remedy."""
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fusion.alignment.first_order_lag import lag_operators
-from fusion.attribution.family_wise import LAGS_S, Film
+from fusion.attribution.family_wise import LAGS_S, FieldSeries
 from fusion.attribution.likelihood_ratio import null_bank
 from fusion.attribution.per_target import screen
 from fusion.attribution.warm_up import Excitation
@@ -17,7 +17,7 @@ SECONDS = np.arange(60) * 252.0
 def problem(rng):
     values = np.cumsum(rng.standard_normal((5, 60)), axis=1) + 0.5 * rng.standard_normal((5, 60))
     film = np.cumsum(rng.standard_normal((60, 700)), axis=0)
-    return values, Film(SECONDS, film - film.mean(axis=0))
+    return values, FieldSeries(SECONDS, film - film.mean(axis=0))
 
 
 def test_the_screen_is_whitened_least_squares_per_series_cell_and_lag(problem):
@@ -57,7 +57,13 @@ def test_the_screen_keeps_its_level_on_independent_walks():
         film = np.cumsum(rng.standard_normal((60, 40)), axis=0)
         values = np.cumsum(rng.standard_normal((4, 60)), axis=1) + 0.3 * rng.standard_normal((4, 60))
         found = screen(
-            values, SECONDS, np.eye(60), Film(SECONDS, film - film.mean(axis=0)), VARIED, permutations=99, rng=rng
+            values,
+            SECONDS,
+            np.eye(60),
+            FieldSeries(SECONDS, film - film.mean(axis=0)),
+            VARIED,
+            permutations=99,
+            rng=rng,
         )
         flagged += bool((found.p_value <= 0.05).any())
     # 7 or more of 40 at a rate of 0.05 has probability 0.003.
@@ -73,7 +79,7 @@ def test_an_effect_is_found_by_the_screen(rng):
         values,
         SECONDS,
         np.eye(60),
-        Film(SECONDS, film - film.mean(axis=0)),
+        FieldSeries(SECONDS, film - film.mean(axis=0)),
         VARIED,
         permutations=99,
         rng=rng,

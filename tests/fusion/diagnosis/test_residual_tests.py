@@ -17,7 +17,7 @@ SEED = 5
 
 def residual_of(*effects: EffectRecipe):
     readings = readings_of(*effects, seed=SEED)
-    terms = [Term(name, next(iter(library()[name].members(readings, {}, None)))) for name in DECLARED]
+    terms = [Term(name, next(iter(library()[name].candidates(readings, {}, None)))) for name in DECLARED]
     return readings, examine_residual(fit_model(readings, terms), np.random.default_rng(1))
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from fusion.alignment.align import AxisGeometry, align
 from fusion.alignment.readings import Readings, ReadingsError, Series, read_fused
-from fusion.effects.candidates import Member, Prior
+from fusion.effects.candidates import Candidate, Prior
 from fusion.effects.jumps import event_instants, instants_near
 from fusion.effects.library import Effect, library
 from fusion.loop.closed_loop import LoopError, close_loop, set_aside_sites
@@ -134,12 +134,12 @@ def test_the_sealed_cycles_do_not_touch_the_model_before_they_are_opened(complet
 
 
 def test_a_users_effect_enters_the_search():
-    def members(readings, coefficients, near):
-        yield Member(np.sin(readings.seconds / 700.0)[:, None] * (readings.target[:, None] == 5), {}, ("um",))
+    def candidates(readings, coefficients, near):
+        yield Candidate(np.sin(readings.seconds / 700.0)[:, None] * (readings.target[:, None] == 5), {}, ("um",))
 
     readings = readings_of()
     hidden = 1.5 * np.sin(readings.seconds / 700.0) * (readings.target == 5)
-    own = Effect("loose_scale", "The scale's clamp at target 5 breathes.", "own observation", members)
+    own = Effect("loose_scale", "The scale's clamp at target 5 breathes.", "own observation", candidates)
     found = close_loop(
         replace(readings, response=readings.response + hidden), DECLARED, effects={**library(), "loose_scale": own}
     )
@@ -147,11 +147,11 @@ def test_a_users_effect_enters_the_search():
 
 
 def test_a_users_effect_that_raises_is_named_and_the_rest_goes_on():
-    def members(readings, coefficients, near):
+    def candidates(readings, coefficients, near):
         raise KeyError("no such series")
         yield
 
-    broken = Effect("broken", "None.", "none", members)
+    broken = Effect("broken", "None.", "none", candidates)
     effects = {name: library()[name] for name in (*DECLARED, "reversal_drift")}
     hidden = readings_of(EffectRecipe("reversal_drift", amplitude_um=0.8))
     found = close_loop(hidden, DECLARED, effects={"broken": broken, **effects})
@@ -187,20 +187,20 @@ def test_too_few_cycles_are_refused():
     ],
 )
 def test_a_users_effect_with_unusable_columns_is_named_and_the_rest_goes_on(column, words):
-    def members(readings, coefficients, near):
-        yield Member(column(readings), {}, ("um",))
+    def candidates(readings, coefficients, near):
+        yield Candidate(column(readings), {}, ("um",))
 
-    own = Effect("own", "None.", "none", members)
+    own = Effect("own", "None.", "none", candidates)
     found = close_loop(readings_of(test={"cycles": 20}), DECLARED, effects={"own": own, **_few("reversal_drift")})
     assert re.search(words, found.not_tried["own"])
     assert {score.name for score in found.rounds[0]} == {"reversal_drift"}
 
 
 def test_an_effect_that_the_model_contains_is_named_as_such():
-    def members(readings, coefficients, near):
-        yield Member(np.ones((readings.seconds.size, 1)), {}, ("um",))
+    def candidates(readings, coefficients, near):
+        yield Candidate(np.ones((readings.seconds.size, 1)), {}, ("um",))
 
-    own = Effect("constant", "None.", "none", members)
+    own = Effect("constant", "None.", "none", candidates)
     found = close_loop(readings_of(test={"cycles": 20}), DECLARED, effects={"constant": own, **_few("reversal_drift")})
     assert "constant or collinear" in found.blocked["constant"]
     told = {one.effect: one for one in found.identifiable}
@@ -269,14 +269,14 @@ def test_a_long_campaign_has_no_more_candidates_than_a_long_day():
     near = instants_near(long, float(event_instants(long)[40]))
     # A closer look reaches from one tried instant to the next.
     assert np.ptp(near) == pytest.approx(2.0 * np.median(steps), rel=0.1)
-    assert len(list(library()["periodic_disturbance"].members(long, {}, None))) <= 600
+    assert len(list(library()["periodic_disturbance"].candidates(long, {}, None))) <= 600
 
 
 def test_one_jump_of_the_camera_is_named_once():
     """Weighed by the coefficients of two rounds its column differs, and both columns become one when they settle."""
     readings = loop_bench.readings_of(loop_bench.effect_of("camera_offset", 0.4, 9007), seed=9007)
     found = close_loop(readings, DECLARED)
-    events = [term.member.event_s for term in found.after.terms if term.effect == "camera_offset"]
+    events = [term.candidate.event_s for term in found.after.terms if term.effect == "camera_offset"]
     assert len(events) == len(set(events)) >= 1
 
 

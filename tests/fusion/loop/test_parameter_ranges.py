@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusion.effects.candidates import Member, pitch_error_members
+from fusion.effects.candidates import Candidate, pitch_error_candidates
 from fusion.loop.scoring import parameter_ranges
 from fusion.report.model_section import parameters_with_ranges
 from tests.fusion.loop_bench import readings_of
@@ -13,8 +13,8 @@ from tests.fusion.loop_bench import readings_of
 NOTHING = np.empty((0, 1))
 
 
-def state(minutes: float, follows: str = "duty") -> Member:
-    return Member(NOTHING, {"follows": follows, "time_constant_min": minutes}, ("um",))
+def state(minutes: float, follows: str = "duty") -> Candidate:
+    return Candidate(NOTHING, {"follows": follows, "time_constant_min": minutes}, ("um",))
 
 
 def test_a_range_ends_where_the_likelihood_has_fallen_by_two():
@@ -56,8 +56,8 @@ def test_a_closer_look_stays_among_waves_that_a_screw_can_make():
     """Half a travel is the longest wave that is tried; the states that scale it are all offered again."""
     readings = readings_of(seed=3)
     travel = float(np.ptp(readings.positions_mm))
-    longest = next(member for member in pitch_error_members(readings, {}, None))
+    longest = next(candidate for candidate in pitch_error_candidates(readings, {}, None))
     assert longest.parameters["period_mm"] == pytest.approx(travel / 2)
-    near = list(pitch_error_members(readings, {}, longest))
-    assert max(member.parameters["period_mm"] for member in near) <= travel / 2 * 1.001
-    assert {member.parameters["follows"] for member in near} == {"mean_rise", "duty", "warm_up"}
+    near = list(pitch_error_candidates(readings, {}, longest))
+    assert max(candidate.parameters["period_mm"] for candidate in near) <= travel / 2 * 1.001
+    assert {candidate.parameters["follows"] for candidate in near} == {"mean_rise", "duty", "warm_up"}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fusion.attribution.two_sessions import Agreement, ConjunctionError
+from fusion.attribution.two_sessions import ConjunctionError, SourceAgreement
 from fusion.pipeline.two_campaigns import join_campaigns, source_row
 from fusion.products.store import read_dataset, write_dataset
 
@@ -45,12 +45,12 @@ def test_other_grids_are_refused(folders: list[Path], tmp_path: Path) -> None:
 
 
 def test_a_source_of_one_session_names_that_session() -> None:
-    one = Agreement("common", 120.0, 60.0, (1,), (0.4, 0.01), (0.2, 1.0), (0.5, 0.1), (0.0, 600.0), False, True)
+    one = SourceAgreement("common", 120.0, 60.0, (1,), (0.4, 0.01), (0.2, 1.0), (0.5, 0.1), (0.0, 600.0), False, True)
     row = source_row(one, ["Monday", "Tuesday"])
     assert row[0] == "120, 60"
     assert row[2] == "p 0.4, 0.2 ± 1.0 µm/K, lag 0 s"
     assert row[-1] == "shown by Tuesday alone"
-    cause = Agreement("common", 120.0, 60.0, (0, 1), (0.01, 0.01), (1.0, 1.0), (0.1, 0.1), (0.0, 0.0), True, True)
+    cause = SourceAgreement("common", 120.0, 60.0, (0, 1), (0.01, 0.01), (1.0, 1.0), (0.1, 0.1), (0.0, 0.0), True, True)
     assert source_row(cause, ["Monday", "Tuesday"])[-1] == "a cause: both agree"
     alike = replace(cause, separate=False)
     assert source_row(alike, ["Monday", "Tuesday"])[-1] == "both agree, but it may only warm with the leading source"

@@ -11,10 +11,10 @@ import pytest
 
 from fusion.campaign.config import load_campaign
 from fusion.campaign.logged_tables import read_record
-from fusion.effects.candidates import Member
+from fusion.effects.candidates import Candidate
 from fusion.effects.library import LIBRARY, Effect, library
 from fusion.record.blocks import RecordError, reduce_record
-from fusion.record.effects import sensor_faults, thermal_lag_members, unseen_heat_source_members
+from fusion.record.effects import sensor_faults, thermal_lag_candidates, unseen_heat_source_candidates
 from fusion.record.gates import blocked_reason, one_switching_share
 from fusion.record.loop import close_record, open_seal, without_unrepeated
 from fusion.record.model import fit_record, simulate_channels
@@ -51,12 +51,12 @@ def test_one_missing_effect_is_named_and_predicts(name, size_um, parameters):
     assert [score.name for score, _ in found.entries] == [name]
     before, after = (channel_rmse(record, one.predicted, ~train).mean() for one in found.predictions())
     assert after < before
-    member = found.terms[-1].member
+    candidate = found.terms[-1].candidate
     if name == "periodic_disturbance":
         # The training part holds 31 periods, whose number is known to a small part of one.
-        assert member.parameters["period_min"] == pytest.approx(37.0, rel=0.01)
+        assert candidate.parameters["period_min"] == pytest.approx(37.0, rel=0.01)
     if name == "step_event":
-        assert member.parameters["time_s"] / 3600.0 == pytest.approx(10.4, abs=0.6)  # within the eleventh hour
+        assert candidate.parameters["time_s"] / 3600.0 == pytest.approx(10.4, abs=0.6)  # within the eleventh hour
 
 
 def test_a_load_that_was_switched_once_names_no_source(rng):
@@ -67,12 +67,14 @@ def test_a_load_that_was_switched_once_names_no_source(rng):
     displacement = source[:, None] * [4.0, -3.0] + rng.normal(0.0, 0.1, (1440, 2))
     record = reduce_record(table_of(displacement, temperature, speed))
     used = np.ones(record.seconds.size, bool)
-    member = next(m for m in unseen_heat_source_members(record, None) if m.parameters["time_constant_min"] == 40.0)
+    candidate = next(
+        m for m in unseen_heat_source_candidates(record, None) if m.parameters["time_constant_min"] == 40.0
+    )
     assert one_switching_share(record.drivers["speed"][1]) > 0.99
     assert one_switching_share(np.tile([0.0, 0.0, 1.0, 1.0], 50)) < 0.1
     effect = next(one for one in LIBRARY if one.name == "unseen_heat_source")
     model = fit_record(record, declare(["quasi_static"], record), used)
-    assert "speed was switched once only" in str(blocked_reason(effect, member, model))
+    assert "speed was switched once only" in str(blocked_reason(effect, candidate, model))
 
 
 def test_a_noisy_sensor_names_no_lag(rng):
@@ -83,8 +85,8 @@ def test_a_noisy_sensor_names_no_lag(rng):
     record = reduce_record(table_of(displacement, temperature))
     model = fit_record(record, declare(["quasi_static"], record), np.ones(record.seconds.size, bool))
     effect = next(one for one in LIBRARY if one.name == "thermal_lag")
-    member = next(m for m in thermal_lag_members(record, None) if m.parameters["sensor"] == "t1")
-    assert "wins by its smoothness alone" in str(blocked_reason(effect, member, model))
+    candidate = next(m for m in thermal_lag_candidates(record, None) if m.parameters["sensor"] == "t1")
+    assert "wins by its smoothness alone" in str(blocked_reason(effect, candidate, model))
 
 
 def test_channels_that_watch_one_part_are_simulated_alike(rng):
@@ -118,11 +120,11 @@ def test_a_user_effect_that_raises_is_named_and_the_rest_goes_on():
 
 
 def test_a_user_effect_sees_the_record_as_readings():
-    def members(readings, coefficients, near):
+    def candidates(readings, coefficients, near):
         door = ((readings.seconds / 3600.0) % 7.0 < 2.0).astype(float)
-        yield Member(door[:, None], {}, ("um",))
+        yield Candidate(door[:, None], {}, ("um",))
 
-    own = Effect("door", "an open door", "seen", members)
+    own = Effect("door", "an open door", "seen", candidates)
     table = twin_table(seed=46)
     hours = np.arange(table.sizes["time"]) / 60.0
     table["displacement"] = table["displacement"] + ((hours % 7.0 < 2.0) * 2.0)[:, None]
