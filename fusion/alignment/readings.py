@@ -123,6 +123,11 @@ class Readings:
         return self.position_mm / self.span_mm
 
     @property
+    def site(self) -> NDArray[np.int64]:
+        """Number of the site, a target approached from one direction: twice the target's index, plus 1 for a negative approach, (n,)."""
+        return self.target_index * 2 + (self.sign < 0)
+
+    @property
     def loadings(self) -> Array:
         """How a common shift and a stretch enter each reading, (n, 2)."""
         return np.column_stack([np.ones_like(self.share), self.share])

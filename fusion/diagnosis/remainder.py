@@ -132,7 +132,7 @@ def _at_readings(
 def _matrix(readings: Readings, values: Array) -> tuple[NDArray[np.int64], list[tuple[int, str]], Array]:
     """Values per cycle and site (cycles, sites); NaN where a reading is missing."""
     cycles = np.unique(readings.cycle)
-    index = readings.target_index * 2 + (readings.sign < 0)
+    index = readings.site
     present = np.unique(index)
     matrix = np.full((cycles.size, present.size), np.nan)
     matrix[np.searchsorted(cycles, readings.cycle), np.searchsorted(present, index)] = values

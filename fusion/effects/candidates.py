@@ -6,9 +6,10 @@ Units: every column is in um per unit of its coefficient. Sources stand with the
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion._typing import Array
 from fusion.alignment.readings import Readings, Series
@@ -52,6 +53,10 @@ class Candidate:
     event_s: float | None = None
     prior: Prior | None = None
     beside: int = 0
+
+    def on(self, used: NDArray[np.bool_]) -> Candidate:
+        """The same candidate with its columns at some of the readings."""
+        return replace(self, columns=self.columns[used])
 
 
 def _column(*columns: Array) -> Array:

@@ -1,131 +1,216 @@
-"""Reasons not to name an effect although it fits: too little excitation, or temperatures too noisy to carry a lag.
+"""Admissibility of an effect that fits: sufficient excitation, and a temperature quiet enough to identify a lag.
 
-A lagged copy of a noisy temperature is a smoother copy, and wins by denoising; one warm-up looks like every other warm-up
-(statistics study, sections 3.4 and 3.5). Both make false names, so both are tested before a name is given.
+A lagged copy of a noisy temperature is a smoother copy and fits better by its smoothness; one warm-up is like every other warm-up. Both
+produce false names, so both are tested before a name is given. The checks are the same for a campaign along an axis and for a record;
+what they ask of the data is answered by the :class:`Grounds` of each. Rates of false names with and without them:
+docs/method/closed-loop.md.
 """
 
 from __future__ import annotations
+
+from typing import Protocol
 
 import numpy as np
 
 from fusion._typing import Array
 from fusion.alignment.readings import Readings, Series, sample_noise
 from fusion.effects.candidates import Candidate, warm_up
-from fusion.effects.library import Effect
+from fusion.loop.decisions import Decision, Reason
 from fusion.model.fit import ModelFit
 from fusion.model.least_squares import residual_squares
 from interferometry.drift.gls import fit_fixed_effects
 
-#: Temperature noise over range beyond which a lag is not believed: where the machine is switched, and for one warm-up only.
-_NOISE_SHARE = {"switched": 0.01, "warm-up": 0.003}
+#: Largest share of a temperature's range that its noise may be for a lag to be identified: where the load is switched, and for a single
+#: warm-up.
+NOISE_SHARE, NOISE_SHARE_OF_A_WARM_UP = 0.01, 0.003
 #: A state of which one plain warm-up explains more than this share has been excited by nothing else: simulated warm-ups reach 0.991.
 WARM_UP_SHARE = 0.99
-#: Log-likelihood that must be left beside free warm-ups of every time constant (protected test), and over a smoothed copy.
+#: Log-likelihood to be gained beside free warm-ups of every time constant (protected test), and over a smoothed copy.
 _PROTECTED_GAIN = 4.0
 _SMOOTH_GAIN = 2.0
 _PROTECTION_MIN = (10.0, 30.0, 90.0, 170.0)
 
 
-def blocked_reason(effect: Effect, candidate: Candidate, part: Readings, model: ModelFit) -> str | None:
-    """Why this effect must not be named although it fits, or None.
+class Grounds(Protocol):
+    """What the data say about the admissibility of a candidate."""
+
+    def at_switching(self, candidate: Candidate) -> float | None:
+        """Hours since the start at which a driver was switched together with the candidate's event, None if it was not."""
+
+    def noise_of_lag(self, candidate: Candidate) -> tuple[str, float, float]:
+        """Name of the temperature that the candidate delays, its noise over its range, and the largest share that is admissible."""
+
+    def refuse_single_excitation(self, effect: str, excited_by: str, candidate: Candidate) -> Decision | None:
+        """The decision against an effect whose state was excited only once."""
+
+    def follows_rate(self, candidate: Candidate) -> bool:
+        """Whether the readings follow the rate of the temperature rather than a delayed copy of it."""
+
+    def advantage_over_smoothing(self, candidate: Candidate) -> float:
+        """Log-likelihood that the delayed copy gains over a copy that is smoothed but not delayed."""
+
+
+def refuse(effect: str, excited_by: str, candidate: Candidate, grounds: Grounds) -> Decision | None:
+    """Decide whether an effect that fits must not be named.
 
     Parameters
     ----------
-    effect, candidate : the candidate, with columns for the readings the model was fitted to
-    part : those readings
-    model : the model without the candidate
+    effect : its name
+    excited_by : ``"field"`` or ``"driver"`` where the effect is only identified by switching of that kind, else ``""``
+    candidate : its best candidate
+    grounds : the data
+
+    Returns
+    -------
+    Decision or None
+        The first check that it fails, None where it is admissible.
     """
-    if not effect.excited_by:
+    hours = grounds.at_switching(candidate)
+    if hours is not None:
+        return Decision(effect, Reason.AT_SWITCHING, {"hours": hours})
+    if not excited_by:
         return None
-    share = warm_up_share(part, candidate)
-    single = share > WARM_UP_SHARE
-    if effect.excited_by == "field":
-        noise = noise_share(part.series["mean_rise"])
-        limit = _NOISE_SHARE["warm-up" if single else "switched"]
+    lags = excited_by == "field"
+    series = ""
+    if lags:
+        series, noise, limit = grounds.noise_of_lag(candidate)
         if noise > limit:
-            return (
-                f"the noise of the mean rise is {100 * noise:.2f} % of its range; above {100 * limit:.1f} % a lagged, smoother copy "
-                "wins by its smoothness alone"
-            )
-    gain = _gain(model, candidate, protection(part) if single else None)
-    if single and gain < _PROTECTED_GAIN:
-        return (
-            f"one warm-up only excited the machine ({100 * share:.1f} % of the candidate is a plain warm-up), and beside free "
-            f"warm-ups it gains only {gain:.1f} in log-likelihood; switch the load on purpose to tell"
-        )
-    if effect.excited_by == "field" and _follows_the_rate(model, candidate):
-        return (
-            "beside it the field's own coefficient takes the opposite sign and nearly cancels it: the readings follow the rate at "
-            "which the table warms, which is the power of a source, not a lag"
-        )
-    if effect.excited_by == "field":
-        smoothed = smoothed_copy(part, float(candidate.parameters["time_constant_min"]))
-        advantage = _gain(model, candidate, None) - _gain(model, smoothed, None)
+            evidence: dict[str, float | str] = {
+                "series": series,
+                "noise_percent": 100.0 * noise,
+                "limit_percent": 100.0 * limit,
+            }
+            return Decision(effect, Reason.TEMPERATURE_NOISE, evidence)
+    single = grounds.refuse_single_excitation(effect, excited_by, candidate)
+    if single is not None:
+        return single
+    if lags and grounds.follows_rate(candidate):
+        return Decision(effect, Reason.FOLLOWS_RATE, {"series": series})
+    if lags:
+        advantage = grounds.advantage_over_smoothing(candidate)
         if advantage < _SMOOTH_GAIN:
-            return (
-                f"a copy of the field that is only smoothed, not delayed, fits as well (log-likelihood {advantage:+.1f}): the lag "
-                "wins by denoising, not by physics"
-            )
+            return Decision(effect, Reason.SMOOTHING, {"series": series, "advantage": advantage})
     return None
 
 
+class AxisGrounds:
+    """Grounds of a positioning campaign: the readings that a model was fitted to, and the model."""
+
+    def __init__(self, model: ModelFit) -> None:
+        self._model = model
+        self._training = model.readings.subset(model.used)
+
+    def at_switching(self, candidate: Candidate) -> float | None:
+        """Return None: a load that is switched between cycles leaves an event its instant."""
+        return None
+
+    def noise_of_lag(self, candidate: Candidate) -> tuple[str, float, float]:
+        """Noise of the mean rise; a single warm-up needs a quieter temperature."""
+        single = warm_up_share(self._training, self._on_training(candidate)) > WARM_UP_SHARE
+        limit = NOISE_SHARE_OF_A_WARM_UP if single else NOISE_SHARE
+        return "the mean rise", noise_share(self._training.series["mean_rise"]), limit
+
+    def refuse_single_excitation(self, effect: str, excited_by: str, candidate: Candidate) -> Decision | None:
+        """Refuse what a plain warm-up explains, unless it gains beside free warm-ups of every time constant."""
+        on_training = self._on_training(candidate)
+        share = warm_up_share(self._training, on_training)
+        if share <= WARM_UP_SHARE:
+            return None
+        gain = _gain(self._model, on_training, _free_warm_ups(self._training))
+        if gain >= _PROTECTED_GAIN:
+            return None
+        return Decision(effect, Reason.SINGLE_WARM_UP, {"share_percent": 100.0 * share, "gain": gain})
+
+    def follows_rate(self, candidate: Candidate) -> bool:
+        """Whether the field and its delayed copy enter with opposite signs and nearly cancel in the long run."""
+        on_training = self._on_training(candidate)
+        model = self._model
+        fit = fit_fixed_effects(
+            model.fit.system, model.fit.response, np.column_stack([model.fit.design, on_training.columns])
+        )
+        direct_units = {"table_offset": "um/K", "axis_expansion": "ppm/K"}
+        for term in model.terms:
+            unit = direct_units.get(term.effect)
+            if unit not in candidate.units:
+                continue
+            direct = float(fit.coefficients[model.place(term)][0])
+            delayed = float(fit.coefficients[model.fit.design.shape[1] + candidate.units.index(unit)])
+            if direct * delayed < 0.0 and abs(direct + delayed) < 0.5 * max(abs(direct), abs(delayed)):
+                return True
+        return False
+
+    def advantage_over_smoothing(self, candidate: Candidate) -> float:
+        """Gain over the seen temperatures averaged over a window as wide as the lag's memory."""
+        smoothed = _smoothed_copy(self._training, float(candidate.parameters["time_constant_min"]))
+        return _gain(self._model, self._on_training(candidate), None) - _gain(self._model, smoothed, None)
+
+    def _on_training(self, candidate: Candidate) -> Candidate:
+        return candidate.on(self._model.used)
+
+
 def noise_share(series: Series) -> float:
-    """Noise of a sampled series over its range, from its second differences (a smooth course cancels in them)."""
+    """Noise of a sampled series over its range.
+
+    Parameters
+    ----------
+    series : evenly or unevenly sampled; a smooth course cancels in its second differences
+
+    Returns
+    -------
+    float
+        1 where fewer than five samples are there.
+    """
     values = series.values
     if values.size < 5:
         return 1.0
     return sample_noise(values) / max(float(np.ptp(values)), 1e-12)
 
 
-def protection(part: Readings) -> Array:
-    """Free warm-ups of several time constants, common and along the axis, (n, 8)."""
-    curves = [warm_up(part, minutes) for minutes in _PROTECTION_MIN]
-    return np.column_stack([*curves, *(curve * part.share for curve in curves)])
+def warm_up_share(readings: Readings, candidate: Candidate) -> float:
+    """Share of a candidate's course that one plain warm-up explains.
+
+    Parameters
+    ----------
+    readings : n readings
+    candidate : with columns (n, q) at these readings
+
+    Returns
+    -------
+    float
+        At the far end of the travel, where a stretch is largest; the least over its columns.
+    """
+    far = np.abs(readings.position_mm) == np.abs(readings.position_mm).max()
+    curves = [warm_up(readings, minutes)[far] for minutes in np.geomspace(5.0, 400.0, 40)]
+    return min(1.0 - min(_residual_share(course, curve) for curve in curves) for course in candidate.columns[far].T)
 
 
-def smoothed_copy(part: Readings, minutes: float) -> Candidate:
+def _residual_share(course: Array, curve: Array) -> float:
+    """Share of a course's variance that a constant and a curve do not explain."""
+    basis = np.column_stack([np.ones(course.size), curve])
+    residual = course - basis @ np.linalg.lstsq(basis, course, rcond=None)[0]
+    return float(residual @ residual) / max(float(((course - course.mean()) ** 2).sum()), 1e-300)
+
+
+def _free_warm_ups(readings: Readings) -> Array:
+    """Warm-ups of several time constants, common and along the axis, (n, 8)."""
+    curves = [warm_up(readings, minutes) for minutes in _PROTECTION_MIN]
+    return np.column_stack([*curves, *(curve * readings.share for curve in curves)])
+
+
+def _smoothed_copy(readings: Readings, minutes: float) -> Candidate:
     """The seen temperatures averaged over a centred window as wide as the lag's memory, without delay."""
     columns = [
-        part.at(_centred_mean(part.series[name], 60.0 * minutes)) * factor
+        readings.at(_centred_mean(readings.series[name], 60.0 * minutes)) * factor
         for name, factor in (("mean_rise", 1.0), ("axis_integral", 1e-3))
     ]
     return Candidate(np.column_stack(columns), {}, ("um/K", "ppm/K"))
 
 
 def _centred_mean(series: Series, half_width_s: float) -> Series:
+    """Mean over a window centred at each sample."""
     weights = np.abs(series.seconds[:, None] - series.seconds[None, :]) <= half_width_s
     smoothed = (weights @ series.values.reshape(series.seconds.size, -1)) / weights.sum(axis=1, keepdims=True)
     return Series(series.seconds, smoothed.reshape(series.values.shape), series.units)
-
-
-def warm_up_share(part: Readings, candidate: Candidate) -> float:
-    """Share of the candidate's course at the far end of the travel that one plain warm-up explains (least of its columns)."""
-    far = np.abs(part.position_mm) == np.abs(part.position_mm).max()
-    curves = [warm_up(part, minutes)[far] for minutes in np.geomspace(5.0, 400.0, 40)]
-    return min(1.0 - min(_residual_share(course, curve) for curve in curves) for course in candidate.columns[far].T)
-
-
-def _residual_share(course: Array, curve: Array) -> float:
-    basis = np.column_stack([np.ones(course.size), curve])
-    left = course - basis @ np.linalg.lstsq(basis, course, rcond=None)[0]
-    return float(left @ left) / max(float(((course - course.mean()) ** 2).sum()), 1e-300)
-
-
-def _follows_the_rate(model: ModelFit, candidate: Candidate) -> bool:
-    """True where the field and its delayed copy enter with opposite signs and little is left in the long run."""
-    fit = fit_fixed_effects(
-        model.fit.system, model.fit.response, np.column_stack([model.fit.design, candidate.columns])
-    )
-    at_once = dict(zip(("table_offset", "axis_expansion"), ("um/K", "ppm/K"), strict=True))
-    for term in model.terms:
-        unit = at_once.get(term.effect)
-        if unit not in candidate.units:
-            continue
-        direct = float(fit.coefficients[model.place(term)][0])
-        delayed = float(fit.coefficients[model.fit.design.shape[1] + candidate.units.index(unit)])
-        if direct * delayed < 0.0 and abs(direct + delayed) < 0.5 * max(abs(direct), abs(delayed)):
-            return True
-    return False
 
 
 def _gain(model: ModelFit, candidate: Candidate, beside: Array | None) -> float:

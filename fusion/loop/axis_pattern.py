@@ -14,6 +14,7 @@ import numpy as np
 from scipy import stats
 
 from fusion._typing import Array
+from fusion.loop.decisions import Decision, Reason
 from fusion.model.fit import ModelFit, Term
 from fusion.model.least_squares import residual_squares
 
@@ -25,8 +26,8 @@ _SEPARABLE = 1e-6
 _PATTERNED = frozenset({"angular_growth", "pitch_error", "reversal_drift"})
 
 
-def wrong_patterns(model: ModelFit, terms: Sequence[Term]) -> dict[int, str]:
-    """Places of the terms that do not deserve their names, each with the reason.
+def wrong_patterns(model: ModelFit, terms: Sequence[Term]) -> dict[int, Decision]:
+    """Places of the terms that do not deserve their names, each with the decision against it.
 
     An effect is wrong where a free pattern fits its course in time better; and two patterns of which one course would do are more likely
     one pattern that the library does not have.
@@ -36,16 +37,13 @@ def wrong_patterns(model: ModelFit, terms: Sequence[Term]) -> dict[int, str]:
     for k in courses:
         p_value = pattern_p_value(model, terms[k])
         if p_value < LEVEL:
-            wrong[k] = (
-                "something with its course in time is there, but along the axis and by direction it is not its pattern "
-                f"(p = {p_value:.1g})"
-            )
+            wrong[k] = Decision(terms[k].effect, Reason.WRONG_PATTERN, {"p_value": p_value})
     patterned = [k for k in courses if terms[k].effect in _PATTERNED]
     for first, second in combinations(patterned, 2):
         if _one_pattern(model, (terms[first], terms[second]), (courses[first], courses[second])):
-            names = f"{terms[first].effect} and {terms[second].effect}"
-            reason = f"{names} fit no better than one course in time with a free pattern: together they are one pattern without a name"
-            wrong[first] = wrong[second] = reason
+            names = {"first": terms[first].effect, "second": terms[second].effect}
+            for place in (first, second):
+                wrong[place] = Decision(terms[place].effect, Reason.SHARED_PATTERN, names)
     return wrong
 
 
@@ -75,7 +73,7 @@ def _left(model: ModelFit, design: Array) -> float:
 def _free_pattern(model: ModelFit, course: Array) -> Array:
     """A course in time (n,) with a size of its own at every site, (n, sites)."""
     readings = model.readings.subset(model.used)
-    site = readings.target_index * 2 + (readings.sign < 0)
+    site = readings.site
     return (site[:, None] == np.unique(site)[None, :]) * course[:, None]
 
 
@@ -85,7 +83,7 @@ def pattern_p_value(model: ModelFit, term: Term) -> float:
     The one target that deviates most is left out: a single position may have an anomaly of its own.
     """
     readings = model.readings.subset(model.used)
-    site = readings.target_index * 2 + (readings.sign < 0)
+    site = readings.site
     course = _course(model, term)
     sites = np.unique(site)
     free = _free_pattern(model, course)
@@ -109,7 +107,7 @@ def pattern_p_value(model: ModelFit, term: Term) -> float:
 def _course(model: ModelFit, term: Term) -> Array:
     """Course in time of a term's largest column, read at the site where it moves most, at all used readings (n,)."""
     readings = model.readings.subset(model.used)
-    site = readings.target_index * 2 + (readings.sign < 0)
+    site = readings.site
     columns = term.candidate.columns[model.used]
     largest = int(np.argmax(columns.std(axis=0) * np.abs(model.fit.coefficients[model.place(term)])))
     column = columns[:, largest]

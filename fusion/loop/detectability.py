@@ -1,14 +1,13 @@
-"""What a campaign could tell at all: how large an effect must be to be found, and which effects look alike in it.
+"""Detection limits: how large an effect must be to be found in a campaign, and which effects look alike in it.
 
-Nothing here looks at what the readings say, only at when, where and under which load they were taken, and at how much noise and drift
-they hold. An effect is found where its expected gain in log-likelihood exceeds, with 80 % power, what the whole search finds by chance.
-The drift is as free here as in the search: what it can stand in for does not count.
+The deviations themselves are not used, only when, where and under which load they were taken, and how much noise and drift they hold. An
+effect is found where its expected gain in log-likelihood exceeds, with 80 % power, the critical gain of the whole search. The drift is as
+free here as in the search: what it can stand in for does not count.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,8 @@ from fusion._typing import Array
 from fusion.effects.candidates import Candidate, hidden_leads_mm
 from fusion.effects.library import Effect
 from fusion.loop.admissibility import WARM_UP_SHARE, warm_up_share
-from fusion.loop.scoring import CandidateScorer, FamilyScore
+from fusion.loop.confirmation import CandidateScorer
+from fusion.loop.state import DetectionLimit, Score
 from fusion.model.fit import ModelFit
 from fusion.model.least_squares import by_width, reductions
 
@@ -30,63 +30,40 @@ _LARGEST_UM = 1e3
 _DRAWS = 20
 
 
-@dataclass(frozen=True)
-class Identifiable:
-    """What this campaign could tell about one effect.
-
-    Attributes
-    ----------
-    effect : its name
-    detectable_um : rms that is found with 80 % power, um: median over the effect's candidates; None where none can be told from the model
-    best_um, worst_um : the same for the candidates that show best and worst
-    visible_share : share of the effect's rms that is left beside static profile and declared effects (median)
-    looks_like : other effects of which a candidate explains at least 90 % of its visible variance
-    note : what stands in the way, empty where nothing does
-    """
-
-    effect: str
-    detectable_um: float | None
-    best_um: float | None
-    worst_um: float | None
-    visible_share: float
-    looks_like: list[str]
-    note: str
-
-
-def identify(
-    judge: CandidateScorer,
+def detection_limits(
+    scorer: CandidateScorer,
     model: ModelFit,
     families: Mapping[str, Sequence[Candidate]],
-    scores: Sequence[FamilyScore],
+    scores: Sequence[Score],
     effects: Mapping[str, Effect],
-) -> list[Identifiable]:
+) -> list[DetectionLimit]:
     """Say for every effect how large it must be to be found and what it looks like.
 
     Parameters
     ----------
-    judge, model : the declared model on the training readings, with simulated campaigns in which it is complete
+    scorer, model : the declared model on the training readings, with simulated campaigns in which it is complete
     families : candidates of every effect that can be tried
     scores : of the first round of the search; only the gain that chance makes is used
     effects : the library
     """
     named = [(name, candidate) for name, candidates in families.items() for candidate in candidates]
-    first = np.column_stack([candidate.columns[judge.used, 0] for _, candidate in named])
+    first = np.column_stack([candidate.columns[scorer.used, 0] for _, candidate in named])
     names = np.array([name for name, _ in named])
     critical = {score.name: score.critical for score in scores}
     wanted = np.array([0.5 * (np.sqrt(2.0 * critical[name]) + _POWER_QUANTILE) ** 2 for name in names])
     own, left = _beside(model, first)
-    smallest = _smallest(judge, first, wanted)
+    smallest = _smallest(scorer, first, wanted)
     # A column that never moves has no size.
     sizes = np.where(own > 0.0, own, np.inf) * smallest
     share = left / np.maximum(own, 1e-300)
     typical = {name: _typical(sizes, names == name) for name in families}
-    alike = _alike(judge, first, [candidate for _, candidate in named], names, list(typical.values()))
+    alike = _alike(scorer, first, [candidate for _, candidate in named], names, list(typical.values()))
     found = []
     for row, name in enumerate(families):
         here = sizes[names == name]
         seen = here[np.isfinite(here)]
         found.append(
-            Identifiable(
+            DetectionLimit(
                 effect=name,
                 detectable_um=float(np.median(seen)) if seen.size else None,
                 best_um=float(seen.min()) if seen.size else None,
@@ -110,7 +87,7 @@ def _typical(sizes: Array, of_effect: NDArray[np.bool_]) -> int:
 def _beside(model: ModelFit, columns: Array) -> tuple[Array, Array]:
     """Rms of columns freed of their mean at every site, and of what is left of them beside the model's columns, (candidates,) each."""
     readings = model.readings.subset(model.used)
-    site = readings.target_index * 2 + (readings.sign < 0)
+    site = readings.site
     number = np.maximum(np.bincount(site), 1)
     means = np.column_stack([np.bincount(site, column) / number for column in columns.T])
     q, _ = np.linalg.qr(model.fit.design)
@@ -118,14 +95,14 @@ def _beside(model: ModelFit, columns: Array) -> tuple[Array, Array]:
     return np.sqrt(np.mean((columns - means[site]) ** 2, axis=0)), np.sqrt(np.mean(left**2, axis=0))
 
 
-def _smallest(judge: CandidateScorer, columns: Array, wanted: Array) -> Array:
+def _smallest(scorer: CandidateScorer, columns: Array, wanted: Array) -> Array:
     """Coefficient of every column at which its expected gain is as wanted, the drift being free with it and without it, (candidates,)."""
-    n, draws = columns.shape[0], judge.draws[:, :_DRAWS]
+    n, draws = columns.shape[0], scorer.draws[:, :_DRAWS]
     energy, noise, penalty = [], [], []
-    for system in judge.systems():
-        errors, spread = system.innovations(np.column_stack([draws, judge.fit.design, columns]))
+    for system in scorer.systems():
+        errors, spread = system.innovations(np.column_stack([draws, scorer.fit.design, columns]))
         errors /= np.sqrt(spread)[:, None]
-        count, p = draws.shape[1], judge.fit.design.shape[1]
+        count, p = draws.shape[1], scorer.fit.design.shape[1]
         q, _ = np.linalg.qr(errors[:, count : count + p])
         free = errors - q @ (q.T @ errors)
         noise.append(np.mean((free[:, :count] ** 2).sum(axis=0)))
@@ -151,19 +128,19 @@ def _smallest(judge: CandidateScorer, columns: Array, wanted: Array) -> Array:
 
 
 def _alike(
-    judge: CandidateScorer,
+    scorer: CandidateScorer,
     first: Array,
     candidates: Sequence[Candidate],
     names: NDArray[np.str_],
     typical: Sequence[int],
 ) -> list[set[str]]:
     """For every effect's typical candidate the effects of which some candidate explains nearly all that is visible of it."""
-    groups = by_width(candidates, judge.used)
+    groups = by_width(candidates, scorer.used)
     columns = np.concatenate([group.columns for group in groups], axis=1)
-    system = judge.fit.system
-    errors, spread = system.innovations(np.column_stack([first[:, list(typical)], judge.fit.design, columns]))
+    system = scorer.fit.system
+    errors, spread = system.innovations(np.column_stack([first[:, list(typical)], scorer.fit.design, columns]))
     errors /= np.sqrt(spread)[:, None]
-    count, p = len(typical), judge.fit.design.shape[1]
+    count, p = len(typical), scorer.fit.design.shape[1]
     q, _ = np.linalg.qr(errors[:, count : count + p])
     y = errors[:, :count] - q @ (q.T @ errors[:, :count])
     reduced, given, _ = reductions(errors[:, count + p :], y, q, groups)
@@ -176,7 +153,7 @@ def _note(effect: Effect, candidate: Candidate, model: ModelFit, seen: int) -> s
     part = model.readings.subset(model.used)
     if not seen:
         return "the declared model contains it, or nothing excites it"
-    on_used = Candidate(candidate.columns[model.used], candidate.parameters, candidate.units, candidate.event_s)
+    on_used = candidate.on(model.used)
     if effect.excited_by and warm_up_share(part, on_used) > WARM_UP_SHARE:
         return "one warm-up is all that excites it; switch the load on purpose to tell it from others"
     if effect.name == "pitch_error":

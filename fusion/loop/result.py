@@ -1,10 +1,9 @@
-"""What the closed loop has to tell: the steps it took, their errors and uncertainties, and the verdict, as results.json says it."""
+"""Result of the closed loop on a positioning campaign, and its form in results.json."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,32 +11,27 @@ from numpy.typing import NDArray
 from fusion._typing import Array
 from fusion.alignment.readings import Readings
 from fusion.diagnosis.remainder import Remainder
-from fusion.effects.candidates import Candidate
-from fusion.loop.detectability import Identifiable
-from fusion.loop.scoring import FamilyScore, Range
-from fusion.loop.search import CONFIRMATION_LEVEL, SEARCH_LEVEL, TIE_GAIN, SealedQuestion
+from fusion.loop.parameter_ranges import Range
+from fusion.loop.state import Confirmation, Confirmed, LoopState, Score, Step, rivals
 from fusion.model.fit import ModelFit, Term, unexplained_drift
-
-#: An effect that is not even significant alone is no rival.
-_RIVAL_LEVEL = 0.05
 
 
 @dataclass(frozen=True)
-class Step:
-    """An effect that was added.
+class AddedEffect:
+    """An effect that was added, as it is reported.
 
     Attributes
     ----------
-    effect, parameters, coefficients : what was added; coefficients by unit as (value, standard uncertainty), from all cycles
+    effect, parameters, coefficients : what was added; coefficients with unit and standard uncertainty, from all cycles
     parameter_ranges : values of the parameters that fit as well (profile likelihood, 95 %)
-    p_value : chance that the search adds any effect where nothing is missing
-    held_out_p : chance of its gain on unused readings where it is not there
-    rmse_before_um, rmse_after_um : open-loop error on the sealed cycles without and with it
+    p_value : probability that the search adds any effect under the null hypothesis
+    held_out_p : probability of its gain on unused readings under the null hypothesis
+    rmse_before_um, rmse_after_um : open-loop error on the hold-out set without and with it
     rms_um : size of its contribution, root mean square after the static profile is removed
-    tied : effects that these data cannot tell from it
-    runner_up : the next best effect, its gain and how far behind it is in log-likelihood
+    tied : effects that these data cannot separate from it
+    runner_up : the next best effect, its p-value and how far behind it is in log-likelihood
     confirmed : how it was confirmed
-    event_cycle : the cycle in which an event happened, None for an effect that is no event
+    event_cycle : the cycle in which an event happened, None for an effect that lasts
     """
 
     effect: str
@@ -54,10 +48,31 @@ class Step:
     confirmed: str
     event_cycle: int | None
 
+    def as_json(self) -> dict[str, object]:
+        """One entry of ``loop.steps``."""
+        return {**vars(self), "parameters": dict(self.parameters), "parameter_ranges": dict(self.parameter_ranges)}
+
 
 @dataclass(frozen=True)
 class LoopResult:
-    """Everything the loop found; see DESIGN of results.json for the meaning of the verdicts."""
+    """Result of the closed loop.
+
+    Attributes
+    ----------
+    declared : names of the declared effects
+    declared_coefficients : their coefficients with unit and standard uncertainty, in the final model
+    held_out : which cycles were held out, in words
+    noise_floor_um : standard deviation of one reading beside the final model
+    rmse_persistence_um : hold-out error of repeating every site's last reading of the training part
+    rmse_declared_um, rmse_final_um : hold-out error of the declared and the final model
+    steps : effects that were added
+    verdict : ``complete``, ``explained``, ``partial`` or ``unexplained``
+    remainder : structure that the final model leaves
+    nuisance : size of the unexplained drift
+    state : the last state of the loop: every round and every decision
+    before : the declared model on the training part
+    after : the final model on all cycles
+    """
 
     declared: list[str]
     declared_coefficients: list[dict[str, float | str]]
@@ -66,20 +81,17 @@ class LoopResult:
     rmse_persistence_um: float
     rmse_declared_um: float
     rmse_final_um: float
-    steps: list[Step]
+    steps: list[AddedEffect]
     verdict: str
     remainder: Remainder
-    rounds: list[list[FamilyScore]]
-    not_tried: dict[str, str]
-    blocked: dict[str, str]
-    question: SealedQuestion | None
-    identifiable: list[Identifiable]
     nuisance: dict[str, float | str]
+    state: LoopState[ModelFit]
     before: ModelFit
     after: ModelFit
 
     def as_json(self) -> dict[str, object]:
         """The ``loop`` part of results.json."""
+        question = self.state.question
         return {
             "declared": self.declared,
             "declared_coefficients": self.declared_coefficients,
@@ -88,7 +100,7 @@ class LoopResult:
             "rmse_persistence_um": self.rmse_persistence_um,
             "rmse_declared_um": self.rmse_declared_um,
             "rmse_final_um": self.rmse_final_um,
-            "steps": [_step_json(step) for step in self.steps],
+            "steps": [step.as_json() for step in self.steps],
             "verdict": self.verdict,
             "unexplained": {
                 "shape": self.remainder.shape,
@@ -97,35 +109,31 @@ class LoopResult:
                 **self._nearest(),
             },
             "nuisance": self.nuisance,
-            "sealed_question": vars(self.question) | {"parameters": dict(self.question.parameters)}
-            if self.question
-            else {},
-            "search": [[_score_json(score) for score in scores] for scores in self.rounds],
-            "identifiability": [vars(one) for one in self.identifiable],
-            "not_tried": self.not_tried,
-            "blocked": self.blocked,
+            "sealed_question": vars(question) | {"parameters": dict(question.parameters)} if question else {},
+            "search": [[_score_json(score) for score in scored.scores] for scored in self.state.rounds],
+            "identifiability": [vars(limit) for scored in self.state.rounds for limit in scored.detection_limits],
+            "not_tried": self.state.not_tried(),
+            "blocked": self.state.blocked(),
         }
 
     def _nearest(self) -> dict[str, object]:
         """The effect that explains the largest share of what is left, its p-value in the search, and that share."""
         added = {step.effect for step in self.steps}
-        rivals = [score for scores in self.rounds for score in scores if score.candidate and score.name not in added]
-        if not self.remainder.shape or not rivals:
+        scores = [score for scored in self.state.rounds for score in scored.scores]
+        others = [score for score in scores if score.candidate and score.name not in added]
+        if not self.remainder.shape or not others:
             return {"nearest": "", "nearest_p": None, "nearest_share": None}
-        shares = [self.remainder.share_of(score.candidate.columns) for score in rivals if score.candidate]
+        shares = [self.remainder.share_of(score.best.columns) for score in others]
         best = int(np.argmax(shares))
         return {
-            "nearest": rivals[best].name,
-            "nearest_p": rivals[best].family_wise_p,
+            "nearest": others[best].name,
+            "nearest_p": others[best].family_wise_p,
             "nearest_share": shares[best],
         }
 
 
-def _step_json(step: Step) -> dict[str, object]:
-    return {**vars(step), "parameters": dict(step.parameters), "parameter_ranges": dict(step.parameter_ranges)}
-
-
-def _score_json(score: FamilyScore) -> dict[str, object]:
+def _score_json(score: Score) -> dict[str, object]:
+    confirmation = score.confirmation or Confirmation(False, Confirmed.LATER_CYCLES)
     return {
         "effect": score.name,
         "parameters": dict(score.candidate.parameters) if score.candidate else {},
@@ -133,106 +141,85 @@ def _score_json(score: FamilyScore) -> dict[str, object]:
         "excess_gain": score.excess,
         "p_value": score.p_value,
         "family_wise_p": score.family_wise_p,
-        "held_out_gain": score.held_out_gain,
-        "held_out_p": score.held_out_p,
+        "held_out_gain": confirmation.gain,
+        "held_out_p": confirmation.p_value,
         "share_not_separable": score.collinear,
     }
 
 
+def report_steps(state: LoopState[ModelFit]) -> list[AddedEffect]:
+    """Describe the steps of a loop whose hold-out set has been opened.
+
+    Parameters
+    ----------
+    state : with a model fitted to all readings, and the hold-out errors of its steps
+    """
+    return [
+        _added_effect(state.model, term, step, state.errors_um[place], state.errors_um[place + 1])
+        for place, (term, step) in enumerate(zip(state.added, state.steps, strict=True))
+    ]
+
+
+def _added_effect(model: ModelFit, term: Term, step: Step, before_um: float, after_um: float) -> AddedEffect:
+    tied, runner_up = rivals(step.score, step.round.scores)
+    held_out_p = step.score.confirmation.p_value if step.score.confirmation else 1.0
+    asked = step.confirmed is Confirmed.HOLD_OUT_QUESTION
+    return AddedEffect(
+        effect=term.effect,
+        parameters=term.candidate.parameters,
+        parameter_ranges=step.score.ranges,
+        coefficients=coefficients_of(model, term),
+        p_value=held_out_p if asked else step.score.family_wise_p,
+        held_out_p=held_out_p,
+        rmse_before_um=before_um,
+        rmse_after_um=after_um,
+        rms_um=_size(model, term),
+        tied=tied,
+        runner_up=runner_up,
+        confirmed=str(step.confirmed),
+        event_cycle=_event_cycle(model.readings, term),
+    )
+
+
+def declared_coefficients(model: ModelFit, declared: int) -> list[dict[str, float | str]]:
+    """Coefficients of the declared effects with unit and standard uncertainty.
+
+    Parameters
+    ----------
+    model : whose first terms are the declared ones
+    declared : their number
+    """
+    return [
+        {"effect": term.effect, **entry} for term in model.terms[:declared] for entry in coefficients_of(model, term)
+    ]
+
+
 def coefficients_of(model: ModelFit, term: Term) -> list[dict[str, float | str]]:
-    """Coefficients of a term with their standard uncertainty and unit, and with the prior that went into the first one."""
+    """Coefficients of a term with standard uncertainty and unit, and with the prior that went into the first one.
+
+    Parameters
+    ----------
+    model : the fitted model
+    term : one of its terms
+    """
     place = model.place(term)
     values, u = model.fit.coefficients[place], model.fit.coefficients_u[place]
-    found: list[dict[str, float | str]] = [
+    entries: list[dict[str, float | str]] = [
         {"value": float(value), "u": float(spread), "unit": unit}
         for value, spread, unit in zip(values, u, term.candidate.units, strict=True)
     ]
     if term.candidate.prior is not None:
-        found[0] |= {"prior": term.candidate.prior.mean, "prior_u": term.candidate.prior.u}
-    return found
+        entries[0] |= {"prior": term.candidate.prior.mean, "prior_u": term.candidate.prior.u}
+    return entries
 
 
 def _size(model: ModelFit, term: Term) -> float:
     """Root mean square of a term's contribution after its mean at every site is removed, um."""
     series = model.series(term)[0]
-    site = model.readings.target_index * 2 + (model.readings.sign < 0)
+    site = model.readings.site
     total = np.bincount(site, series, minlength=site.max() + 1)
     number = np.maximum(np.bincount(site, minlength=site.max() + 1), 1)
     return float(np.sqrt(np.mean((series - (total / number)[site]) ** 2)))
-
-
-class Scored(Protocol):
-    """What a score of any search tells of its effect."""
-
-    @property
-    def name(self) -> str:
-        """Effect."""
-
-    @property
-    def candidate(self) -> Candidate | None:
-        """Its best candidate, None where none can be told from the model."""
-
-    @property
-    def excess(self) -> float:
-        """Gain beyond what chance finds."""
-
-    @property
-    def p_value(self) -> float:
-        """Chance of the gain for this effect alone."""
-
-    @property
-    def family_wise_p(self) -> float:
-        """The same for the best of all that were tried."""
-
-
-def rivals(score: Scored, scores: Sequence[Scored]) -> tuple[list[str], dict[str, float | str]]:
-    """Effects of a round (best excess first) that these data cannot tell from the chosen one; the next best, how far behind."""
-    others = [other for other in scores if other.name != score.name and other.candidate is not None]
-    tied = [other.name for other in others if other.p_value < _RIVAL_LEVEL and score.excess - other.excess < TIE_GAIN]
-    if not others:
-        return tied, {}
-    behind = score.excess - others[0].excess
-    return tied, {"effect": others[0].name, "behind_by": behind, "p_value": others[0].family_wise_p}
-
-
-def make_step(
-    model: ModelFit, term: Term, score: FamilyScore, scores: list[FamilyScore], before: float, after: float
-) -> Step:
-    """Describe an added effect: the score that let it in, all scores of its round, the error on the sealed cycles before and after."""
-    tied, runner_up = rivals(score, scores)
-    return Step(
-        effect=term.effect,
-        parameters=term.candidate.parameters,
-        parameter_ranges=score.ranges,
-        coefficients=coefficients_of(model, term),
-        p_value=_entry_p(score),
-        held_out_p=score.held_out_p,
-        rmse_before_um=before,
-        rmse_after_um=after,
-        rms_um=_size(model, term),
-        tied=tied,
-        runner_up=runner_up,
-        confirmed=_confirmation(term, score),
-        event_cycle=_event_cycle(model.readings, term),
-    )
-
-
-def _entry_p(score: FamilyScore) -> float:
-    """The p-value that let an effect in: of the search, or of the one question that was put to the sealed cycles."""
-    return score.family_wise_p if score.family_wise_p <= SEARCH_LEVEL else score.held_out_p
-
-
-def _confirmation(term: Term, score: FamilyScore) -> str:
-    """How an effect was confirmed, in words."""
-    if score.family_wise_p > SEARCH_LEVEL:
-        return (
-            "the strongest candidate of a search that could not decide; the sealed cycles, asked once about it, agree"
-        )
-    if score.held_out_p > CONFIRMATION_LEVEL:
-        undecided = f"later blocks of cycles do not decide (p = {score.held_out_p:.2g})"
-        return f"{undecided}; its evidence in all of them does, and the sealed cycles agree"
-    way = "on the other half of the targets" if term.candidate.event_s is not None else "on later blocks of cycles"
-    return f"confirmed {way}, coefficients frozen"
 
 
 def _event_cycle(readings: Readings, term: Term) -> int | None:
@@ -244,13 +231,34 @@ def _event_cycle(readings: Readings, term: Term) -> int | None:
 
 
 def rmse(errors: Array) -> float:
-    """Root mean square of errors, those of sites that a fit has never seen left out, um."""
+    """Root mean square of errors, those of sites without a prediction left out.
+
+    Parameters
+    ----------
+    errors : (n,) um; NaN where a site was not in the training part
+
+    Returns
+    -------
+    float
+        um
+    """
     return float(np.sqrt(np.nanmean(errors**2)))
 
 
 def persistence(readings: Readings, used: NDArray[np.bool_]) -> float:
-    """Error of predicting every sealed reading by its site's last reading before the seal, um."""
-    site = readings.target_index * 2 + (readings.sign < 0)
+    """Hold-out error of repeating every site's last reading of the training part.
+
+    Parameters
+    ----------
+    readings : n readings
+    used : (n,) True for the training part
+
+    Returns
+    -------
+    float
+        Root mean square, um.
+    """
+    site = readings.site
     errors = []
     for number in np.unique(site):
         before = np.flatnonzero((site == number) & used)
@@ -261,7 +269,17 @@ def persistence(readings: Readings, used: NDArray[np.bool_]) -> float:
 
 
 def nuisance_size(model: ModelFit) -> dict[str, float | str]:
-    """Size of the drift that nobody explains beside profile and effects: of its common part and of its stretch, um over the readings."""
+    """Size of the unexplained drift beside profile and effects: of its common part and of its stretch.
+
+    Parameters
+    ----------
+    model : fitted to all readings
+
+    Returns
+    -------
+    dict
+        Kind of the drift, root mean square over the readings in um, and rate in um.
+    """
     drift, _ = unexplained_drift(model.fit)
     kind = "random walk" if model.fit.system.order == 1 else "integrated random walk"
     rate = model.fit.drift_rate

@@ -124,7 +124,7 @@ class ModelFit:
         return missed[~self.used], np.sqrt(self.fit.sigma**2 * spread + own)[~self.used]
 
     def _known_site(self) -> NDArray[np.bool_]:
-        site = self.readings.target_index * 2 + (self.readings.sign < 0)
+        site = self.readings.site
         return np.isin(site, np.unique(site[self.used]))
 
 
@@ -207,7 +207,7 @@ def _site_variance(readings: Readings, fit: DriftFit) -> Array:
     noise, share = fit.noise()
     # Readings that were given a larger variance as outliers tell nothing about their site's ordinary scatter.
     ordinary = fit.system.variance == 1.0
-    site = readings.target_index * 2 + (readings.sign < 0)
+    site = readings.site
     relative = np.ones(noise.size)
     for number in np.unique(site):
         here = (site == number) & ordinary

@@ -60,6 +60,28 @@ def solve(normal: Array, moment: Array) -> Array:
 
 
 @dataclass(frozen=True)
+class PriorRows:
+    """Priors of a model's coefficients as further whitened readings, one each, without drift.
+
+    Attributes
+    ----------
+    design : (k, p)
+    response, draws : (k,) and (k, draws)
+    """
+
+    design: Array
+    response: Array
+    draws: Array
+
+    def append(self, y: Array, x: Array) -> tuple[Array, Array]:
+        """Whitened responses (n + k, r) and design (n + k, p + q); columns beyond the model's are zero in the priors' rows."""
+        responses = np.column_stack([self.response, self.draws])[:, : y.shape[1]]
+        design = np.zeros((self.response.size, x.shape[1]))
+        design[:, : self.design.shape[1]] = self.design
+        return np.vstack([y, responses]), np.vstack([x, design])
+
+
+@dataclass(frozen=True)
 class Moments:
     """Products of whitened columns over some readings: of the design (p, p), with the responses (p, r), of the responses (r,)."""
 

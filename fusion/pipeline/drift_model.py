@@ -1,10 +1,9 @@
-"""The stages after the thermal one: deviations evaluated, both recordings joined, correlated, modelled."""
+"""The stage that models the drift: the closed loop, the camera's errors taken out, residual tests, positions that stand out."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -12,24 +11,19 @@ import xarray as xr
 from fusion.alignment.align import align
 from fusion.alignment.readings import Readings, read_fused
 from fusion.campaign.inputs import Source, counted
-from fusion.diagnosis.diagnose import Diagnosis, diagnose
 from fusion.diagnosis.residual_tests import ResidualTests, examine_residual
 from fusion.effects.candidates import Prior
 from fusion.effects.library import EXPANSION_U_PPM_PER_K, Effect, library
+from fusion.loop.axis import close_loop, on_corrected_fields, set_aside_sites
 from fusion.loop.camera_correction import FieldError, correct_fields, corrected_variables, find_field_errors
-from fusion.loop.closed_loop import close_loop, on_corrected_fields, set_aside_sites
 from fusion.loop.result import LoopResult
 from fusion.model.fit import ModelFit, fit_model
+from fusion.pipeline.positions import judge_positions, sites_of
 from fusion.products import store
 from fusion.products.grouped import joined
 from fusion.products.progress import Report
 from fusion.products.results import Notice, Outcome
 from fusion.record.effects import QUASI_STATIC
-from interferometry.anomalies import Anomaly, detect_anomalies
-from interferometry.drift.estimate import estimate_drift
-
-#: Largest family-wise p of an anomaly for which a cause is named.
-_CAUSE_LEVEL = 0.02
 
 
 def effect_names() -> tuple[str, ...]:
@@ -37,67 +31,122 @@ def effect_names() -> tuple[str, ...]:
     return (*library(), QUASI_STATIC)
 
 
+@dataclass(frozen=True)
+class CorrectedCamera:
+    """Errors of the camera that the loop found, and both recordings aligned again on fields without them."""
+
+    errors: list[FieldError]
+    fused: xr.Dataset
+
+
 def model_drift(
     source: Source, fields: xr.Dataset, fused: xr.Dataset, deviations: xr.Dataset, *, report: Report
 ) -> Outcome:
-    """Close the loop, then look for positions that stand out from what the model explains, and for their cause.
+    """Close the loop, then judge the positions that stand out from what the model explains.
 
-    An effect that moves whole stretches of the axis makes their positions stand out too; it is taken out before positions are judged.
-    Where the camera erred, the fields are put right and the model is fitted again to them.
+    Where the camera erred, the fields are corrected and the model is fitted again to them.
+
+    Parameters
+    ----------
+    source : the campaign as read
+    fields : keeps ``thermography.contract.FIELDS``
+    fused : both recordings on one clock
+    deviations : keeps ``interferometry.contract.DEVIATIONS``
+    report : called with the stage, steps done and steps in total
+
+    Returns
+    -------
+    Outcome
+        Residuals, contributions and tests at every reading; the parts ``anomalies`` and ``loop`` of results.json; notices.
     """
     readings = read_fused(fused)
-    found = close_loop(
+    effects = library_for(source)
+    result = close_loop(
         readings,
         source.campaign.model.declared,
-        effects=library_for(source),
+        effects=effects,
         progress=lambda done, total, what: report("closed loop", done, total),
     )
-    errors = find_field_errors(found, fields, fused)
-    if errors:
-        right = align(
-            deviations,
-            correct_fields(fields, errors),
-            source.axis,
-            environment=source.environment,
-            drivers=source.drivers,
-        )
-        found = on_corrected_fields(
-            found, read_fused(right), {one.effect for one in errors}, effects=library_for(source)
-        )
-    # The declared model is shown on the fields as they came, also where they were put right afterwards.
-    declared = fit_model(found.before.readings, found.before.terms)
-    tests = {
-        name: examine_residual(model, np.random.default_rng(1))
-        for name, model in (("declared", declared), ("final", found.after))
-    }
-    variables = loop_variables(fused, found, declared, tests)
-    if errors:
-        corrected = {f"{name}_corrected": right[name] for name in ("mean_rise", "axis_integral", "local_rise")}
-        variables = variables.assign(corrected_variables(fields, fused, errors)).assign(corrected)
+    corrected = correct_camera(source, result, fields, fused, deviations)
+    if corrected is not None:
+        names = {error.effect for error in corrected.errors}
+        result = on_corrected_fields(result, read_fused(corrected.fused), names, effects=effects)
+    errors = [] if corrected is None else corrected.errors
+    models = both_models(result)
+    tests = {name: examine_residual(model, np.random.default_rng(1)) for name, model in models.items()}
+    variables = loop_variables(fused, models, tests).assign(correction_variables(corrected, fields, fused))
     report("anomalies", 0, 1)
-    explained = variables["contribution"].sum("effect", skipna=False)
-    cleaned = deviations.assign(deviation=deviations["deviation"].copy(data=(fused["deviation"] - explained).values))
-    # Scatter that is only unequal, as it naturally is, makes no position a machine's anomaly; one that stands out does.
-    anomalies = [one for one in detect_anomalies(estimate_drift(cleaned), cleaned) if one.stands_out]
-    diagnoses = [
-        temper(anomaly, found_cause)
-        for anomaly, found_cause in zip(
-            anomalies,
-            diagnose(anomalies, fused.assign(deviation=fused["deviation"].copy(data=cleaned["deviation"].values))),
-            strict=True,
-        )
-    ]
-    found = set_aside_sites(found, sites_of(anomalies, deviations.sizes["target"]))
+    positions = judge_positions(fused, deviations, variables["contribution"].sum("effect", skipna=False))
+    result = set_aside_sites(result, sites_of(positions, deviations.sizes["target"]))
     report("anomalies", 1, 1)
     parts = {
-        "anomalies": [anomaly_part(*pair) for pair in zip(anomalies, diagnoses, strict=True)],
+        "anomalies": [position.as_json() for position in positions],
         "loop": {
-            **found.as_json(),
-            "field_corrections": [one.as_json() for one in errors],
-            "residual_tests": {name: one.as_json() for name, one in tests.items()},
+            **result.as_json(),
+            "field_corrections": [error.as_json() for error in errors],
+            "residual_tests": {name: examined.as_json() for name, examined in tests.items()},
         },
     }
     return Outcome(variables, parts, (*gap_notices(readings), *field_notices(errors)))
+
+
+def correct_camera(
+    source: Source, result: LoopResult, fields: xr.Dataset, fused: xr.Dataset, deviations: xr.Dataset
+) -> CorrectedCamera | None:
+    """Take the camera's errors that entered the model out of the fields, and align both recordings again.
+
+    Parameters
+    ----------
+    source, fields, fused, deviations : as for :func:`model_drift`
+    result : of the loop on the fields as they came
+
+    Returns
+    -------
+    CorrectedCamera or None
+        None where the camera did not err.
+    """
+    errors = find_field_errors(result, fields, fused)
+    if not errors:
+        return None
+    aligned = align(
+        deviations,
+        correct_fields(fields, errors),
+        source.axis,
+        environment=source.environment,
+        drivers=source.drivers,
+    )
+    return CorrectedCamera(errors, aligned)
+
+
+def both_models(result: LoopResult) -> dict[str, ModelFit]:
+    """The declared and the final model, each fitted to all readings.
+
+    The declared model is shown on the fields as they came, also where they were corrected afterwards.
+
+    Parameters
+    ----------
+    result : of the loop
+    """
+    return {"declared": fit_model(result.before.readings, result.before.terms), "final": result.after}
+
+
+def correction_variables(
+    corrected: CorrectedCamera | None, fields: xr.Dataset, fused: xr.Dataset
+) -> dict[str, xr.Variable | xr.DataArray]:
+    """The correction of the fields and what it changes, for fusion.nc; empty where the camera did not err.
+
+    Parameters
+    ----------
+    corrected : of :func:`correct_camera`
+    fields, fused : before the correction
+    """
+    if corrected is None:
+        return {}
+    names = ("mean_rise", "axis_integral", "local_rise")
+    return {
+        **corrected_variables(fields, fused, corrected.errors),
+        **{f"{name}_corrected": corrected.fused[name] for name in names},
+    }
 
 
 def gap_notices(readings: Readings) -> list[Notice]:
@@ -148,54 +197,22 @@ def join_fusion(fused: xr.Dataset, maps: xr.Dataset, loop: xr.Dataset) -> xr.Dat
     return dataset.assign_attrs({f"correlation_{name}": value for name, value in own.items()})
 
 
-def temper(anomaly: Anomaly, diagnosis: Diagnosis) -> Diagnosis:
-    """Name no cause for a position that is itself flagged only at the limit: two doubts make no verdict."""
-    if diagnosis.cause == "undetermined" or anomaly.p_value <= _CAUSE_LEVEL:
-        return diagnosis
-    doubt = f"the position itself is flagged only at the limit (p = {anomaly.p_value:.2g}); before a cause, it needs more cycles"
-    return replace(diagnosis, cause="undetermined", against_it=(doubt, *diagnosis.against_it))
+def loop_variables(fused: xr.Dataset, models: Mapping[str, ModelFit], tests: Mapping[str, ResidualTests]) -> xr.Dataset:
+    """Lay residuals, spectra and contributions of the effects out by cycle, direction and target.
 
+    Parameters
+    ----------
+    fused : both recordings on one clock
+    models : the ``declared`` and the ``final`` model
+    tests : of the residual of each
 
-def sites_of(anomalies: Sequence[Anomaly], targets: int) -> list[tuple[int, str]]:
-    """Return the sites (target, direction) that are reported as anomalies, with a cause or without one, and not by the loop again.
-
-    Where more than a quarter of the targets stands out, that is no matter of single positions, and none is set aside.
+    Returns
+    -------
+    Dataset
+        Residuals and contributions in um, innovations in standard deviations; NaN where there is no reading.
     """
-    if 4 * len({one.target for one in anomalies}) > targets:
-        return []
-    return [(one.target, name) for one in anomalies for name in directions_of(one.direction)]
-
-
-def directions_of(direction: str) -> tuple[str, ...]:
-    """Return the approaches that an anomaly concerns."""
-    return ("positive", "negative") if direction == "both" else (direction,)
-
-
-def anomaly_part(anomaly: Anomaly, diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return one entry of ``anomalies`` in results.json: what was flagged, its cause, and the evidence for and against it."""
-    return {
-        "target": anomaly.target,
-        "direction": anomaly.direction,
-        "p_value": anomaly.p_value,
-        "scatter_um": anomaly.scatter_um,
-        "cause": diagnosis.cause,
-        "evidence": {
-            "kind": anomaly.kind,
-            "extra_um": anomaly.extra_um,
-            "probability": diagnosis.probability,
-            "for": list(diagnosis.for_it),
-            "against": list(diagnosis.against_it),
-            "check": diagnosis.check,
-            **diagnosis.evidence,
-        },
-    }
-
-
-def loop_variables(
-    fused: xr.Dataset, found: LoopResult, declared: ModelFit, tests: Mapping[str, ResidualTests]
-) -> xr.Dataset:
-    """Return the residuals before and after with their spectra, and what each effect contributes, at every reading."""
-    readings = found.after.readings
+    final = models["final"]
+    readings = final.readings
     dims = ("cycle", "direction", "target")
     shape = tuple(fused.sizes[name] for name in dims)
     place = (
@@ -209,15 +226,14 @@ def loop_variables(
         laid[place] = values
         return laid
 
-    terms = found.after.terms
+    terms = final.terms
     names = [term.effect for term in terms]
     unique = [name if names.count(name) == 1 else f"{name} {at + 1}" for at, name in enumerate(names)]
-    contribution = np.array([spread(found.after.series(term)[0]) for term in terms]).reshape(len(terms), *shape)
+    contribution = np.array([spread(final.series(term)[0]) for term in terms]).reshape(len(terms), *shape)
     um = {"units": "um"}
     return xr.Dataset(
         {
-            "residual_declared": (dims, spread(centred(declared)), um),
-            "residual_final": (dims, spread(centred(found.after)), um),
+            **{f"residual_{name}": (dims, spread(_centred(model)), um) for name, model in models.items()},
             "contribution": (("effect", *dims), contribution, um),
             **{
                 f"innovation_{name}": (
@@ -250,7 +266,7 @@ def loop_variables(
     )
 
 
-def centred(fit: ModelFit) -> np.ndarray:
+def _centred(fit: ModelFit) -> np.ndarray:
     """Return the readings minus profile and effects, the unexplained drift left in, with mean zero, (n,)."""
     residual = fit.fit.residual()
     return residual - residual.mean()

@@ -15,8 +15,9 @@ from fusion.products.progress import Report
 from fusion.products.results import Notice, Outcome
 from fusion.record.blocks import Record, reduce_record
 from fusion.record.effects import QUASI_STATIC
-from fusion.record.loop import RecordResult, close_record
-from fusion.record.search import declare
+from fusion.record.hold_out import declare
+from fusion.record.loop import close_record
+from fusion.record.result import RecordResult
 from fusion.report.wording import duration
 
 
@@ -125,7 +126,7 @@ def record_notices(record: Record) -> list[Notice]:
 
 def record_variables(record: Record, found: RecordResult) -> xr.Dataset:
     """Return the record on its blocks with predictions, contributions and the sealed part."""
-    terms = found.found.terms
+    terms = found.state.model.terms
     names = [term.effect for term in terms]
     unique = [name if names.count(name) == 1 else f"{name} {at + 1}" for at, name in enumerate(names)]
     drivers = np.array([powers[1] for powers in record.drivers.values()]).reshape(-1, record.seconds.size).T
@@ -157,7 +158,7 @@ def record_variables(record: Record, found: RecordResult) -> xr.Dataset:
                 um,
             ),
             "noise": ("channel", found.whole.sigma, {**um, "long_name": "noise of a block mean"}),
-            "sealed": ("time", found.sealed, {"long_name": "block that took no part in any choice"}),
+            "sealed": ("time", found.hold_out, {"long_name": "block that took no part in any choice"}),
             "part": ("time", record.chained + 1, {"long_name": "part of the record for forward chaining"}),
         },
         coords={

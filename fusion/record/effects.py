@@ -46,11 +46,13 @@ class RecordEffect:
     candidates : from the record (and a candidate near which to look closer) to columns (blocks, q) that every channel follows with its
         own coefficients
     needs : why it cannot be tried with this record, or None
+    excited_by : as in the library
     """
 
     name: str
     candidates: Callable[[Record, Candidate | None], Iterator[Candidate]]
     needs: Callable[[Record], str | None]
+    excited_by: str = ""
 
 
 def quasi_static_columns(record: Record) -> Candidate:
@@ -157,7 +159,7 @@ def _around(near: Candidate | None, grid: tuple[float, ...]) -> tuple[float, ...
     return tuple(float(found * factor) for factor in np.geomspace(0.6, 1.6, 7))
 
 
-_MEMBERS = {
+_CANDIDATES = {
     "thermal_lag": thermal_lag_candidates,
     "unseen_heat_source": unseen_heat_source_candidates,
     "step_event": step_event_candidates,
@@ -187,12 +189,12 @@ def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[st
     built_in = {effect.name for effect in LIBRARY}
     found, not_tried = {}, {}
     for name, effect in (library() if effects is None else effects).items():
-        if name in _MEMBERS:
-            found[name] = RecordEffect(name, _MEMBERS[name], _needs(name))
+        if name in _CANDIDATES:
+            found[name] = RecordEffect(name, _CANDIDATES[name], _needs(name), effect.excited_by)
         elif name in built_in:
             not_tried[name] = _ALONG_AN_AXIS
         else:
-            found[name] = RecordEffect(name, _as_it_is(effect), _own_needs(effect))
+            found[name] = RecordEffect(name, _as_it_is(effect), _own_needs(effect), effect.excited_by)
     return found, not_tried
 
 

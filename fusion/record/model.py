@@ -1,7 +1,7 @@
 """A model of a record: tested under a drift that is free to wander, predicted with shrunken coefficients.
 
 Two fits serve two questions. Whether an effect is there is asked under a drift in every channel that may explain the same thing
-(generalised least squares; statistics study, section 1.5). What the model predicts for hours ahead is asked of coefficients that
+(generalised least squares). What the model predicts for hours ahead is asked of coefficients that
 are shrunk together: many alike sensors determine their coefficients badly, and such coefficients extrapolate badly. How strongly to
 shrink is decided by forward chaining inside the readings that the model may use.
 """
@@ -9,21 +9,22 @@ shrink is decided by forward chaining inside the readings that the model may use
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
 from fusion.effects.candidates import Candidate
+from fusion.loop.scoring import Gains
+from fusion.model.drift_variances import SINGLE, plausible_ratios, scaled_systems
 from fusion.model.fit import Term
-from fusion.model.least_squares import Group, by_width, reductions
-from fusion.model.null_simulation import least_ratio, plausible_ratios
+from fusion.model.least_squares import by_width
+from fusion.model.null_simulation import random_walk
+from fusion.model.profile_gain import profile_gains
 from fusion.record.blocks import Record, RecordError, independent
 from interferometry.drift.gls import DriftFit, estimate
 
-#: Drift variances that are tried for every candidate, as factors of the estimated one: from none to ten times as much.
-_DRIFT_FACTORS = (1e-6, 10**-2.5, 0.1, 1.0, 10**0.5, 10.0)
 #: Readings per coefficient that a chained block needs before it, or its prediction says nothing.
 _LEAST_PER_COEFFICIENT = 2
 #: Blocks per column of one effect; what has more columns is reduced to its principal components for the test.
@@ -127,30 +128,26 @@ def simulate_channels(model: RecordFit, rng: np.random.Generator, *, draws: int)
         pool[rows] = noises[k]
         drawn = pool[picked[rows]] * np.sqrt(fit.system.variance)[:, None]
         ratios = plausible_ratios(fit, rng, draws=draws)[:, 0]
-        drawn += fit.sigma * np.sqrt(ratios) * _walk(fit, correlated[..., k][:, rows])
+        drawn += fit.sigma * np.sqrt(ratios) * random_walk(fit.system, *correlated[..., k][:, rows])
         simulated.append(drawn)
     return simulated
 
 
-def _walk(fit: DriftFit, normal: Array) -> Array:
-    """Random walk or integrated walk of unit variance rate from standard normal numbers (2, n, draws), (n, draws)."""
-    steps = np.diff(fit.system.seconds, prepend=fit.system.seconds[0])[:, None]
-    shocks = normal[0] * np.sqrt(steps)
-    if fit.system.order == 1:
-        return np.asarray(np.cumsum(shocks, axis=0))
-    rate = np.cumsum(shocks, axis=0)
-    before = np.vstack([np.zeros(shocks.shape[1]), rate[:-1]])
-    own = 0.5 * shocks + normal[1] * np.sqrt(steps / 12.0)
-    return np.asarray(np.cumsum((before + own) * steps, axis=0))
+def channel_gains(model: RecordFit, candidates: Sequence[Candidate], draws: Sequence[Array] = ()) -> Gains:
+    """Gain in log-likelihood of every candidate, all channels together.
 
+    Every channel has its own drift, whose variance is chosen anew for every candidate and for the model without one.
 
-def gains(
-    model: RecordFit, candidates: Sequence[Candidate], draws: Sequence[Array] = ()
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Gain in log-likelihood of every candidate, all channels together, for the record and every draw (candidates, 1 + draws).
+    Parameters
+    ----------
+    model : without the candidates
+    candidates : with columns for all blocks
+    draws : for every channel, (n, draws) simulated displacements, um
 
-    Every channel has its own drift, whose variance is chosen anew for every candidate, and for the model without one. A further
-    coefficient must earn its keep (Akaike).
+    Returns
+    -------
+    Gains
+        For the record and every draw; one unit is taken off for every coefficient beyond the first in every channel (Akaike).
     """
     draws = draws or [np.empty((rows.size, 0)) for rows in model.rows]
     total = np.zeros((len(candidates), 1 + draws[0].shape[1]))
@@ -158,34 +155,14 @@ def gains(
     for fit, rows, drawn in zip(model.channels, model.rows, draws, strict=True):
         here = np.zeros(model.record.seconds.size, bool)
         here[rows] = True
-        gain, tells = _channel_gains(
-            fit, np.column_stack([fit.response, drawn]), by_width(candidates, here), len(candidates)
+        gains = profile_gains(
+            scaled_systems(fit, SINGLE),
+            np.column_stack([fit.response, drawn]),
+            fit.design,
+            by_width(candidates, here),
         )
-        total += np.where(tells[:, None], gain, 0.0)
-        separable |= tells
+        total += np.where(gains.separable[:, None], gains.gain, 0.0)
+        separable |= gains.separable
     widths = np.array([candidate.columns.shape[1] for candidate in candidates])
-    return total - len(model.channels) * (widths - 1.0)[:, None], separable
-
-
-def _channel_gains(
-    fit: DriftFit, responses: Array, groups: Sequence[Group], size: int
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Gain of every candidate in one channel (candidates, responses), and which candidates the model does not contain already."""
-    n, count = responses.shape
-    columns = np.concatenate([group.columns for group in groups], axis=1)
-    centre = np.maximum(fit.system.ratios, least_ratio(fit.system))
-    without, best = np.full(count, -np.inf), np.full((count, size), -np.inf)
-    separable = np.zeros(size, bool)
-    for factor in _DRIFT_FACTORS:
-        system = replace(fit.system, ratios=centre * factor)
-        whitened, log_determinant = system.whiten(np.column_stack([responses, fit.design, columns]))
-        y, x, c = np.split(whitened, [count, count + fit.design.shape[1]], axis=1)
-        q, _ = np.linalg.qr(x)
-        y = y - q @ (q.T @ y)
-        rss = (y**2).sum(axis=0)
-        reduced, _, tells = reductions(c, y, q, groups)
-        left = np.maximum(rss[:, None] - reduced, 1e-12 * rss[:, None])
-        best = np.maximum(best, -0.5 * (n * np.log(left) + log_determinant))
-        without = np.maximum(without, -0.5 * (n * np.log(rss) + log_determinant))
-        separable |= tells
-    return (best - without[:, None]).T, separable
+    penalty = len(model.channels) * (widths - 1.0)
+    return Gains(total - penalty[:, None], np.zeros(len(candidates), int), separable)

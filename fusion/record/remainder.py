@@ -2,7 +2,7 @@
 
 Two things can be left. A shape in the innovations of the fit: where only drift and noise act they are exchangeable in time, so that
 permuting them gives every statistic its null. And a drift that the fit lets wander freely and that no test of the innovations can see:
-it counts where the model, asked for the sealed part, leaves more than a tenth of the displacements' variance.
+it counts where the model, asked for the hold-out set, leaves more than a tenth of the displacements' variance.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class RecordRemainder:
     p_value : chance of so much structure where only drift and noise act, over all statistics
     p_values : the same for each statistic alone
     shape : in words, empty where nothing is left
-    rms_um : error on the sealed part that the shape stands for, mean over channels; 0 where nothing is left
-    variance_share : (channels,) share of the displacement's variance that the model leaves in the sealed part
+    rms_um : error on the hold-out set that the shape stands for, mean over channels; 0 where nothing is left
+    variance_share : (channels,) share of the displacement's variance that the model leaves in the hold-out set
     """
 
     p_value: float
@@ -45,13 +45,13 @@ class RecordRemainder:
     variance_share: Array
 
 
-def examine(model: RecordFit, sealed_rmse: Array, rng: np.random.Generator) -> RecordRemainder:
+def examine(model: RecordFit, hold_out_rmse: Array, rng: np.random.Generator) -> RecordRemainder:
     """Test what is left.
 
     Parameters
     ----------
     model : fitted to all blocks
-    sealed_rmse : (channels,) error of the final model on the sealed part, um
+    hold_out_rmse : (channels,) error of the final model on the hold-out set, um
     rng : for the permutations
     """
     record = model.record
@@ -67,7 +67,7 @@ def examine(model: RecordFit, sealed_rmse: Array, rng: np.random.Generator) -> R
     names = ("course in time", "rhythm", "switching")
     each, p_value, strongest = family_wise(observed, null)
     p_values = dict(zip(names, each.tolist(), strict=True))
-    share = sealed_rmse**2 / np.nanvar(record.displacement, axis=0)
+    share = hold_out_rmse**2 / np.nanvar(record.displacement, axis=0)
     words = []
     if p_value < LEVEL:
         period_min = record.seconds.size * record.block_s / 60.0 / line
@@ -78,12 +78,12 @@ def examine(model: RecordFit, sealed_rmse: Array, rng: np.random.Generator) -> R
                 "switching": "quick responses where a driver is switched",
             }[names[strongest]]
         )
-    if np.nanmean(sealed_rmse**2) > _VARIANCE_SHARE * np.mean(np.nanvar(record.displacement, axis=0)):
+    if np.nanmean(hold_out_rmse**2) > _VARIANCE_SHARE * np.mean(np.nanvar(record.displacement, axis=0)):
         words.append(
-            f"a slow drift that neither temperatures nor drivers follow, largest in {_largest(record, sealed_rmse)}"
+            f"a slow drift that neither temperatures nor drivers follow, largest in {_largest(record, hold_out_rmse)}"
         )
     shape = " and ".join(words)
-    return RecordRemainder(p_value, p_values, shape, float(np.nanmean(sealed_rmse)) if words else 0.0, share)
+    return RecordRemainder(p_value, p_values, shape, float(np.nanmean(hold_out_rmse)) if words else 0.0, share)
 
 
 def _statistics(innovations: Array, switched: NDArray[np.bool_]) -> tuple[Array, int]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from fusion.loop.search import ENTRY_LEVEL
+from fusion.loop.axis import ENTRY_LEVEL
 from fusion.products.grouped import group, has
 from fusion.report import wording
 from fusion.report.attribution_section import describe_correlation

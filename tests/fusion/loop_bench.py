@@ -14,7 +14,7 @@ import numpy as np
 from fusion.alignment.align import AxisGeometry, align
 from fusion.alignment.readings import Readings, read_fused
 from fusion.effects.library import library
-from fusion.loop.closed_loop import close_loop, seal
+from fusion.loop.axis import close_loop, hold_out
 from fusion.loop.result import LoopResult, rmse
 from fusion.model.fit import ModelFit, Term, fit_model
 from fusion.twin import simulate
@@ -42,7 +42,7 @@ class Outcome:
     right : how many of the missing effects are named, alone or in a stated tie
     tied : how many of those stand in a stated tie only
     wrong : how many names were given that are no missing effect and are not tied with one
-    after_over_floor : error on the sealed cycles after the loop over that of the declared model where nothing is missing
+    after_over_floor : error on the hold-out cycles after the loop over that of the declared model where nothing is missing
     visible_um : rms of what is missing once static profile and declared effects have been fitted to it
     """
 
@@ -65,7 +65,7 @@ class Outcome:
         steps = ", ".join(f"{s.effect}{s.tied or ''} p {s.p_value:.1g}" for s in found.steps)
         return (
             f"{self.seed} visible {self.visible_um:.2f} error {self.before_over_floor:.2f} -> {self.after_over_floor:.2f} x floor: "
-            f"{found.verdict}; {steps or '-'}; {found.remainder.shape}; blocked {sorted(found.blocked)}"
+            f"{found.verdict}; {steps or '-'}; {found.remainder.shape}; blocked {sorted(found.state.blocked())}"
         )
 
 
@@ -104,9 +104,9 @@ def effect_of(name: str, rms_um: float, seed: int) -> EffectRecipe:
 
 @cache
 def without(seed: int, jitter_mm: float) -> tuple[Readings, float, ModelFit]:
-    """The same campaign with nothing missing, the declared model's error on its sealed cycles, and its fit."""
+    """The same campaign with nothing missing, the declared model's error on its hold-out cycles, and its fit."""
     readings = readings_of(seed=seed, jitter_mm=jitter_mm)
-    used, _ = seal(readings)
+    used, _ = hold_out(readings)
     terms = [Term(name, next(iter(library()[name].candidates(readings, {}, None)))) for name in DECLARED]
     fit = fit_model(readings, terms, used=used)
     return readings, rmse(fit.open_loop_errors()[0]), fit

@@ -7,8 +7,8 @@ import pytest
 
 from fusion.alignment.align import AxisGeometry, align
 from fusion.alignment.readings import read_fused
+from fusion.loop.axis import close_loop, on_corrected_fields
 from fusion.loop.camera_correction import correct_fields, corrected_variables, find_field_errors
-from fusion.loop.closed_loop import close_loop, on_corrected_fields
 from fusion.twin import simulate
 from fusion.twin.datasets import deviations_of, fields_of
 from fusion.twin.machine.recipe import EffectRecipe, Recipe

@@ -13,7 +13,7 @@ from fusion.alignment.readings import Readings, ReadingsError, Series, read_fuse
 from fusion.effects.candidates import Candidate, Prior
 from fusion.effects.jumps import event_instants, instants_near
 from fusion.effects.library import Effect, library
-from fusion.loop.closed_loop import LoopError, close_loop, set_aside_sites
+from fusion.loop.axis import LoopError, close_loop, set_aside_sites
 from fusion.twin import simulate
 from fusion.twin.datasets import deviations_of, fields_of
 from fusion.twin.machine.recipe import EffectRecipe, Recipe
@@ -66,7 +66,7 @@ def test_one_missing_effect_is_named_and_the_held_out_error_falls_to_the_noise(n
     # The size that was put in; a static part of it belongs to the profile.
     assert step.rms_um == pytest.approx(0.8, rel=0.25)
     if name != "step_event":
-        # A level that steps before the seal is known to the carried drift afterwards.
+        # A level that steps in the training part is known to the carried drift afterwards.
         assert step.rmse_after_um < step.rmse_before_um
     if name == "step_event":
         assert step.event_cycle == 25
@@ -112,10 +112,10 @@ def test_sites_with_a_diagnosis_of_their_own_are_no_remainder():
     assert left.verdict == "complete"
 
 
-def test_an_event_among_the_sealed_cycles_is_found_after_the_seal_is_opened():
+def test_an_event_among_the_hold_out_cycles_is_found_in_the_second_look():
     found = close_loop(readings_of(EffectRecipe("step_event", amplitude_um=0.5, parameters={"at_cycle": 54})), DECLARED)
     assert [step.effect for step in found.steps] == ["step_event"]
-    assert "sealed cycles" in found.steps[0].confirmed
+    assert "found in the hold-out set" in found.steps[0].confirmed
     assert found.steps[0].rmse_after_um < found.steps[0].rmse_before_um
 
 
@@ -124,10 +124,10 @@ def test_the_same_seed_gives_the_same_result(complete):
     assert again.as_json() == complete.as_json()
 
 
-def test_the_sealed_cycles_do_not_touch_the_model_before_they_are_opened(complete):
+def test_the_hold_out_cycles_do_not_touch_the_model_before_they_are_opened(complete):
     readings = readings_of()
-    sealed = readings.cycle > 48
-    spoiled = replace(readings, response=np.where(sealed, readings.response + 50.0, readings.response))
+    held_out = readings.cycle > 48
+    spoiled = replace(readings, response=np.where(held_out, readings.response + 50.0, readings.response))
     found = close_loop(spoiled, DECLARED)
     np.testing.assert_array_equal(found.before.fit.coefficients, complete.before.fit.coefficients)
     assert found.rmse_declared_um > 40.0
@@ -155,7 +155,7 @@ def test_a_users_effect_that_raises_is_named_and_the_rest_goes_on():
     effects = {name: library()[name] for name in (*DECLARED, "reversal_drift")}
     hidden = readings_of(EffectRecipe("reversal_drift", amplitude_um=0.8))
     found = close_loop(hidden, DECLARED, effects={"broken": broken, **effects})
-    assert "KeyError: 'no such series'" in found.not_tried["broken"]
+    assert "KeyError: 'no such series'" in found.state.not_tried()["broken"]
     assert [step.effect for step in found.steps] == ["reversal_drift"]
 
 
@@ -192,8 +192,8 @@ def test_a_users_effect_with_unusable_columns_is_named_and_the_rest_goes_on(colu
 
     own = Effect("own", "None.", "none", candidates)
     found = close_loop(readings_of(test={"cycles": 20}), DECLARED, effects={"own": own, **_few("reversal_drift")})
-    assert re.search(words, found.not_tried["own"])
-    assert {score.name for score in found.rounds[0]} == {"reversal_drift"}
+    assert re.search(words, found.state.not_tried()["own"])
+    assert {score.name for score in found.state.rounds[0].scores} == {"reversal_drift"}
 
 
 def test_an_effect_that_the_model_contains_is_named_as_such():
@@ -202,8 +202,8 @@ def test_an_effect_that_the_model_contains_is_named_as_such():
 
     own = Effect("constant", "None.", "none", candidates)
     found = close_loop(readings_of(test={"cycles": 20}), DECLARED, effects={"constant": own, **_few("reversal_drift")})
-    assert "constant or collinear" in found.blocked["constant"]
-    told = {one.effect: one for one in found.identifiable}
+    assert "constant, or collinear" in found.state.blocked()["constant"]
+    told = {one.effect: one for one in found.state.rounds[0].detection_limits}
     assert told["constant"].detectable_um is None
     assert told["constant"].note == "the declared model contains it, or nothing excites it"
 
@@ -219,11 +219,11 @@ def test_gaps_in_a_log_are_found():
     assert readings.gaps() == []
 
 
-def test_the_sealed_cycles_are_asked_once_and_the_answer_is_logged():
+def test_the_hold_out_set_is_asked_once_and_the_answer_is_logged():
     """A reversal of an eighth of the noise is too small for the search, and too large to be left unasked."""
     readings = readings_of(EffectRecipe("reversal_drift", amplitude_um=0.05), seed=15, test={"cycles": 20})
     found = close_loop(readings, DECLARED, effects=_few("reversal_drift", "dead_path", "air_index"))
-    assert found.question is not None
+    assert found.state.question is not None
     logged = found.as_json()["sealed_question"]
     assert logged["effect"] == "reversal_drift" and logged["entered"] is bool(found.steps)
     assert 0.0 < logged["p_value"] <= 1.0
@@ -247,7 +247,9 @@ def test_a_prior_is_one_more_observation_of_its_coefficient():
 def test_what_could_be_found_is_found_at_that_size():
     """An effect at twice the size that is found in 80 % of campaigns is found; the size of a reversal is set by the noise alone."""
     few = _few("reversal_drift", "pitch_error", "dead_path")
-    told = {one.effect: one for one in close_loop(readings_of(), DECLARED, effects=few).identifiable}
+    told = {
+        one.effect: one for one in close_loop(readings_of(), DECLARED, effects=few).state.rounds[0].detection_limits
+    }
     size = 2.0 * told["reversal_drift"].detectable_um
     # 1,500 readings of 0.4 um: 0.4 / sqrt(1500) = 0.01 um is one standard deviation of the size, and about four are asked for.
     assert 0.04 < size < 0.2
@@ -280,8 +282,8 @@ def test_one_jump_of_the_camera_is_named_once():
     assert len(events) == len(set(events)) >= 1
 
 
-def test_the_seal_judges_an_effect_beside_the_others():
-    """The first of two missing effects makes the sealed error larger, because the drift still bends to the second; both are right."""
+def test_the_hold_out_set_judges_an_effect_beside_the_others():
+    """The first of two missing effects makes the hold-out error larger, because the drift still bends to the second; both are right."""
     missing = ("air_index", "reversal_drift")
     found = close_loop(
         loop_bench.readings_of(*(loop_bench.effect_of(name, 0.4, 21001) for name in missing), seed=21001), DECLARED
@@ -299,8 +301,8 @@ def test_a_laser_that_warms_up_is_no_heat_source():
     assert [step.effect for step in found.steps] == ["laser_warm_up"]
 
 
-def test_an_event_among_the_sealed_cycles_does_not_hide_what_acts_beside_it():
-    """The cycles before the seal say nothing of the event, so every error beside it is that of sizing it on half of the targets."""
+def test_an_event_among_the_hold_out_cycles_does_not_hide_what_acts_beside_it():
+    """The training cycles say nothing of the event, so every error beside it is that of sizing it on half of the targets."""
     missing = ("unseen_heat_source:flat", "step_event")
     effects = [loop_bench.effect_of(name, 0.4, 23018) for name in missing]
     found = close_loop(loop_bench.readings_of(*effects, seed=23018), DECLARED)

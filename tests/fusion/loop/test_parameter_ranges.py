@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fusion.effects.candidates import Candidate, pitch_error_candidates
-from fusion.loop.scoring import parameter_ranges
+from fusion.loop.parameter_ranges import parameter_ranges
 from fusion.report.model_section import parameters_with_ranges
 from tests.fusion.loop_bench import readings_of
 

@@ -8,9 +8,10 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from fusion.loop.closed_loop import open_hold_out
 from fusion.record.blocks import reduce_record
-from fusion.record.loop import open_seal
-from fusion.record.search import declare, seal, search
+from fusion.record.hold_out import declare, hold_out
+from fusion.record.problem import search_record
 from fusion.twin.machine.recipe import EffectRecipe
 from tests.fusion.record_tables import twin_table
 
@@ -35,16 +36,16 @@ def test_rates_of_names_on_records(capsys: pytest.CaptureFixture[str]) -> None:
         before, after = [], []
         for seed in range(FIRST_SEED, FIRST_SEED + RUNS):
             record = reduce_record(twin_table(*([effect] if effect else []), seed=seed))
-            train, _ = seal(record)
-            found, _, sealed = open_seal(search(record, train, declare(["quasi_static"], record)))
-            names[tuple(score.name for score, _ in found.entries)] += 1
-            before.append(sealed[0].mean())
-            after.append(sealed[-1].mean())
+            train, _ = hold_out(record)
+            state = open_hold_out(*search_record(record, train, declare(["quasi_static"], record)))
+            names[tuple(step.effect for step in state.steps)] += 1
+            before.append(state.errors_um[0])
+            after.append(state.errors_um[-1])
         right = sum(count for found_names, count in names.items() if found_names == ((kind,) if effect else ()))
         wrong[kind] = sum(count for found_names, count in names.items() if set(found_names) - {kind})
         rows.append(
             f"{kind:22s} right alone {right}/{RUNS}, a wrong name {wrong[kind]}/{RUNS}, "
-            f"sealed error {np.median(before):.2f} -> {np.median(after):.2f} um   {dict(names)}"
+            f"hold-out error {np.median(before):.2f} -> {np.median(after):.2f} um   {dict(names)}"
         )
     with capsys.disabled():
         print("\n" + "\n".join(rows))

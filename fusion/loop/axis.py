@@ -1,0 +1,456 @@
+"""The closed loop on a positioning campaign: readings along an axis, a hold-out set of the last cycles, a second look at all of them.
+
+The last fifth of the cycles is held out. After the search on the others the hold-out set is opened once: the error before and after is
+that of predicting these cycles in open loop with frozen coefficients. What acted only there is searched for in a second look.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from fusion.alignment.readings import Readings
+from fusion.diagnosis import remainder
+from fusion.effects.candidates import Candidate
+from fusion.effects.jumps import cycle_starts
+from fusion.effects.library import LIBRARY, Effect, library
+from fusion.errors import FusionError
+from fusion.loop.admissibility import AxisGrounds, refuse
+from fusion.loop.axis_pattern import wrong_patterns
+from fusion.loop.closed_loop import (
+    HOLD_OUT_SHARE,
+    MAY_REPEAT,
+    MOST_EFFECTS,
+    MOST_EVENTS,
+    Progress,
+    choose,
+    drop_superfluous,
+    enter,
+    no_progress,
+    open_hold_out,
+    search,
+    verdict,
+    withdraw,
+)
+from fusion.loop.confirmation import CandidateScorer, ask_hold_out
+from fusion.loop.decisions import Decision, Reason
+from fusion.loop.detectability import detection_limits
+from fusion.loop.result import (
+    LoopResult,
+    declared_coefficients,
+    nuisance_size,
+    persistence,
+    report_steps,
+    rmse,
+)
+from fusion.loop.scoring import WORTH_CONFIRMING, Families, collect_candidates, of_same_kind, refine, score_effects
+from fusion.loop.state import Confirmation, Confirmed, HoldOutQuestion, LoopState, Round, Score
+from fusion.model.fit import ModelFit, Term, again, fit_model, refit_fixed, settled
+
+LEAST_CYCLES = 10
+#: Shares of the probability of adding an effect under the null hypothesis, over everything that is tried (2.5 %): the search, the one
+#: question to the hold-out set, the second look. Every effect that is found opens the search again with the same probability, and a
+#: campaign may lack two: half of the 5 % that a wrong name may have.
+SEARCH_LEVEL, ASKED_LEVEL, SECOND_LEVEL = 0.015, 0.005, 0.005
+ENTRY_LEVEL = SEARCH_LEVEL + ASKED_LEVEL + SECOND_LEVEL
+#: An effect with a larger p-value, uncorrected, is not worth the one question to the hold-out set.
+_WORTH_ASKING = 0.1
+#: An effect is withdrawn where the hold-out error grows by more than this factor with it.
+_WORSE = 1.05
+_BUILT_IN = frozenset(effect.name for effect in LIBRARY)
+
+AxisState = LoopState[ModelFit]
+
+
+class LoopError(FusionError):
+    """The campaign cannot be modelled; the message says what is missing."""
+
+
+# Threaded BLAS is many times slower than one thread on matrices of a few dozen columns.
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def close_loop(
+    readings: Readings,
+    declared: Sequence[str],
+    *,
+    seed: int = 1,
+    set_aside: Collection[tuple[int, str]] = (),
+    effects: Mapping[str, Effect] | None = None,
+    progress: Progress = no_progress,
+) -> LoopResult:
+    """Close the loop on a positioning campaign.
+
+    Parameters
+    ----------
+    readings : n readings in um with times, targets and directions, and what was seen and logged beside them
+    declared : names of the effects the user believes to act
+    seed : of the simulated campaigns behind the p-values, so that a run can be repeated
+    set_aside : sites (target, direction) whose anomaly has its own diagnosis
+    effects : the library by name; the built-in one with the user's own by default
+    progress : called with steps done, steps in total, and what is done
+
+    Returns
+    -------
+    LoopResult
+        Steps with their errors on the hold-out set in um, verdict, what remains, and both models.
+
+    Raises
+    ------
+    LoopError
+        if fewer than 10 cycles are there, or a declared effect cannot be computed from these readings.
+
+    Notes
+    -----
+    Procedure, assumptions and error rates: docs/method/closed-loop.md.
+    """
+    effects = library() if effects is None else effects
+    used, description = hold_out(readings)
+    terms = declare(readings, declared, effects)
+    progress(0, MOST_EFFECTS + 2, "fitting the declared model")
+    problem = AxisProblem(readings, used, effects, np.random.default_rng(seed))
+    start = problem.start(terms)
+    state = search(problem, start, progress=progress)
+    progress(MOST_EFFECTS, MOST_EFFECTS + 2, "opening the hold-out set")
+    state = open_hold_out(problem, state)
+    rmse_declared_um = state.errors_um[0]
+    state = replace(state, model=settled(fit_model(readings, state.model.terms), effects))
+    progress(MOST_EFFECTS + 1, MOST_EFFECTS + 2, "second look, at all cycles")
+    state = keep_right_patterns(problem, look_again(problem, state))
+    left = examine_remainder(state.model, seed, set_aside)
+    progress(MOST_EFFECTS + 2, MOST_EFFECTS + 2, "loop closed")
+    return LoopResult(
+        declared=list(declared),
+        declared_coefficients=declared_coefficients(state.model, len(terms)),
+        held_out=description,
+        noise_floor_um=state.model.fit.sigma,
+        rmse_persistence_um=persistence(readings, used),
+        rmse_declared_um=rmse_declared_um,
+        rmse_final_um=state.errors_um[-1],
+        steps=report_steps(state),
+        verdict=verdict(added=bool(state.steps), remains=bool(left.shape)),
+        remainder=left,
+        nuisance=nuisance_size(state.model),
+        state=state,
+        before=start.model,
+        after=state.model,
+    )
+
+
+class AxisProblem:
+    """The readings of a campaign, the training part of them, and the library, for :mod:`fusion.loop.closed_loop`."""
+
+    def __init__(
+        self, readings: Readings, used: NDArray[np.bool_], effects: Mapping[str, Effect], rng: np.random.Generator
+    ) -> None:
+        self.readings, self.used, self.effects, self.rng = readings, used, effects, rng
+        # The same few models are asked for again and again: before and after an effect, with it and without it.
+        self._trained: dict[tuple[int, ...], ModelFit] = {}
+
+    def start(self, declared: Sequence[Term]) -> AxisState:
+        """The state before the search: the declared model, and the effects that these readings cannot show."""
+        missing = {name: effect.needs(self.readings) for name, effect in self.effects.items()}
+        return AxisState(self._train(declared)).decide(
+            *(
+                Decision(name, Reason.NOT_AVAILABLE, {"because": because})
+                for name, because in missing.items()
+                if because is not None
+            )
+        )
+
+    def refit(self, model: ModelFit, terms: Sequence[Term]) -> ModelFit:
+        """Fit other terms to the readings that a model was fitted to."""
+        return self._train(terms) if model.used is self.used else fit_model(self.readings, terms, used=model.used)
+
+    def _train(self, terms: Sequence[Term]) -> ModelFit:
+        """Fit terms to the training part, once; the models keep their terms, so that these identify them."""
+        key = tuple(id(term) for term in terms)
+        if key not in self._trained:
+            self._trained[key] = fit_model(self.readings, terms, used=self.used)
+        return self._trained[key]
+
+    def score(self, state: AxisState) -> Round:
+        """Score the library; effects worth it are looked at more closely before they are compared, and are confirmed."""
+        model = state.model
+        scorer = CandidateScorer.of(model, self.rng)
+        families, faults = self._families(state)
+        if not families:
+            return Round((), tuple(faults))
+        gains = scorer.gains([candidate for candidates in families.values() for candidate in candidates])
+        scores, decisions = score_effects(families, gains, level=SEARCH_LEVEL)
+        limits = () if state.rounds else tuple(detection_limits(scorer, model, families, scores, self.effects))
+        measured = partial(scorer.gains, simulated=False)
+        worth = [
+            refine(score, partial(self._near, score.name, model), measured)
+            for score in scores
+            if score.candidate is not None and score.p_value < WORTH_CONFIRMING
+        ]
+        confirmed = {score.name: score for score in scorer.confirm(worth, families)}
+        closer = [confirmed.get(score.name, score) for score in scores]
+        return Round(
+            tuple(sorted(closer, key=lambda score: -score.excess)),
+            (*faults, *decisions),
+            detection_limits=limits,
+        )
+
+    def entry_level(self, score: Score) -> float:
+        """Level of the search before the hold-out set is opened."""
+        return SEARCH_LEVEL
+
+    def refuse(self, score: Score, model: ModelFit) -> Decision | None:
+        """Refuse an effect that these readings do not identify."""
+        return refuse(score.name, self.effects[score.name].excited_by, score.best, AxisGrounds(model))
+
+    def confirm(self, score: Score, state: AxisState) -> Score:
+        """Return the score: it was confirmed when it was scored."""
+        return score
+
+    def loss_without(self, model: ModelFit, term: Term) -> float:
+        """Log-likelihood lost without a term, the drift's variances kept."""
+        kept = [other for other in model.terms if other is not term]
+        return 0.5 * model.fit.response.size * float(np.log(refit_fixed(model, kept).rss / model.fit.rss))
+
+    def hold_out_error(self, terms: Sequence[Term]) -> float:
+        """Open-loop error on the hold-out cycles, um; an event among them is sized on one half of the targets, tested on the other."""
+        if not any(self.is_late(term) for term in terms):
+            return rmse(self._train(terms).open_loop_errors()[0])
+        half = self.readings.target_index % 2 == 0
+        parts = [fit_model(self.readings, terms, used=self.used | fitted) for fitted in (half, ~half)]
+        return rmse(np.concatenate([part.open_loop_errors()[0] for part in parts]))
+
+    def is_judged_by_hold_out(self, score: Score) -> bool:
+        """An event before the hold-out set shifts a level that the carried drift has learnt by then, so the error says nothing of it."""
+        return not score.is_event
+
+    def is_harmless(self, with_it_um: float, without_it_um: float) -> bool:
+        """An effect may stay unless the error grows clearly with it."""
+        return with_it_um <= _WORSE * without_it_um
+
+    def ask_hold_out(self, state: AxisState) -> AxisState:
+        """Put the strongest candidate that the search could not decide on to the hold-out set.
+
+        One question, chosen before the hold-out set is opened, needs no correction for the search.
+        """
+        blocked = state.blocked()
+        for score in state.rounds[-1].scores:
+            if score.candidate is None or score.p_value > _WORTH_ASKING or score.name in blocked:
+                continue
+            refusal = self.refuse(score, state.model)
+            if refusal is not None:
+                state = state.decide(refusal)
+                continue
+            before, after, p_value = ask_hold_out(state.model, score.best, self.rng)
+            entered = after < before and p_value <= ASKED_LEVEL
+            question = HoldOutQuestion(score.name, score.best.parameters, before, after, p_value, entered)
+            state = replace(state, question=question)
+            if not entered:
+                return state
+            way = Confirmed.HOLD_OUT_QUESTION
+            gain = score.confirmation.gain if score.confirmation else 0.0
+            return enter(self, state, replace(score, confirmation=Confirmation(True, way, gain, p_value)))
+        return state
+
+    def is_late(self, term: Term) -> bool:
+        """Whether a term is an event among the hold-out cycles, of which the cycles before say nothing."""
+        first = self.readings.seconds[~self.used].min()
+        cycle_s = float(np.median(np.diff(cycle_starts(self.readings))))
+        return term.candidate.event_s is not None and term.candidate.event_s >= first - cycle_s
+
+    def _families(self, state: AxisState) -> tuple[Families, list[Decision]]:
+        """Candidates of every effect that can be tried beside the model, those without any left out."""
+        model, not_tried = state.model, state.not_tried()
+        present = {term.effect for term in model.terms} - MAY_REPEAT
+        # One event happens once, however its column was weighed when it was found.
+        happened = {(term.effect, term.candidate.event_s) for term in model.terms if term.candidate.event_s is not None}
+
+        def offer(name: str) -> list[Candidate]:
+            offered = self.effects[name].candidates(self.readings, model.coefficients(), None)
+            return [candidate for candidate in offered if (name, candidate.event_s) not in happened]
+
+        offers = {name: partial(offer, name) for name in self.effects if name not in not_tried and name not in present}
+        families, faults = collect_candidates(offers, self.readings.seconds.size, built_in=_BUILT_IN)
+        inside = {name: self._inside(candidates, model) for name, candidates in families.items()}
+        return {name: candidates for name, candidates in inside.items() if candidates}, faults
+
+    def _inside(self, candidates: Sequence[Candidate], model: ModelFit) -> list[Candidate]:
+        """Candidates whose event, if they have one, has enough cycles on both sides."""
+        starts = cycle_starts(self.readings.subset(model.used))
+        return [
+            candidate
+            for candidate in candidates
+            if candidate.event_s is None or starts[2] <= candidate.event_s <= starts[-2]
+        ]
+
+    def _near(self, name: str, model: ModelFit, chosen: Candidate) -> list[Candidate]:
+        """Candidates of an effect about one that was chosen."""
+        offered = self.effects[name].candidates(self.readings, model.coefficients(), chosen)
+        return self._inside([candidate for candidate in offered if of_same_kind(candidate, chosen)], model)
+
+
+def hold_out(readings: Readings) -> tuple[NDArray[np.bool_], str]:
+    """Divide the cycles into a training part and a hold-out set.
+
+    Parameters
+    ----------
+    readings : n readings
+
+    Returns
+    -------
+    used : (n,) True for the training part
+    description : which cycles are held out, and how they are predicted
+
+    Raises
+    ------
+    LoopError
+        if fewer than 10 cycles are there.
+    """
+    numbers = np.unique(readings.cycle)
+    if numbers.size < LEAST_CYCLES:
+        raise LoopError(
+            f"{numbers.size} cycles are too few to hold some out and to model the others; measure at least {LEAST_CYCLES}, better 50"
+        )
+    first = numbers[-max(2, round(HOLD_OUT_SHARE * numbers.size))]
+    return (
+        readings.cycle < first,
+        f"cycles {first}-{numbers[-1]} held out; coefficients frozen at cycle {first - 1}, drift state carried in open loop",
+    )
+
+
+def declare(readings: Readings, declared: Sequence[str], effects: Mapping[str, Effect]) -> list[Term]:
+    """Make the terms of the declared model.
+
+    Parameters
+    ----------
+    readings : n readings
+    declared : names of effects
+    effects : the library by name
+
+    Raises
+    ------
+    LoopError
+        if a name is unknown, or the effect cannot be computed from these readings or has parameters that are not known beforehand.
+    """
+    terms = []
+    for name in declared:
+        if name not in effects:
+            raise LoopError(f"declared effect {name!r} is not in the library: {', '.join(effects)}")
+        reason = effects[name].needs(readings)
+        if reason is not None:
+            raise LoopError(f"declared effect {name!r} cannot be computed: {reason}")
+        candidates = list(effects[name].candidates(readings, {}, None))
+        if len(candidates) != 1:
+            raise LoopError(
+                f"declared effect {name!r} has parameters that are not known beforehand; leave it out of [model] declared, the "
+                "search tries it anyway"
+            )
+        terms.append(Term(name, replace(candidates[0], prior=effects[name].prior)))
+    return terms
+
+
+def look_again(problem: AxisProblem, state: AxisState) -> AxisState:
+    """Search once more with the hold-out cycles in view: what acted only there could not be found before.
+
+    Coefficients behind the error after still come from the training cycles, but the name does not; the step says so.
+    """
+    while len(state.steps) < MOST_EFFECTS:
+        state, score = choose(problem, state.scored(problem.score(state)), level=SECOND_LEVEL)
+        if score is None or state.events + (score.name == "step_event") > MOST_EVENTS:
+            return state
+        model = settled(
+            fit_model(problem.readings, [*state.model.terms, Term(score.name, score.best)]), problem.effects
+        )
+        before_um, after_um = state.errors_um[-1], problem.hold_out_error(model.terms)
+        if after_um > _WORSE * before_um:
+            evidence = {"without_um": before_um, "with_um": after_um}
+            state = state.decide(Decision(score.name, Reason.SECOND_LOOK_ERROR, evidence))
+            continue
+        confirmed = Confirmed.LATE_EVENT if problem.is_late(model.terms[-1]) else Confirmed.SECOND_LOOK
+        entered = state.entered(model, score, confirmed)
+        state = drop_superfluous(problem, replace(entered, errors_um=(*state.errors_um, after_um)))
+    return state
+
+
+def keep_right_patterns(problem: AxisProblem, state: AxisState) -> AxisState:
+    """Withdraw the name of an effect whose pattern along the axis is not what the readings show; it was the nearest, not the cause.
+
+    What was found after it goes with it: it was judged beside a pattern that was not there.
+    """
+    wrong = wrong_patterns(state.model, state.added)
+    if not wrong:
+        return state
+    first = min(wrong)
+    places = range(first, len(state.steps))
+    beside = {"beside": state.steps[first].effect}
+    decisions = [
+        wrong.get(place, Decision(state.steps[place].effect, Reason.BESIDE_WRONG_PATTERN, beside)) for place in places
+    ]
+    return keep_right_patterns(problem, withdraw(problem, state, places, decisions))
+
+
+def examine_remainder(model: ModelFit, seed: int, set_aside: Collection[tuple[int, str]]) -> remainder.Remainder:
+    """Describe what a model leaves: a shape among the sites or, where there is none, an unexplained drift of all of them.
+
+    Parameters
+    ----------
+    model : fitted to all readings
+    seed : of the permutations
+    set_aside : sites (target, direction) whose anomaly has its own diagnosis
+    """
+    left = remainder.examine(model.readings, model.fit, np.random.default_rng(seed), set_aside=set_aside)
+    return left if left.shape else remainder.with_drift(left, model.fit)
+
+
+def set_aside_sites(result: LoopResult, sites: Collection[tuple[int, str]], *, seed: int = 1) -> LoopResult:
+    """Count sites whose anomaly has its own diagnosis no longer as a remainder.
+
+    Parameters
+    ----------
+    result : of :func:`close_loop`
+    sites : (target, direction)
+    seed : of the permutations
+    """
+    left = examine_remainder(result.after, seed, sites)
+    return replace(result, remainder=left, verdict=verdict(added=bool(result.steps), remains=bool(left.shape)))
+
+
+def on_corrected_fields(
+    result: LoopResult,
+    readings: Readings,
+    errors: Collection[str],
+    *,
+    effects: Mapping[str, Effect] | None = None,
+    seed: int = 1,
+) -> LoopResult:
+    """Fit the model again on fields from which the camera's errors have been taken out.
+
+    Parameters
+    ----------
+    result : with the camera's errors as effects
+    readings : the same readings beside the corrected fields
+    errors : names of the effects that the correction has made superfluous
+    effects : the library by name; the built-in one with the user's own by default
+    seed : of the permutations
+    """
+    effects = library() if effects is None else effects
+    terms = [
+        again(term, readings, result.after.coefficients(), effects)
+        for term in result.after.terms
+        if term.effect not in errors
+    ]
+    used, _ = hold_out(readings)
+    problem = AxisProblem(readings, used, effects, np.random.default_rng(seed))
+    model = fit_model(readings, terms)
+    left = examine_remainder(model, seed, ())
+    return replace(
+        result,
+        declared_coefficients=declared_coefficients(model, len(result.declared)),
+        noise_floor_um=model.fit.sigma,
+        rmse_final_um=problem.hold_out_error(terms),
+        verdict=verdict(added=bool(result.steps), remains=bool(left.shape)),
+        remainder=left,
+        nuisance=nuisance_size(model),
+        after=model,
+    )

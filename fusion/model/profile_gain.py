@@ -1,0 +1,105 @@
+"""Gain in profile log-likelihood of many candidates over one model, for many responses at once.
+
+The noise variance, the coefficients and the drift variances are those that suit each candidate best, and those that suit the model
+without it best. The same kernel serves the readings along an axis and the channels of a record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion._typing import Array
+from fusion.model.least_squares import Group, PriorRows, reductions
+from interferometry.drift.state_space import DriftSystem
+
+#: The residual sum of squares beside a candidate is at least this share of the model's.
+_LEAST_LEFT = 1e-12
+
+
+@dataclass(frozen=True)
+class ProfileGains:
+    """Gains of candidates over a model.
+
+    Attributes
+    ----------
+    gain : (candidates, responses) gain in log-likelihood, no penalty for further coefficients taken off
+    drift_place : (candidates,) which of the systems suits the first response best with the candidate
+    separable : (candidates,) whether the candidate is independent of the model under any of the systems
+    """
+
+    gain: Array
+    drift_place: NDArray[np.int64]
+    separable: NDArray[np.bool_]
+
+
+def profile_gains(
+    systems: Sequence[DriftSystem],
+    responses: Array,
+    design: Array,
+    groups: Sequence[Group],
+    *,
+    priors: PriorRows | None = None,
+) -> ProfileGains:
+    """Compute the gain of every candidate for every response.
+
+    Parameters
+    ----------
+    systems : the drift with every set of variances over which the likelihood is maximised
+    responses : (n, responses) um; the measured one first, then simulated ones
+    design : (n, p) columns of the model
+    groups : the candidates' columns at the same readings, grouped by width
+    priors : what is known beforehand of the model's coefficients
+
+    Returns
+    -------
+    ProfileGains
+        Candidates in the order in which the groups number them. Columns of a candidate that may be present without the effect
+        (:attr:`Candidate.beside`) are part of the model it is held against, at the price of one unit of log-likelihood each.
+    """
+    n, count = responses.shape
+    size = sum(group.places.size for group in groups)
+    columns = np.concatenate([group.columns for group in groups], axis=1)
+    known = np.column_stack([responses, design])
+    beside = np.zeros(size, int)
+    for group in groups:
+        beside[group.places] = group.beside
+    started = np.flatnonzero(beside)
+    without, best = np.full(count, -np.inf), np.full((count, size), -np.inf)
+    best_started = np.full((count, started.size), -np.inf)
+    drift_place, separable = np.zeros(size, int), np.zeros(size, bool)
+    for place, system in enumerate(systems):
+        c, spread = system.innovations(columns)
+        root, log_determinant = np.sqrt(spread)[:, None], float(np.log(spread).sum())
+        c /= root
+        whitened = system.innovations(known)[0] / root
+        y, x = whitened[:, :count], whitened[:, count:]
+        if priors is not None:
+            y, x = priors.append(y, x)
+        q, _ = np.linalg.qr(x)
+        y = y - q @ (q.T @ y)
+        rss = (y**2).sum(axis=0)
+        reduced, given, separate = reductions(c, y[:n], q[:n], groups)
+        likelihood = _likelihood(rss, reduced, n, log_determinant)
+        without = np.maximum(without, -0.5 * (n * np.log(rss) + log_determinant))
+        best_started = np.maximum(best_started, _likelihood(rss, given[:, started], n, log_determinant))
+        better = likelihood[0] > best[0]
+        drift_place[better] = place
+        np.maximum(best, likelihood, out=best)
+        separable |= separate
+    against = np.repeat(without[:, None], size, axis=1)
+    against[:, started] = np.maximum(against[:, started], best_started - beside[started])
+    return ProfileGains((best - against).T, drift_place, separable)
+
+
+def _likelihood(squares: Array, reduced: Array, readings: int, log_determinant: float) -> Array:
+    """Log-likelihood (responses, candidates) with ``reduced`` taken from the sums of squares (responses,); overwrites ``reduced``."""
+    # In place: these matrices are large, and fetching memory for new ones takes as long as the sums.
+    likelihood = np.subtract(squares[:, None], reduced, out=reduced)
+    np.log(np.maximum(likelihood, _LEAST_LEFT * squares[:, None], out=likelihood), out=likelihood)
+    likelihood *= -0.5 * readings
+    likelihood -= 0.5 * log_determinant
+    return likelihood

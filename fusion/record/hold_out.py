@@ -1,0 +1,58 @@
+"""Hold-out set and declared model of a record."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.loop.closed_loop import HOLD_OUT_SHARE
+from fusion.model.fit import Term
+from fusion.record.blocks import Record, RecordError
+from fusion.record.effects import QUASI_STATIC, quasi_static_columns
+
+
+def hold_out(record: Record) -> tuple[NDArray[np.bool_], str]:
+    """Divide a record into a training part and a hold-out set, the last fifth of the time.
+
+    Parameters
+    ----------
+    record : on its blocks
+
+    Returns
+    -------
+    train : (blocks,) True for the training part
+    description : which time is held out, and how it is predicted
+    """
+    first = record.seconds[0] + (1.0 - HOLD_OUT_SHARE) * (record.seconds[-1] - record.seconds[0])
+    hours = first / 3600.0, record.seconds[-1] / 3600.0
+    return (
+        record.seconds < first,
+        f"{hours[0]:.1f} h to {hours[1]:.1f} h held out; coefficients from the time before, nothing re-zeroed; error is the mean over "
+        "channels",
+    )
+
+
+def declare(declared: Sequence[str], record: Record) -> list[Term]:
+    """Make the terms of the declared model.
+
+    Parameters
+    ----------
+    declared : names of effects; ``quasi_static`` is the only one that a record can be declared with
+    record : on its blocks
+
+    Raises
+    ------
+    RecordError
+        if a name has no meaning for a record.
+    """
+    terms = []
+    for name in declared:
+        if name != QUASI_STATIC:
+            raise RecordError(
+                f'declared effect {name!r} cannot be computed from a record; declare "{QUASI_STATIC}" (every displacement linear '
+                "in the temperatures), the search tries the rest of the library"
+            )
+        terms.append(Term(QUASI_STATIC, quasi_static_columns(record)))
+    return terms

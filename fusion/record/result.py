@@ -1,0 +1,182 @@
+"""Result of the closed loop on a record, and its form in results.json."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion._typing import Array
+from fusion.loop.closed_loop import verdict
+from fusion.loop.decisions import Decision, Reason
+from fusion.loop.state import Round, Step, rivals
+from fusion.model.fit import Term, place_of
+from fusion.record.blocks import Record
+from fusion.record.model import RecordFit
+from fusion.record.prediction import Prediction
+from fusion.record.problem import ChainedPart, RecordState
+from fusion.record.remainder import RecordRemainder
+
+
+@dataclass(frozen=True)
+class RecordResult:
+    """Result of the closed loop on a record.
+
+    Attributes
+    ----------
+    state : what the search on the training part found, effects that were withdrawn left out
+    record : the record on its blocks
+    hold_out : (blocks,) True for the hold-out set
+    held_out : which part that is, in words
+    predictions : of the declared model and after every added effect, from the training part
+    errors : (1 + effects, channels) their errors on the hold-out set, um
+    persistence_um : (channels,) error of repeating the last value of the training part
+    whole : the final model fitted to all blocks, for its residual
+    remainder : structure that the final model leaves
+    chained : every part from the third on, predicted by the whole procedure on the time before it
+    """
+
+    state: RecordState
+    record: Record
+    hold_out: NDArray[np.bool_]
+    held_out: str
+    predictions: list[Prediction]
+    errors: Array
+    persistence_um: Array
+    whole: RecordFit
+    remainder: RecordRemainder
+    chained: list[ChainedPart]
+
+    @property
+    def verdict(self) -> str:
+        """complete, explained, partial or unexplained."""
+        return verdict(added=bool(self.state.steps), remains=bool(self.remainder.shape))
+
+    def as_json(self) -> dict[str, Any]:
+        """The ``loop`` part of results.json; errors are means over the channels."""
+        mean = np.nanmean(self.errors, axis=1)
+        last = self.state.rounds[-1].scores
+        return {
+            "declared": [term.effect for term in self.state.declared],
+            "held_out": self.held_out,
+            "noise_floor_um": float(np.mean(self.whole.sigma)),
+            "rmse_persistence_um": float(np.nanmean(self.persistence_um)),
+            "rmse_declared_um": float(mean[0]),
+            "rmse_final_um": float(mean[-1]),
+            "steps": [self._step(place) for place in range(len(self.state.steps))],
+            "verdict": self.verdict,
+            "unexplained": {
+                "shape": self.remainder.shape,
+                "rms_um": self.remainder.rms_um,
+                "p_value": self.remainder.p_value,
+                "p_values": self.remainder.p_values,
+                "variance_share": float(np.nanmean(self.remainder.variance_share)),
+                "nearest": last[0].name if self.remainder.shape and last else "",
+            },
+            "channels": {
+                name: {
+                    "rmse_persistence_um": float(self.persistence_um[k]),
+                    "rmse_declared_um": float(self.errors[0, k]),
+                    "rmse_final_um": float(self.errors[-1, k]),
+                    "noise_um": float(self.whole.sigma[k]),
+                    "variance_share": float(self.remainder.variance_share[k]),
+                }
+                for k, name in enumerate(self.record.channels)
+            },
+            "chained": [
+                {
+                    "first_h": part.first_h,
+                    "last_h": part.last_h,
+                    "effects": list(part.effects),
+                    "rmse_persistence_um": float(np.nanmean(part.rmse_persistence_um)),
+                    "rmse_declared_um": float(np.nanmean(part.rmse_declared_um)),
+                    "rmse_final_um": float(np.nanmean(part.rmse_final_um)),
+                }
+                for part in self.chained
+            ],
+            "search": [_round_json(scored) for scored in self.state.rounds],
+            "not_tried": self.state.not_tried(),
+            "blocked": self.state.blocked(),
+        }
+
+    def _step(self, place: int) -> dict[str, Any]:
+        step, term = self.state.steps[place], self.state.added[place]
+        tied, runner_up = rivals(step.score, step.round.scores)
+        squares = self.contribution(term) ** 2
+        before, after = np.nanmean(self.errors[place]), np.nanmean(self.errors[place + 1])
+        return {
+            "effect": term.effect,
+            "parameters": dict(term.candidate.parameters),
+            "parameter_ranges": dict(step.score.ranges),
+            "p_value": step.score.family_wise_p,
+            "rmse_before_um": float(before),
+            "rmse_after_um": float(after),
+            "rms_um": float(np.sqrt(np.mean(squares))),
+            "rms_by_channel_um": {
+                name: float(np.sqrt(np.mean(squares[:, channel]))) for channel, name in enumerate(self.record.channels)
+            },
+            "chained_rmse_before_um": step.round.start_error_um,
+            "chained_rmse_after_um": _error_after(step),
+            "tied": tied,
+            "runner_up": runner_up,
+            "rejected": _rejected(step.round),
+            "confirmed": str(step.confirmed),
+            "event_s": term.candidate.event_s,
+        }
+
+    def contribution(self, term: Term) -> Array:
+        """Contribution of a term to the prediction by the final model, about its mean.
+
+        Parameters
+        ----------
+        term : of the final model
+
+        Returns
+        -------
+        (blocks, channels) ndarray, um
+        """
+        place = place_of(self.state.model.terms, term)
+        series = term.candidate.columns @ self.predictions[-1].coefficients[place]
+        return np.asarray(series - series.mean(axis=0))
+
+
+def _error_after(step: Step) -> float:
+    return step.score.confirmation.error_um if step.score.confirmation else np.nan
+
+
+def _rejected(scored: Round) -> dict[str, str]:
+    """Effects of a round that were significant and not confirmed, with the reason in words."""
+    return {
+        score.name: Decision(
+            score.name,
+            Reason.NOT_CONFIRMED,
+            {
+                "p_value": score.family_wise_p,
+                "before_um": scored.start_error_um,
+                "after_um": score.confirmation.error_um,
+            },
+        ).sentence
+        for score in scored.scores
+        if score.confirmation is not None and not score.confirmation.passed
+    }
+
+
+def _round_json(scored: Round) -> list[dict[str, Any]]:
+    rejected = _rejected(scored)
+    return [
+        {
+            "effect": score.name,
+            "parameters": dict(score.candidate.parameters) if score.candidate else {},
+            "gain": score.gain,
+            "excess_gain": score.excess,
+            "p_value": score.p_value,
+            "family_wise_p": score.family_wise_p,
+            "chained_rmse_before_um": scored.start_error_um,
+            "chained_rmse_after_um": score.confirmation.error_um if score.confirmation else np.nan,
+            "chosen": score.confirmation is not None and score.confirmation.passed,
+            "rejected": rejected.get(score.name, ""),
+        }
+        for score in scored.scores
+    ]
