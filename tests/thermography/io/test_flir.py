@@ -179,7 +179,7 @@ def test_undeclared_padding_is_stepped_over_and_said(tmp_path: Path, padding: in
     path.write_bytes(data)
     frames, rejected = index_frames([path])
     assert [frame.index for frame in frames] == [0, 1, 2]
-    assert frames[1].notes == (f"{padding} bytes of padding before the frame were stepped over",)
+    assert frames[1].notes == (f"{padding} bytes of padding before the frame were skipped",)
     np.testing.assert_array_equal(frames[2].read().counts, written[2].counts)
     assert rejected == []
 
@@ -282,7 +282,7 @@ def test_a_damaged_frame_inside_a_sequence_costs_only_itself(tmp_path: Path) -> 
     assert [frame.index for frame in frames] == [0, 2]
     np.testing.assert_array_equal(frames[1].read().counts, written[2].counts)
     (cut,) = rejected
-    assert cut.index == 1 and "100 bytes fewer: the frame is cut short" in cut.reason
+    assert cut.index == 1 and "100 bytes fewer: the frame is truncated" in cut.reason
 
 
 @pytest.mark.parametrize("kept", [3, 63, 64, 500, 1000])
@@ -303,7 +303,7 @@ def test_a_jpeg_that_ends_too_early_is_left_out_at_once(tmp_path: Path) -> None:
     at, length = _segments(data)[-1]
     path.write_bytes(data[: at + length - 50])
     frames, rejected = index_frames([path])
-    assert frames == [] and "50 bytes fewer: the frame is cut short" in rejected[0].reason
+    assert frames == [] and "50 bytes fewer: the frame is truncated" in rejected[0].reason
 
 
 def test_a_frame_reference_reads_in_another_process(tmp_path: Path) -> None:
