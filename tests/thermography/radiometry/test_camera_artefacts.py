@@ -1,4 +1,4 @@
-"""Camera artefacts: planted ones are found, corrected and named; none is found where none is."""
+"""Camera artefacts: planted ones are detected, corrected and named; none is detected where none was planted."""
 
 from __future__ import annotations
 
@@ -111,11 +111,11 @@ def test_what_comes_back_or_moves_a_part_is_named_and_not_corrected() -> None:
     passing[41] -= 0.5
     flags = find_steps(_levels(passing))
     assert {flag.cause for flag in flags} == {"transient"}
-    assert "came back: not taken for a flat-field correction" in flags[0].message
+    assert "and returned: not attributed to a flat-field correction" in flags[0].message
     moved = change.copy()
     moved[40] += 0.5
     (flag,) = find_steps(_levels(moved, share=0.6))
-    assert flag.cause == "transient" and "moved 60% of the reference only" in flag.message
+    assert flag.cause == "transient" and "in only 60% of the reference" in flag.message
     np.testing.assert_array_equal(anchor(_levels(moved), [flag]), 0)
 
 
@@ -149,8 +149,8 @@ def test_repeated_and_frozen_frames_are_told_apart(tmp_path: Path) -> None:
     levels = read_levels(index_frames([tmp_path / "a.seq"])[0])
     flags = find_repeats(levels)
     assert [(flag.cause, flag.index) for flag in flags] == [("repeated_frame", 2), ("frozen_frames", 6)]
-    assert flags[0].message == "1 frames repeat the counts of frame 1"
-    assert flags[1].message == "4 frames repeat the counts of frame 5: the camera stood still"
+    assert flags[0].message == "1 frame repeats the counts of frame 1"
+    assert flags[1].message == "4 frames repeat the counts of frame 5: the camera output was frozen"
 
 
 # Slow drift ----------------------------------------------------------------------------------------------------------

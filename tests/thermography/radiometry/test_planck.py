@@ -17,7 +17,7 @@ from thermography.radiometry.planck import (
     RadiometryError,
     black_body_signal,
     calibrate,
-    check,
+    check_parameters,
     counts_from_temperature,
     override,
     path_transmission,
@@ -181,24 +181,24 @@ def test_transmission_falls_with_distance_and_humidity() -> None:
 )
 def test_parameters_without_meaning_are_refused_by_name(change: dict[str, float], message: str) -> None:
     broken = replace(PARAMETERS, **change)
-    with pytest.raises(RadiometryError, match=message + ".*; override what the file has wrong"):
+    with pytest.raises(RadiometryError, match=message + ".*; override the wrong values of the file"):
         calibrate(np.full(3, 18000, np.uint16), broken)
 
 
 def test_all_faults_come_in_one_message() -> None:
     with pytest.raises(RadiometryError, match=r"emissivity = 2.*relative_humidity = 3"):
-        check(replace(PARAMETERS, emissivity=2.0, relative_humidity=3.0))
+        check_parameters(replace(PARAMETERS, emissivity=2.0, relative_humidity=3.0))
 
 
 def test_a_window_that_is_not_there_needs_no_temperature() -> None:
-    check(replace(PARAMETERS, window_temperature_K=0.0))
+    check_parameters(replace(PARAMETERS, window_temperature_K=0.0))
     with pytest.raises(RadiometryError, match="window_temperature_K = 0"):
-        check(replace(PARAMETERS, window_temperature_K=0.0, window_transmission=0.9))
+        check_parameters(replace(PARAMETERS, window_temperature_K=0.0, window_transmission=0.9))
 
 
 def test_unknown_names_averages_and_wild_emissivities_are_refused() -> None:
     with pytest.raises(
-        RadiometryError, match="parameter 'distance' is not known; use one of emissivity, object_distance_m"
+        RadiometryError, match="parameter 'distance' is unknown; use one of emissivity, object_distance_m"
     ):
         override(PARAMETERS, distance=2.0)
     with pytest.raises(RadiometryError, match="counts: expected uint16, got float64; use temperature_from_counts"):
