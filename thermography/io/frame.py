@@ -213,7 +213,7 @@ class FrameHeader:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Frame(FrameHeader):
-    """A frame with its pixels.
+    """A frame with its pixels; two frames are equal if their headers are.
 
     Attributes
     ----------
