@@ -131,8 +131,8 @@ def test_a_damaged_frame_in_an_intact_file_is_rejected_and_reported(tmp_path: Pa
     path = tmp_path / "a.seq"
     sequence(path, "jpegls", frames=2)
     data = bytearray(path.read_bytes())
-    at = data.rindex(b"\xff\xd8\xff\xf7")
-    data[at + 25 : at + 60] = bytes(35)
+    start = data.rindex(b"\xff\xd8\xff\xf7")
+    data[start + 25 : start + 60] = bytes(35)
     path.write_bytes(data)
     inspection = inspect_file(path)
     assert inspection.frames_read == 1

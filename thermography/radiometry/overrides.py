@@ -44,8 +44,8 @@ class ParameterLog:
                 "log of a parameter: expected increasing times and finite values; sort the log and remove gaps"
             )
 
-    def at(self, time: np.datetime64) -> float:
-        """Interpolate linearly.
+    def interpolate(self, time: np.datetime64) -> float:
+        """Interpolate linearly to a time.
 
         Parameters
         ----------
@@ -90,7 +90,7 @@ class Overrides:
 
     def __call__(self, frame: FrameHeader) -> CameraParameters:
         """Return the parameters to calibrate a frame with."""
-        logged = {name: log.at(frame.time) for name, log in self.logs.items()}
+        logged = {name: log.interpolate(frame.time) for name, log in self.logs.items()}
         changes = {**self.constants, **logged}
         return override(frame.parameters, **changes) if changes else frame.parameters
 

@@ -72,11 +72,11 @@ def test_directory_and_records_are_read_in_either_byte_order(tmp_path: Path, ord
     (written,) = sequence(path, frames=1)
     data = bytearray(path.read_bytes())
     if order == "<":
-        for at in (0x14, 0x18, 0x1C, 0x20, 0x34, 0x38, 0x3C):
-            data[at : at + 4] = data[at : at + 4][::-1]
-        for at in range(0x40, 0x200, 32):
-            entry = struct.unpack_from(">2H7I", data, at)
-            struct.pack_into("<2H7I", data, at, *entry)
+        for offset in (0x14, 0x18, 0x1C, 0x20, 0x34, 0x38, 0x3C):
+            data[offset : offset + 4] = data[offset : offset + 4][::-1]
+        for offset in range(0x40, 0x200, 32):
+            entry = struct.unpack_from(">2H7I", data, offset)
+            struct.pack_into("<2H7I", data, offset, *entry)
     path.write_bytes(data)
     np.testing.assert_array_equal(read_frame(path).counts, written.counts)
 
@@ -120,8 +120,8 @@ def test_humidity_in_percent_is_converted_and_noted(tmp_path: Path) -> None:
     jpeg(path)
     data = path.read_bytes()
     stored = struct.pack("<f", 0.5)
-    at = data.index(stored, data.index(struct.pack("<f", PARAMETERS.emissivity)))
-    path.write_bytes(data[:at] + struct.pack("<f", 45.0) + data[at + 4 :])
+    offset = data.index(stored, data.index(struct.pack("<f", PARAMETERS.emissivity)))
+    path.write_bytes(data[:offset] + struct.pack("<f", 45.0) + data[offset + 4 :])
     frame = read_frame(path)
     assert frame.parameters.relative_humidity == pytest.approx(0.45)
     assert frame.notes == ("relative humidity 45 was stored in percent",)
@@ -189,15 +189,15 @@ def test_truncation_at_every_byte_of_the_headers_is_refused_with_its_place(tmp_p
             read_frame(path)
 
 
-def _patched(path: Path, at: int, value: bytes) -> Path:
+def _patched(path: Path, offset: int, value: bytes) -> Path:
     data = bytearray(path.read_bytes())
-    data[at : at + len(value)] = value
+    data[offset : offset + len(value)] = value
     path.write_bytes(data)
     return path
 
 
 @pytest.mark.parametrize(
-    ("at", "value", "message"),
+    ("offset", "value", "message"),
     [
         (
             0x14,
@@ -224,11 +224,11 @@ def _patched(path: Path, at: int, value: bytes) -> Path:
         (0xBAE, b"\xff\xff\xff\xff", r"expected 1 to 16777216 pixels, found 65535 x 65535"),
     ],
 )
-def test_a_violation_is_named_with_file_and_place(tmp_path: Path, at: int, value: bytes, message: str) -> None:
+def test_a_violation_is_named_with_file_and_place(tmp_path: Path, offset: int, value: bytes, message: str) -> None:
     path = tmp_path / "a.seq"
     sequence(path, frames=1)
     with pytest.raises(FlirFormatError, match=message):
-        read_frame(_patched(path, at, value))
+        read_frame(_patched(path, offset, value))
 
 
 def test_a_directory_that_points_to_itself_is_refused(tmp_path: Path) -> None:
@@ -271,8 +271,8 @@ def test_thousands_of_damaged_frames_leave_the_interpreter_intact(tmp_path: Path
     path = tmp_path / "a.seq"
     sequence(path, "png", frames=1)
     data = bytearray(path.read_bytes())
-    at = data.index(b"IDAT") + 10
-    data[at : at + 4] = b"abcd"
+    offset = data.index(b"IDAT") + 10
+    data[offset : offset + 4] = b"abcd"
     path.write_bytes(data)
     (frame,), _ = index_frames([path])
     before = sys.getrefcount(None)

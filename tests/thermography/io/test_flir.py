@@ -27,12 +27,12 @@ C3X_JPEG = "frkatona__ThermalImageFitter/Nov19/FLIR2167.jpg"
 
 def _segments(data: bytes) -> list[tuple[int, int]]:
     """Return (offset, length) of every marker segment before the image."""
-    found, at = [], 2
-    while data[at + 1] == 0xE1:
-        (length,) = struct.unpack_from(">H", data, at + 2)
-        found.append((at, 2 + length))
-        at += 2 + length
-    return found
+    segments, offset = [], 2
+    while data[offset + 1] == 0xE1:
+        (length,) = struct.unpack_from(">H", data, offset + 2)
+        segments.append((offset, 2 + length))
+        offset += 2 + length
+    return segments
 
 
 # What files hold -----------------------------------------------------------------------------------------------------
@@ -76,9 +76,9 @@ def test_csq_whose_last_frame_lacks_padding_is_read_whole(real_file) -> None:
     ],
 )
 def test_other_cameras_give_smooth_pictures(real_file, name: str, shape: tuple[int, int], frames: int) -> None:
-    found, rejected = index_frames([real_file(name)])
-    assert len(found) == frames and rejected == []
-    counts = found[0].read().counts.astype(float)
+    references, rejected = index_frames([real_file(name)])
+    assert len(references) == frames and rejected == []
+    counts = references[0].read().counts.astype(float)
     assert counts.shape == shape
     # Wrong byte order or a shifted line makes neighbours differ by thousands of counts.
     assert np.median(np.abs(np.diff(counts, axis=1))) < 30
@@ -108,7 +108,7 @@ def test_segments_may_come_in_any_order(tmp_path: Path) -> None:
     written = jpeg(path, rows=200, columns=400)
     data = path.read_bytes()
     segments = _segments(data)
-    pieces = [data[at : at + length] for at, length in segments]
+    pieces = [data[offset : offset + length] for offset, length in segments]
     end = segments[-1][0] + segments[-1][1]
     for order in permutations(pieces):
         path.write_bytes(data[:2] + b"".join(order) + data[end:])
@@ -122,11 +122,11 @@ def test_segments_must_be_complete_and_single(tmp_path: Path) -> None:
     jpeg(path, rows=200, columns=400)
     data = path.read_bytes()
     segments = _segments(data)
-    at, length = segments[2]
-    path.write_bytes(data[:at] + data[at + length :])
+    offset, length = segments[2]
+    path.write_bytes(data[:offset] + data[offset + length :])
     with pytest.raises(FlirFormatError, match=r"expected FLIR segments 0 to 2, found no \[1\]"):
         read_frame(path)
-    path.write_bytes(data[: at + length] + data[at:])
+    path.write_bytes(data[: offset + length] + data[offset:])
     with pytest.raises(FlirFormatError, match="expected FLIR segment 1 once, found it twice"):
         read_frame(path)
 
@@ -222,8 +222,8 @@ def test_a_jpeg_that_ends_too_early_is_left_out_at_once(tmp_path: Path) -> None:
     path = tmp_path / "a.jpg"
     jpeg(path, rows=200, columns=400)
     data = path.read_bytes()
-    at, length = _segments(data)[-1]
-    path.write_bytes(data[: at + length - 50])
+    offset, length = _segments(data)[-1]
+    path.write_bytes(data[: offset + length - 50])
     frames, rejected = index_frames([path])
     assert frames == [] and "50 bytes fewer: the frame is truncated" in rejected[0].reason
 

@@ -1,4 +1,4 @@
-"""Stacks as zarr: equal after the way to disk, whole or absent."""
+"""Stacks as zarr: bit-exact, and written as a whole or not at all."""
 
 import numpy as np
 import pytest
