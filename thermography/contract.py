@@ -1,13 +1,11 @@
-"""What crosses the border of thermography: names, dims, units and kinds of the per-cycle fields.
-
-A contract maps a variable's name to ``(dims, units, kind)``, kind being a NumPy dtype kind (``f``, ``i``, ``u``, ``M``).
-"""
+"""Contract of the products of `thermography`: dims, units and kinds of the variables that other packages may rely on."""
 
 from __future__ import annotations
 
+#: Name of a variable -> (dims, units, kind), kind being a NumPy dtype kind (``f``, ``i``, ``u``, ``M``).
 Contract = dict[str, tuple[tuple[str, ...], str, str]]
 
-#: Fields on the table plan; ``x`` and ``y`` are plan millimetres, ``cycle`` counts from 1.
+#: Fields on the table plan; ``x`` and ``y`` are plan coordinates in mm, ``cycle`` counts from 1.
 FIELDS: Contract = {
     "temperature": (("cycle", "y", "x"), "degC", "f"),
     "temperature_u": (("cycle", "y", "x"), "K", "f"),

@@ -1,4 +1,4 @@
-"""What a FLIR file holds, in facts and in lines, with a warning for everything that looks wrong."""
+"""Summarises the content of a FLIR file and warns about everything in it that is implausible or damaged."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from thermography.io.flir import FrameReference, Rejected, index_frames, read_frame
+from thermography.io.flir import FrameReference, RejectedFrame, index_frames, read_frame
 from thermography.io.frame import CameraParameters, FlirFormatError, Frame
 from thermography.radiometry.planck import (
     ZERO_CELSIUS_K,
@@ -20,16 +20,26 @@ from thermography.radiometry.planck import (
     temperature_from_counts,
 )
 
-#: Frames whose pixels are read, spread over the file; a day of video must not take a day to inspect.
-_FRAMES_LOOKED_AT = 32
-#: Bolometer cameras with these files appeared after this year; an older date is a clock that was never set.
+#: Maximum number of frames whose pixels are read, spread evenly over the file, so that long recordings are inspected quickly.
+_FRAMES_READ = 32
+#: Bolometer cameras with these file formats appeared after this year; an earlier date means that the clock was never set.
 _OLDEST_YEAR = 2001
 _THUMBNAIL_WIDTH = 320
 
 
 @dataclass(frozen=True)
-class Warned:
-    """Something that looks wrong: a code, what was seen, and what to do."""
+class FileWarning:
+    """An implausible or damaged part of a file.
+
+    Attributes
+    ----------
+    code : str
+        Identifier of the kind of warning, for example "saturated".
+    message : str
+        What was found, with its value.
+    remedy : str
+        What to do about it.
+    """
 
     code: str
     message: str
@@ -37,33 +47,36 @@ class Warned:
 
 
 @dataclass(frozen=True)
-class Inspection:
-    """Facts about one FLIR file.
+class FlirInspection:
+    """Content of one FLIR file.
 
     Attributes
     ----------
     path : Path
+        The file.
     frames : tuple of FrameReference
-        In time order.
-    rejected : tuple of Rejected
+        Usable frames in order of time.
+    rejected : tuple of RejectedFrame
+        Frames that cannot be used, and why.
     lowest_degC, highest_degC, mean_degC : float
-        Over the frames that were looked at; NaN where the parameters give no temperature.
-    looked_at : int
+        Surface temperature over the frames that were read, degC; NaN where the parameters give no temperature.
+    frames_read : int
         Number of frames whose pixels were read.
-    warnings : tuple of Warned
+    warnings : tuple of FileWarning
+        Everything that is implausible or damaged.
     """
 
     path: Path
     frames: tuple[FrameReference, ...]
-    rejected: tuple[Rejected, ...]
+    rejected: tuple[RejectedFrame, ...]
     lowest_degC: float
     highest_degC: float
     mean_degC: float
-    looked_at: int
-    warnings: tuple[Warned, ...]
+    frames_read: int
+    warnings: tuple[FileWarning, ...]
 
     def lines(self) -> list[str]:
-        """Return the facts as lines for a terminal."""
+        """Return the content as lines of text, the warnings last."""
         first, last = self.frames[0], self.frames[-1]
         camera, p = first.camera, first.parameters
         rows, columns = first.shape
@@ -72,85 +85,129 @@ class Inspection:
         serial = f", serial {camera.serial}" if camera.serial else ""
         times = f"{first.time} UTC" if len(self.frames) == 1 else f"{first.time} to {last.time} UTC"
         zone = f"{first.utc_offset_minutes / 60:+g} h" if first.utc_offset_minutes else "UTC"
-        inside = ", ".join(
+        housekeeping = ", ".join(
             f"{name} {value - ZERO_CELSIUS_K:.1f}"
             for name, value in first.housekeeping.items()
             if abs(value - ZERO_CELSIUS_K) > 1e-3
         )
         lines = [
             f"{self.path}: FLIR, {count} of {columns} x {rows}, samples {first.samples.encoding}",
-            f"  camera {camera.model or 'not named'}{serial}{lens}",
+            f"  camera {camera.model or 'unknown'}{serial}{lens}",
             f"  time {times} (camera set to {zone})",
             f"  emissivity {p.emissivity:.3g}, distance {p.object_distance_m:.3g} m, reflected "
             f"{p.reflected_temperature_K - ZERO_CELSIUS_K:.2f} degC, air {p.atmospheric_temperature_K - ZERO_CELSIUS_K:.2f} degC, "
             f"relative humidity {p.relative_humidity:.0%}, window transmission {p.window_transmission:.3g}",
             f"  R1 {p.planck_r1:.9g}, B {p.planck_b:.7g}, F {p.planck_f:.7g}, O {p.planck_o:g}, R2 {p.planck_r2:.8g}",
             f"  temperature {self.lowest_degC:.2f} to {self.highest_degC:.2f} degC, mean {self.mean_degC:.2f} degC "
-            f"({self.looked_at} of {len(self.frames)} frames read)",
+            f"({self.frames_read} of {len(self.frames)} frames read)",
         ]
         if first.settings.frame_rate_Hz:
             lines.append(
                 f"  frame rate {first.settings.frame_rate_Hz:g} Hz, focus {first.settings.focus_distance_m:.3g} m"
             )
-        if inside:
-            lines.append(f"  inside the camera, degC: {inside}")
+        if housekeeping:
+            lines.append(f"  inside the camera, degC: {housekeeping}")
         lines += [f"  note: {note}" for note in dict.fromkeys(note for frame in self.frames for note in frame.notes)]
         return lines + [f"  warning: {each.message} {each.remedy}" for each in self.warnings]
 
 
 def is_flir_file(path: Path) -> bool:
-    """Whether a file starts like a JPEG or an FFF record."""
+    """Return whether a file starts as a JPEG or an FFF record.
+
+    Parameters
+    ----------
+    path : Path
+        An existing file.
+
+    Returns
+    -------
+    bool
+        True for the first bytes of a JPEG or an FFF record; a JPEG need not be radiometric.
+    """
     with Path(path).open("rb") as file:
         start = file.read(4)
     return start[:2] == b"\xff\xd8" or start == b"FFF\0"
 
 
-def inspect_file(path: Path) -> list[str]:
-    """Return what a FLIR file holds, as lines; see `inspect`."""
-    return inspect(path).lines()
-
-
-def inspect(path: Path) -> Inspection:
-    """Read the headers of a FLIR file and the pixels of some of its frames, and look for what is wrong.
+def inspect_file(path: Path) -> FlirInspection:
+    """Read the headers of a FLIR file and the pixels of up to 32 frames, and check them for implausible or damaged content.
 
     Parameters
     ----------
-    path : path of an R-JPEG, SEQ, CSQ or FFF file
+    path : Path
+        Radiometric JPEG, SEQ, CSQ or FFF file.
 
     Returns
     -------
-    Inspection
+    FlirInspection
+        Frames, camera, parameters, temperature range (degC) and warnings; its method `lines` gives them as text.
 
     Raises
     ------
     FlirFormatError
         Where no frame can be read.
+
+    Notes
+    -----
+    Checked are the time, the camera, the camera parameters (zero or swapped units, values outside their range, values that vary), the
+    checksums of the records, counts outside the calibrated range, and a stored atmospheric transmission that disagrees with distance,
+    humidity and air temperature.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from thermography.io.flir_writer import write_jpeg
+    >>> sc660 = CameraParameters(
+    ...     0.95, 0.0, 293.15, 293.15, 293.15, 1.0, 0.0, 0.5, 21106.77, 1501.0, 1.0, -7340.0, 0.012545258,
+    ...     0.006569, 0.01262, -0.002276, -0.00667, 1.9,
+    ... )
+    >>> with TemporaryDirectory() as folder:
+    ...     write_jpeg(Path(folder, "a.jpg"), np.array([[18000, 18500]], np.uint16), sc660, "2026-03-09T06:33:47")
+    ...     inspection = inspect_file(Path(folder, "a.jpg"))
+    >>> round(inspection.mean_degC, 2), inspection.warnings[0].message
+    (24.6, 'distance 0 m: the atmosphere is not corrected.')
     """
     path = Path(path)
     references, rejected = index_frames([path])
     if not references:
         raise FlirFormatError(rejected[0].reason)
-    chosen = np.unique(np.linspace(0, len(references) - 1, _FRAMES_LOOKED_AT).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(references) - 1, _FRAMES_READ).round().astype(int))
     frames = []
     for index in chosen:
         try:
             frames.append(references[index].read())
         except FlirFormatError as error:
-            rejected.append(Rejected(path, references[index].index, str(error)))
+            rejected.append(RejectedFrame(path, references[index].index, str(error)))
     lowest, highest, mean = _temperature_range(frames)
     warnings = [
-        *(_warned_rejected(rejected)),
-        *(_warned_times(references)),
-        *(_warned_parameters(references[0].parameters, references)),
-        *(_warned_damage([references[index] for index in chosen])),
-        *(_warned_pixels(frames)),
-        *(_warned_transmission(frames[:1])),
+        *_warn_rejected(rejected),
+        *_warn_times(references),
+        *_warn_parameters(references[0].parameters, references),
+        *_warn_checksums([references[index] for index in chosen]),
+        *_warn_pixels(frames),
+        *_warn_transmission(frames[:1]),
     ]
-    return Inspection(path, tuple(references), tuple(rejected), lowest, highest, mean, len(frames), tuple(warnings))
+    return FlirInspection(path, tuple(references), tuple(rejected), lowest, highest, mean, len(frames), tuple(warnings))
 
 
 def thumbnail(path: Path) -> bytes:
-    """Return a small PNG of the first frame, stretched from its 1st to its 99th percentile; dark is cold."""
+    """Return a small picture of the first frame.
+
+    Parameters
+    ----------
+    path : Path
+        Radiometric JPEG, SEQ, CSQ or FFF file.
+
+    Returns
+    -------
+    bytes
+        PNG of up to 320 pixels width in false colours, scaled from the 1st to the 99th percentile of the counts; dark is cold.
+
+    Raises
+    ------
+    FlirFormatError
+        Where the first frame cannot be read.
+    """
     counts = read_frame(path).counts.astype(np.float32)
     low, high = np.percentile(counts, (1, 99))
     grey = np.clip((counts - low) * (255 / max(high - low, 1)), 0, 255).astype(np.uint8)
@@ -161,7 +218,7 @@ def thumbnail(path: Path) -> bytes:
 
 
 def _temperature_range(frames: Sequence[Frame]) -> tuple[float, float, float]:
-    """Return lowest, highest and mean temperature, degC."""
+    """Return lowest, highest and mean temperature, degC; NaN where no frame gives a temperature."""
     ranges = []
     for frame in frames:
         try:
@@ -177,83 +234,95 @@ def _temperature_range(frames: Sequence[Frame]) -> tuple[float, float, float]:
     return float(low.min()), float(high.max()), float(mean.mean())
 
 
-def _warned_rejected(rejected: Sequence[Rejected]) -> Iterator[Warned]:
+def _warn_rejected(rejected: Sequence[RejectedFrame]) -> Iterator[FileWarning]:
+    """Warn about frames that cannot be used."""
     for each in rejected:
-        yield Warned("frame_left_out", f"{each.reason}.", "Copy the file from the camera again if the frame matters.")
+        yield FileWarning(
+            "frame_left_out", f"{each.reason}.", "Copy the file from the camera again if the frame matters."
+        )
 
 
-def _warned_times(references: Sequence[FrameReference]) -> Iterator[Warned]:
+def _warn_times(references: Sequence[FrameReference]) -> Iterator[FileWarning]:
+    """Warn about missing or implausible times, and about frames of several cameras."""
     without = sum(bool(np.isnat(frame.time)) for frame in references)
     if without:
-        yield Warned("no_time", f"{without} frames have no time.", "They cannot be matched with laser readings.")
+        yield FileWarning("no_time", f"{without} frames have no time.", "They cannot be matched with laser readings.")
     first = references[0].time
     if not np.isnat(first) and first < np.datetime64(f"{_OLDEST_YEAR}-01-01"):
-        yield Warned(
+        yield FileWarning(
             "clock_not_set",
-            f"the camera's clock says {first}.",
+            f"the clock of the camera was at {first}.",
             "Set it, or give thermography.clock_offset in the campaign.",
         )
     cameras = {(frame.camera.model, frame.camera.serial) for frame in references}
     if len(cameras) > 1:
-        yield Warned(
-            "several_cameras", f"frames of {len(cameras)} cameras.", "Keep each camera's frames in its own file."
+        yield FileWarning(
+            "several_cameras",
+            f"the file holds frames of {len(cameras)} cameras.",
+            "Store the frames of each camera in a separate file.",
         )
 
 
-def _warned_parameters(p: CameraParameters, references: Sequence[FrameReference]) -> Iterator[Warned]:
-    """Warn of parameters that no one can have meant."""
+def _warn_parameters(p: CameraParameters, references: Sequence[FrameReference]) -> Iterator[FileWarning]:
+    """Warn about implausible parameters."""
     varying = [
         each.name for each in fields(p) if len({getattr(frame.parameters, each.name) for frame in references}) > 1
     ]
     if varying:
-        yield Warned(
+        yield FileWarning(
             "parameters_vary",
-            f"not the same in all frames: {', '.join(varying)}.",
+            f"parameters differ between the frames: {', '.join(varying)}.",
             "Override them if the scene did not change.",
         )
     for name in ("reflected_temperature_K", "atmospheric_temperature_K"):
-        value, what = getattr(p, name), name.removesuffix("_K").replace("_", " ")
+        value, quantity = getattr(p, name), name.removesuffix("_K").replace("_", " ")
         if not value > 150:
-            yield Warned(
+            yield FileWarning(
                 "celsius_as_kelvin",
-                f"{what} {value:g} K looks like degC stored as K.",
-                f"Give {what.replace(' ', '_')}.",
+                f"{quantity} {value:g} K: probably degC stored as K.",
+                f"Give {quantity.replace(' ', '_')}.",
             )
         elif value - ZERO_CELSIUS_K > 150:
-            yield Warned(
+            yield FileWarning(
                 "kelvin_as_celsius",
-                f"{what} {value - ZERO_CELSIUS_K:.0f} degC looks like K stored as degC.",
-                f"Give {what.replace(' ', '_')}.",
+                f"{quantity} {value - ZERO_CELSIUS_K:.0f} degC: probably K stored as degC.",
+                f"Give {quantity.replace(' ', '_')}.",
             )
     if not 0 < p.emissivity < 1:
-        yield Warned("emissivity", f"emissivity {p.emissivity:g} is no real surface's.", "Give emissivity.")
+        yield FileWarning(
+            "emissivity", f"emissivity {p.emissivity:g} is not that of a real surface.", "Give emissivity."
+        )
     if p.object_distance_m <= 0:
-        yield Warned(
-            "distance_zero", f"distance {p.object_distance_m:g} m: no air is corrected.", "Give object_distance."
+        yield FileWarning(
+            "distance_zero",
+            f"distance {p.object_distance_m:g} m: the atmosphere is not corrected.",
+            "Give object_distance.",
         )
     if not 0 < p.relative_humidity <= 1:
-        yield Warned("humidity", f"relative humidity {p.relative_humidity:g}.", "Give relative_humidity as a fraction.")
+        yield FileWarning(
+            "humidity", f"relative humidity {p.relative_humidity:g}.", "Give relative_humidity as a fraction."
+        )
     if references[0].notes and any("percent" in note for note in references[0].notes):
-        yield Warned("humidity_percent", "relative humidity was stored in percent.", "It was divided by 100.")
+        yield FileWarning("humidity_percent", "relative humidity was stored in percent.", "It was divided by 100.")
     if min(p.planck_r1, p.planck_b, p.planck_r2) <= 0:
-        yield Warned("not_calibrated", "the Planck constants are not positive.", "Only counts can be used.")
+        yield FileWarning("not_calibrated", "the Planck constants are not positive.", "Only the counts can be used.")
 
 
-def _warned_damage(references: Sequence[FrameReference]) -> Iterator[Warned]:
-    """Warn of records that differ from their checksum."""
+def _warn_checksums(references: Sequence[FrameReference]) -> Iterator[FileWarning]:
+    """Warn about records that differ from their checksum."""
     for frame in references:
         if kinds := frame.damaged_records():
             names = ", ".join(f"0x{kind:02X}" for kind in kinds)
-            yield Warned(
+            yield FileWarning(
                 "checksum",
                 f"frame {frame.index}: records {names} differ from their checksum.",
-                "Something changed the file after the camera wrote it; compare it with the original.",
+                "The file was changed after the camera wrote it; compare it with the original.",
             )
 
 
-def _warned_pixels(frames: Sequence[Frame]) -> Iterator[Warned]:
-    """Warn of counts outside the calibrated range, and of pictures without content."""
-    for code, label in (("saturated", "at or above"), ("under_range", "at or below")):
+def _warn_pixels(frames: Sequence[Frame]) -> Iterator[FileWarning]:
+    """Warn about counts outside the calibrated range, and about frames of one constant value."""
+    for code, label in (("saturated", "at or above the upper limit"), ("under_range", "at or below the lower limit")):
         shares = []
         for frame in frames:
             limits = frame.limits
@@ -262,23 +331,25 @@ def _warned_pixels(frames: Sequence[Frame]) -> Iterator[Warned]:
             shares.append(outside.mean())
         if max(shares, default=0) > 0:
             share = f"{max(shares):.2%}" if max(shares) >= 1e-4 else f"{max(shares):.1e}"
-            yield Warned(
+            yield FileWarning(
                 code,
-                f"up to {share} of the pixels lie {label} the calibrated range of the camera.",
-                "Choose another range.",
+                f"up to {share} of the pixels of a frame are {label} of the calibrated range of the camera.",
+                "Select another range in the camera.",
             )
-    outside_degC = max((_share_outside(frame) for frame in frames), default=0.0)
-    if outside_degC > 0:
+    outside_share = max((_share_outside(frame) for frame in frames), default=0.0)
+    if outside_share > 0:
         limits = frames[0].limits
-        yield Warned(
+        yield FileWarning(
             "outside_range",
-            f"up to {outside_degC:.2%} of the pixels lie outside the camera's range of "
+            f"up to {outside_share:.2%} of the pixels of a frame are outside the calibrated range of "
             f"{limits.minimum_K - ZERO_CELSIUS_K:.0f} to {limits.maximum_K - ZERO_CELSIUS_K:.0f} degC.",
             "Their temperatures are not calibrated.",
         )
     if any(frame.counts.min() == frame.counts.max() for frame in frames):
-        yield Warned(
-            "no_content", "a frame has the same count everywhere.", "The shutter was closed, or the frame is broken."
+        yield FileWarning(
+            "no_content",
+            "a frame has the same count in all pixels.",
+            "The shutter was closed, or the frame is damaged.",
         )
 
 
@@ -294,8 +365,8 @@ def _share_outside(frame: Frame) -> float:
     return float(np.mean(~((kelvin >= limits.minimum_K) & (kelvin <= limits.maximum_K))))
 
 
-def _warned_transmission(frames: Sequence[Frame]) -> Iterator[Warned]:
-    """Warn where the stored transmission is not what distance and humidity give, with its effect on the mean."""
+def _warn_transmission(frames: Sequence[Frame]) -> Iterator[FileWarning]:
+    """Warn where the stored transmission disagrees with distance, humidity and air temperature, and quantify its effect."""
     for frame in frames:
         p = frame.parameters
         if p.stored_transmission <= 0:
@@ -307,9 +378,9 @@ def _warned_transmission(frames: Sequence[Frame]) -> Iterator[Warned]:
         except RadiometryError:
             continue
         if abs(stored - calculated) > 0.01:
-            yield Warned(
+            yield FileWarning(
                 "stored_transmission",
-                f"the file stores a transmission of {p.stored_transmission:.4f} where distance and humidity give "
+                f"the file stores a transmission of {p.stored_transmission:.4f}, but distance and humidity give "
                 f"{path_transmission(p):.4f}; the stored one is used and changes the mean by {stored - calculated:+.2f} K.",
                 "Give object_distance to calculate it instead.",
             )

@@ -217,7 +217,7 @@ def describe_file(path: Path) -> list[str]:
         If the file is of no kind that is known, or cannot be used.
     """
     if is_flir_file(path):
-        return inspect_file(path)
+        return inspect_file(path).lines()
     with path.open("rb") as stream:
         start = stream.read(4096)
     if b"air_temperature" in start and b"deviation_um" not in start:

@@ -1,1 +1,1 @@
-"""Frames as recorded (level 0): radiometric JPEG, FFF, SEQ and CSQ read and written, stacks of frames, OpenEXR maps."""
+"""Reads and writes files: radiometric JPEG, FFF, SEQ and CSQ, stacks of fields as zarr, maps as OpenEXR."""

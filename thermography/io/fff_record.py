@@ -1,9 +1,11 @@
-"""One FFF record of a FLIR file: its bytes, its directory and its camera information.
+"""Reads one FFF record of a FLIR file: its bytes, its directory, the camera information and the samples of the raw image.
 
-The layout was measured on some 250 real files of 40 camera models; the offsets below are those of the records themselves.
-`thermography.io.flir` finds the records in their containers (radiometric JPEG, SEQ, CSQ, FFF) and is what other modules import.
+An FFF record is a header, a directory of typed records, and the records. Two of them matter here: the camera information (type 0x20:
+parameters, time, camera) and the raw image (type 0x01: plain, PNG or JPEG-LS samples). The module follows that order.
+`thermography.io.flir` finds the FFF records in their containers (radiometric JPEG, SEQ, CSQ, FFF).
 
-The raw record of an FFF: where its samples are, and the samples themselves (plain, PNG or JPEG-LS).
+The format is not published; the offsets were established on about 250 files of 40 camera models, and the tests compare them with
+ExifTool (P. Harvey, "FLIR Tags").
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from thermography.io.frame import (
     Encoding,
     FlirFormatError,
     FrameHeader,
-    Samples,
+    SampleLocation,
     Segments,
 )
 from thermography.io.png16 import SIGNATURE, PngError, decode_png
@@ -38,20 +40,36 @@ MAGIC = b"FFF\0"
 HEADER_SIZE = 0x40
 ENTRY_SIZE = 32
 CAMERA_RECORD = 0x20
-#: The largest directory seen has 33 slots.
-MAX_SLOTS = 1024
+RAW_RECORD = 0x01
+RAW_HEADER_SIZE = 0x20
+#: The largest directory in these files has 33 slots.
+_MAX_SLOTS = 1024
+#: Up to and including Planck R2 and the raw range; the shortest record in these files has 1148 bytes.
+_MINIMUM_CAMERA_INFO = 0x314
+#: The longest record in these files has 2476 bytes; a wrong length must not cost memory.
+_MAXIMUM_CAMERA_INFO = 0x4000
+#: Limits between which a number in the housekeeping table is a temperature inside a camera.
+_LOWEST_K, _HIGHEST_K = 150.0, 450.0
+#: The largest FLIR detectors have 3 million pixels; a file that claims more is damaged or hostile.
+_MAX_PIXELS = 1 << 24
 
 
 class FffSource:
-    """The bytes of one FFF record, wherever its pieces lie in an open file.
+    """Bytes of one FFF record, which may lie in several segments of an open file.
 
     Parameters
     ----------
-    file : binary file, opened unbuffered
+    file : binary file
+        Opened unbuffered; it stays open.
     path : Path
-        For messages.
+        Path of the file, for messages.
     segments : tuple of (offset, length)
-        The pieces in order, bytes in the file.
+        Segments of the record in their order, bytes in the file.
+
+    Attributes
+    ----------
+    size : int
+        Length of the record, bytes.
     """
 
     def __init__(self, file: BinaryIO, path: Path, segments: Segments) -> None:
@@ -59,7 +77,7 @@ class FffSource:
         self.size = segments[0][1] if len(segments) == 1 else sum(length for _, length in segments)
 
     def read(self, offset: int, length: int) -> bytes:
-        """Return up to `length` bytes from `offset` of the record; fewer where it ends."""
+        """Return `length` bytes from `offset` of the record, or fewer at its end."""
         if len(self.segments) == 1:
             start, available = self.segments[0]
             self.file.seek(start + offset)
@@ -74,26 +92,40 @@ class FffSource:
         return b"".join(pieces)
 
     def take(self, offset: int, length: int, what: str) -> bytes:
-        """Return exactly `length` bytes, or say what is missing."""
+        """Return exactly `length` bytes from `offset` of the record; `what` names them in the FlirFormatError if some are missing."""
         data = self.read(offset, length)
         if len(data) < length:
             raise self.error(offset, f"{what} of {length} bytes", f"{len(data)} bytes before the end")
         return data
 
-    def error(self, offset: int, expected: str, found: str) -> FlirFormatError:
-        """Name file and place (the offset in the file itself) of a broken promise."""
+    def error(self, offset: int, expected: str, actual: str) -> FlirFormatError:
+        """Return the error for a violation at `offset` of the record; the message gives the offset in the file itself."""
         place = offset
         for start, available in self.segments:
             if place < available or (start, available) == self.segments[-1]:
                 place += start
                 break
             place -= available
-        return FlirFormatError(f"{self.path}: at 0x{place:X}: expected {expected}, found {found}")
+        return FlirFormatError(f"{self.path}: at 0x{place:X}: expected {expected}, found {actual}")
 
 
 @dataclass(frozen=True)
 class Directory:
-    """The records of one FFF, type -> (offset, length), the directory as read, the end of the last, the declared length (0: none)."""
+    """Directory of one FFF record.
+
+    Attributes
+    ----------
+    records : mapping of int to (offset, length)
+        Place of the first record of each type, bytes from the start of the FFF record.
+    order : {"<", ">"}
+        Byte order of header and directory.
+    table : bytes
+        The directory as stored.
+    end : int
+        End of the last record, bytes.
+    declared_length : int
+        Length of the FFF record as its header declares it, bytes; 0 for none.
+    """
 
     records: Mapping[int, tuple[int, int]]
     order: str
@@ -103,7 +135,7 @@ class Directory:
 
     @property
     def checksums(self) -> dict[int, int]:
-        """The checksum that the directory states for every type of record, 0 for none."""
+        """CRC-32 of every type of record as stated in the directory; 0 for none."""
         stated: dict[int, int] = {}
         for kind, _, _, _, _, length, _, _, checksum in struct.iter_unpack(self.order + "2H7I", self.table):
             if kind and length:
@@ -111,26 +143,47 @@ class Directory:
         return stated
 
 
-def plausible_header(data: bytes) -> bool:
-    r"""Whether 64 bytes look like an FFF header; `FFF\0` alone also occurs in the middle of pixels."""
+def is_fff_header(data: bytes) -> bool:
+    r"""Return whether bytes are a plausible FFF header; the magic `FFF\0` alone also occurs among pixels.
+
+    Parameters
+    ----------
+    data : bytes
+        At least `HEADER_SIZE` bytes; fewer are never a header.
+
+    Returns
+    -------
+    bool
+        True if magic, version and directory position are plausible.
+    """
     if len(data) < HEADER_SIZE or not data.startswith(MAGIC):
         return False
     order = _byte_order(data)
     if order is None:
         return False
     offset, slots = struct.unpack_from(order + "2I", data, 0x18)
-    return offset >= HEADER_SIZE and 0 < slots <= MAX_SLOTS
+    return offset >= HEADER_SIZE and 0 < slots <= _MAX_SLOTS
 
 
 def read_directory(source: FffSource) -> Directory:
     """Read header and directory of one FFF record.
 
+    Parameters
+    ----------
+    source : FffSource
+        Bytes of the record.
+
+    Returns
+    -------
+    Directory
+        Places of the records by type.
+
     Raises
     ------
     FlirFormatError
-        Where the magic, the version or the directory is not what the format promises.
+        Where the magic, the version or the directory violates the format.
     """
-    # One read covers the header and the directory of all but exotic files.
+    # One read covers header and directory of nearly all files.
     head = source.read(0, HEADER_SIZE + 33 * ENTRY_SIZE)
     if head[:4] != MAGIC:
         raise source.error(0, "an FFF record (bytes 46 46 46 00)", head[:4].hex(" ") or "the end of the file")
@@ -140,13 +193,13 @@ def read_directory(source: FffSource) -> Directory:
     if order is None:
         raise source.error(0x14, "a version of 100 to 199 in either byte order", head[0x14:0x18].hex(" "))
     offset, slots = struct.unpack_from(order + "2I", head, 0x18)
-    if not 0 < slots <= MAX_SLOTS:
-        raise source.error(0x1C, f"1 to {MAX_SLOTS} directory slots", str(slots))
+    if not 0 < slots <= _MAX_SLOTS:
+        raise source.error(0x1C, f"1 to {_MAX_SLOTS} directory slots", str(slots))
     if offset < HEADER_SIZE:
         raise source.error(0x18, f"a directory after the header (offset >= {HEADER_SIZE})", str(offset))
     end = offset + slots * ENTRY_SIZE
     table = head[offset:end] if end <= len(head) else source.take(offset, slots * ENTRY_SIZE, "a directory")
-    # All frames of a sequence lie alike; only the checksums of their records differ.
+    # All frames of a sequence share one layout; only the checksums of their records differ, so they are blanked for the cache.
     layout = int.from_bytes(table, "little") & _without_checksums(slots)
     records, last = _records(order, layout.to_bytes(len(table), "little"))
     (declared,) = struct.unpack_from(order + "I", head, 0x34)
@@ -155,13 +208,13 @@ def read_directory(source: FffSource) -> Directory:
 
 @lru_cache(maxsize=64)
 def _without_checksums(slots: int) -> int:
-    """A mask of all bytes of a directory but the last four of every entry."""
+    """Return a mask of all bytes of a directory except the checksum, the last four bytes of every entry."""
     return int.from_bytes((b"\xff" * (ENTRY_SIZE - 4) + bytes(4)) * slots, "little")
 
 
 @lru_cache(maxsize=64)
 def _records(order: str, table: bytes) -> tuple[Mapping[int, tuple[int, int]], int]:
-    """Return the records of a directory and the end of the last one; most sequences repeat one layout, hence the cache."""
+    """Return the records of a directory and the end of the last one; cached because the frames of a sequence repeat one layout."""
     records: dict[int, tuple[int, int]] = {}
     last = 0
     for kind, _, _, _, offset, length, *_ in struct.iter_unpack(order + "2H7I", table):
@@ -172,42 +225,90 @@ def _records(order: str, table: bytes) -> tuple[Mapping[int, tuple[int, int]], i
 
 
 def _byte_order(head: bytes) -> str | None:
-    """Return the struct prefix of header and directory: the one in which the version reads 100 to 199."""
+    """Return the struct prefix of header and directory: the byte order in which the version is 100 to 199."""
     for order in "<>":
         if 100 <= struct.unpack_from(order + "I", head, 0x14)[0] < 200:
             return order
     return None
 
 
-def find_record(source: FffSource, directory: Directory, kind: int, name: str) -> tuple[int, int]:
-    """Return offset and length of a record that must be there."""
+def _find_record(source: FffSource, directory: Directory, kind: int, name: str) -> tuple[int, int]:
+    """Return offset and length of a mandatory record."""
     if kind not in directory.records:
-        found = ", ".join(f"0x{k:02X}" for k in directory.records) or "none"
-        raise source.error(HEADER_SIZE, f"{name} (type 0x{kind:02X}) in the directory", f"types {found}")
+        present = ", ".join(f"0x{k:02X}" for k in directory.records) or "none"
+        raise source.error(HEADER_SIZE, f"{name} (type 0x{kind:02X}) in the directory", f"types {present}")
     return directory.records[kind]
 
 
 def damaged_records(source: FffSource, directory: Directory) -> list[int]:
-    """Return the types of the records that do not have the CRC-32 which their directory entry states (0 states none)."""
+    """Return the types of the records whose bytes differ from their checksum.
+
+    Parameters
+    ----------
+    source : FffSource
+        Bytes of the record.
+    directory : Directory
+        Its directory, from `read_directory`.
+
+    Returns
+    -------
+    list of int
+        Types whose CRC-32 differs from the one in the directory; records without a checksum are not tested.
+    """
     stated = directory.checksums
     return [
         kind
-        for kind, place in directory.records.items()
-        if stated[kind] and zlib.crc32(source.read(*place)) != stated[kind]
+        for kind, (offset, length) in directory.records.items()
+        if stated[kind] and zlib.crc32(source.read(offset, length)) != stated[kind]
     ]
 
 
 def find_camera_info(source: FffSource, directory: Directory) -> tuple[int, int]:
-    """Return offset and length of the camera-info record."""
-    offset, length = find_record(source, directory, CAMERA_RECORD, "camera information")
+    """Return the place of the camera-information record.
+
+    Parameters
+    ----------
+    source : FffSource
+        Bytes of the record.
+    directory : Directory
+        Its directory, from `read_directory`.
+
+    Returns
+    -------
+    tuple of int
+        Offset from the start of the FFF record and length, bytes.
+
+    Raises
+    ------
+    FlirFormatError
+        Where the record is missing or too short to hold the calibration.
+    """
+    offset, length = _find_record(source, directory, CAMERA_RECORD, "camera information")
     if length < _MINIMUM_CAMERA_INFO:
         raise source.error(offset, f"camera information of at least {_MINIMUM_CAMERA_INFO} bytes", f"{length} bytes")
-    # The longest record seen has 2476 bytes; a wild length must not cost memory.
-    return offset, min(length, 0x4000)
+    return offset, min(length, _MAXIMUM_CAMERA_INFO)
 
 
 def read_header(source: FffSource, place: tuple[int, int]) -> FrameHeader:
-    """Read the camera-info record at a place (offset, length) from `find_camera_info`."""
+    """Read the camera-information record.
+
+    Parameters
+    ----------
+    source : FffSource
+        Bytes of the record.
+    place : tuple of int
+        Offset and length of the camera information, bytes, from `find_camera_info`.
+
+    Returns
+    -------
+    FrameHeader
+        Parameters, time, camera, ranges, settings and housekeeping; fields beyond the end of an old record are 0 or NaT.
+
+    Raises
+    ------
+    FlirFormatError
+        Where the record is truncated or has no byte-order mark.
+    """
     offset, length = place
     info = source.take(offset, length, "camera information")
     order = "<" if info[:2] == b"\x02\x00" else ">" if info[:2] == b"\x00\x02" else None
@@ -232,13 +333,9 @@ def read_header(source: FffSource, place: tuple[int, int]) -> FrameHeader:
     )
 
 
-#: Up to and including Planck R2 and the raw range; the oldest record seen has 1148 bytes.
-_MINIMUM_CAMERA_INFO = 0x314
-
-
 @lru_cache(maxsize=256)
 def _parameters(order: str, data: bytes) -> tuple[CameraParameters, tuple[str, ...]]:
-    """Return the parameters from their bytes; frames of one sequence share them, hence the cache."""
+    """Return the parameters and notes from their bytes; cached because the frames of a sequence share them."""
     *ambient, r1, b, f, alpha1, alpha2, beta1, beta2, x, o, r2 = struct.unpack(order + "16fif", data)
     notes: tuple[str, ...] = ()
     if ambient[7] > 2:
@@ -262,7 +359,7 @@ def _settings(order: str, data: bytes) -> CameraSettings:
 
 @lru_cache(maxsize=256)
 def _identity(order: str, data: bytes) -> CameraIdentity:
-    """Return who made the frame from bytes 0xD4..0x1B8 of the camera information."""
+    """Return camera and lens from bytes 0xD4 to 0x1B8 of the camera information."""
 
     def text(offset: int, width: int) -> str:
         return data[offset - 0xD4 : offset - 0xD4 + width].split(b"\0")[0].decode("latin-1").strip()
@@ -280,7 +377,7 @@ def _identity(order: str, data: bytes) -> CameraIdentity:
 
 
 def _time(order: str, info: bytes) -> tuple[np.datetime64, int]:
-    """Return UTC with milliseconds, and local time minus UTC in minutes; the file stores minutes west."""
+    """Return UTC with milliseconds, and local time minus UTC in minutes; the file stores minutes west of Greenwich."""
     if len(info) < 0x38E:
         return np.datetime64("NaT", "ms"), 0
     seconds, milliseconds, west = struct.unpack_from(order + "2Ih", info, 0x384)
@@ -289,18 +386,14 @@ def _time(order: str, info: bytes) -> tuple[np.datetime64, int]:
     return np.datetime64(seconds * 1000 + milliseconds % 1000, "ms"), -west
 
 
-#: Between these a number in the housekeeping table is a temperature of a camera.
-_LOWEST_K, _HIGHEST_K = 150.0, 450.0
-
-
 def _housekeeping(order: str, info: bytes) -> dict[str, float]:
-    """Return the camera's own temperatures, K; raw readings and times in the same table are not temperatures."""
+    """Return the temperatures inside the camera, K; the table also holds raw readings and times, which are left out."""
     readings: dict[str, float] = {}
-    for at in range(0x47C, len(info) - 27, 28):
-        name = info[at + 4 : at + 20].split(b"\0")[0]
+    for entry in range(0x47C, len(info) - 27, 28):
+        name = info[entry + 4 : entry + 20].split(b"\0")[0]
         if not name or not name.isascii():
             break
-        (value,) = struct.unpack_from(order + "f", info, at)
+        (value,) = struct.unpack_from(order + "f", info, entry)
         if _LOWEST_K < value < _HIGHEST_K and name != b"ITimeUs":
             readings[name.decode()] = value
     if not readings and len(info) >= 0x3A4:
@@ -309,15 +402,27 @@ def _housekeeping(order: str, info: bytes) -> dict[str, float]:
     return readings
 
 
-RAW_RECORD = 0x01
-RAW_HEADER_SIZE = 0x20
-#: The largest FLIR detectors have 3 million pixels; a file that claims more is damaged or hostile.
-MAX_PIXELS = 1 << 24
+def locate_samples(source: FffSource, directory: Directory) -> SampleLocation:
+    """Read the header of the raw image: place, packing and number of its samples.
 
+    Parameters
+    ----------
+    source : FffSource
+        Bytes of the record.
+    directory : Directory
+        Its directory, from `read_directory`.
 
-def read_sample_place(source: FffSource, directory: Directory) -> Samples:
-    """Read the raw record's header: where the samples are, how they are packed, how many there should be."""
-    offset, length = find_record(source, directory, RAW_RECORD, "a raw image")
+    Returns
+    -------
+    SampleLocation
+        Place, packing, byte order and shape of the samples.
+
+    Raises
+    ------
+    FlirFormatError
+        Where the raw image is missing, truncated, or claims an impossible number of pixels.
+    """
+    offset, length = _find_record(source, directory, RAW_RECORD, "a raw image")
     if length <= RAW_HEADER_SIZE:
         raise source.error(offset, "a raw image longer than its header", f"{length} bytes")
     head = source.read(offset, RAW_HEADER_SIZE + 8)
@@ -329,8 +434,8 @@ def read_sample_place(source: FffSource, directory: Directory) -> Samples:
     if order is None:
         raise source.error(offset, "the byte-order mark 2 of a raw image", head[:2].hex(" "))
     columns, rows = struct.unpack_from(order + "2H", head, 2)
-    if not 0 < rows * columns <= MAX_PIXELS:
-        raise source.error(offset + 2, f"1 to {MAX_PIXELS} pixels", f"{columns} x {rows}")
+    if not 0 < rows * columns <= _MAX_PIXELS:
+        raise source.error(offset + 2, f"1 to {_MAX_PIXELS} pixels", f"{columns} x {rows}")
     encoding: Encoding = "raw"
     if head[RAW_HEADER_SIZE:] == SIGNATURE:
         encoding = "png"
@@ -341,30 +446,43 @@ def read_sample_place(source: FffSource, directory: Directory) -> Samples:
         raise source.error(offset, f"{columns} x {rows} samples of 2 bytes", f"a record with {length} bytes of samples")
     if encoding == "raw":
         length = 2 * rows * columns
-    return Samples(encoding, offset + RAW_HEADER_SIZE, length, order == "<", (rows, columns))
+    return SampleLocation(encoding, offset + RAW_HEADER_SIZE, length, order == "<", (rows, columns))
 
 
-def read_counts(source: FffSource, samples: Samples) -> NDArray[np.uint16]:
-    """Read the pixels.
+def read_counts(source: FffSource, samples: SampleLocation) -> NDArray[np.uint16]:
+    """Read the samples of the raw image.
+
+    Parameters
+    ----------
+    source : FffSource
+        Bytes of the record.
+    samples : SampleLocation
+        Place and packing of the samples, from `locate_samples`.
 
     Returns
     -------
-    ndarray of uint16, shape (row, column)
-        Counts in native byte order; read-only, whatever the packing.
+    (row, column) ndarray of uint16
+        Counts in native byte order; read-only for every packing.
+
+    Raises
+    ------
+    FlirFormatError
+        Where the samples are truncated or their PNG or JPEG-LS stream is damaged.
     """
     counts = _decode(source, samples)
     counts.flags.writeable = False
     return counts
 
 
-def _decode(source: FffSource, samples: Samples) -> NDArray[np.uint16]:
+def _decode(source: FffSource, samples: SampleLocation) -> NDArray[np.uint16]:
+    """Return the samples in native byte order; the array may be read-only."""
     rows, columns = samples.shape
     if samples.encoding == "raw":
         data = source.take(samples.offset, samples.length, f"{columns} x {rows} samples")
         counts = np.frombuffer(data, "<u2" if samples.little_endian else ">u2").reshape(rows, columns)
         return counts if counts.dtype.isnative else counts.astype(np.uint16)
-    # Rounded up to 8 bytes by the writers; the padding after the last frame's stream may be missing.
-    data = source.read(samples.offset, min(samples.length, 2 * MAX_PIXELS))
+    # Writers pad the stream to a multiple of 8 bytes; after the last frame of a file the padding may be missing.
+    data = source.read(samples.offset, min(samples.length, 2 * _MAX_PIXELS))
     if samples.encoding == "jpegls":
         return _decode_jpegls(source, samples, data)
     try:
@@ -374,8 +492,8 @@ def _decode(source: FffSource, samples: Samples) -> NDArray[np.uint16]:
     return counts.byteswap() if samples.little_endian else counts
 
 
-def _decode_jpegls(source: FffSource, samples: Samples, data: bytes) -> NDArray[np.uint16]:
-    """Decode a JPEG-LS stream after comparing the size it claims with the record's, before the decoder allocates for it."""
+def _decode_jpegls(source: FffSource, samples: SampleLocation, data: bytes) -> NDArray[np.uint16]:
+    """Decode a JPEG-LS stream (ISO/IEC 14495-1); its size is compared with the record's before the decoder allocates memory."""
     claim = struct.unpack_from(">B2HB", data, 6) if len(data) >= 12 else None
     expected = (16, *samples.shape, 1)
     if claim is None or claim[1:] != expected[1:] or not 8 < claim[0] <= 16:

@@ -1,7 +1,7 @@
-"""Radiometric FLIR files as read: R-JPEG, SEQ, CSQ and FFF to frames of counts, and back.
+"""Reads radiometric FLIR files: radiometric JPEG, SEQ, CSQ and FFF to frames of counts.
 
-`read_frame` reads one frame, `index_frames` walks any number of files by their headers only, `write_jpeg` and `write_sequence`
-write files that other readers understand.
+`read_frame` reads the first frame of a file with its pixels; `index_frames` lists the frames of any number of files from their
+headers only, and each `FrameReference` reads its pixels on demand.
 """
 
 from __future__ import annotations
@@ -23,73 +23,46 @@ from thermography.io.fff_record import (
     FffSource,
     damaged_records,
     find_camera_info,
-    plausible_header,
+    is_fff_header,
+    locate_samples,
     read_counts,
     read_directory,
     read_header,
-    read_sample_place,
 )
-from thermography.io.flir_writer import write_jpeg, write_sequence
-from thermography.io.frame import (
-    CalibratedRange,
-    CameraIdentity,
-    CameraParameters,
-    CameraSettings,
-    FlirFormatError,
-    Frame,
-    FrameHeader,
-    Samples,
-    Segments,
-)
-
-__all__ = [
-    "CalibratedRange",
-    "CameraIdentity",
-    "CameraParameters",
-    "CameraSettings",
-    "FlirFormatError",
-    "Frame",
-    "FrameHeader",
-    "FrameReference",
-    "Rejected",
-    "Samples",
-    "index_frames",
-    "read_frame",
-    "write_jpeg",
-    "write_sequence",
-]
+from thermography.io.frame import FlirFormatError, Frame, FrameHeader, SampleLocation, Segments
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrameReference(FrameHeader):
-    """A frame in a file, without its pixels.
+    """A frame in a file: its header, and where its pixels are; further attributes are those of `FrameHeader`.
 
     Attributes
     ----------
     path : Path
+        Path of the file.
     index : int
-        Place of the frame in the file, from 0.
+        Index of the frame in the file, from 0.
     segments : tuple of (offset, length)
-        Where the pieces of the FFF record lie in the file, bytes.
-    camera_info_place : tuple of (offset, length)
-        Where the camera information lies in the record, bytes.
-    samples : Samples
-        Where the pixels lie in the record.
+        Segments of the FFF record in the file, bytes.
+    camera_info_place : (offset, length)
+        Place of the camera information in the record, bytes.
+    samples : SampleLocation
+        Place and packing of the pixels in the record.
     """
 
     path: Path
     index: int
     segments: Segments
     camera_info_place: tuple[int, int]
-    samples: Samples
+    samples: SampleLocation
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """Number of rows and columns."""
         return self.samples.shape
 
     def read(self) -> Frame:
-        """Read the frame with its pixels."""
+        """Read the frame with its pixels; raise FlirFormatError where they are damaged."""
         with self.path.open("rb", buffering=0) as file:
             return self._read_from(file)
 
@@ -101,20 +74,30 @@ class FrameReference(FrameHeader):
         return Frame(**header, counts=counts, source=str(self.path), index=self.index, camera_info=info)
 
     def damaged_records(self) -> list[int]:
-        """Compare the records with their checksums, which reading does not do for its cost; return the types that differ."""
+        """Return the types of the records that differ from their checksums, which reading does not compute because it is slow."""
         with self.path.open("rb", buffering=0) as file:
             source = FffSource(file, self.path, self.segments)
             return damaged_records(source, read_directory(source))
 
     def read_counts(self) -> NDArray[np.uint16]:
-        """Read the pixels only, shape (row, column)."""
+        """Read the pixels only, (row, column) uint16; raise FlirFormatError where they are damaged."""
         with self.path.open("rb", buffering=0) as file:
             return read_counts(FffSource(file, self.path, self.segments), self.samples)
 
 
 @dataclass(frozen=True)
-class Rejected:
-    """A frame or a file that was left out, and why; `index` is the frame's place in its file, from 0."""
+class RejectedFrame:
+    """A frame or a file that was not used.
+
+    Attributes
+    ----------
+    path : Path
+        Path of the file.
+    index : int
+        Index of the frame in its file, from 0; 0 where the whole file is rejected.
+    reason : str
+        Why it was rejected, with file and offset.
+    """
 
     path: Path
     index: int
@@ -122,65 +105,105 @@ class Rejected:
 
 
 def read_frame(path: str | os.PathLike[str]) -> Frame:
-    """Read the first frame of a radiometric JPEG, SEQ, CSQ or FFF file.
+    """Read the first frame of a radiometric FLIR file.
 
     Parameters
     ----------
-    path : path
+    path : str or path-like
+        Radiometric JPEG, SEQ, CSQ or FFF file; the content decides, not the suffix.
 
     Returns
     -------
     Frame
+        Counts (row, column) uint16, camera parameters, time (UTC) and everything else in the header.
 
     Raises
     ------
     FlirFormatError
         Where the file is not radiometric or its first frame is damaged.
+    OSError
+        Where the file cannot be opened.
+
+    See Also
+    --------
+    index_frames : All frames of many files, from their headers only.
+    thermography.radiometry.planck.calibrate : Counts to temperature.
+
+    Notes
+    -----
+    The format is not published; see `thermography.io.fff_record` for the sources of its layout.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from thermography.io.flir_writer import write_jpeg
+    >>> from thermography.io.frame import CameraParameters
+    >>> sc660 = CameraParameters(
+    ...     0.95, 1.0, 293.15, 293.15, 293.15, 1.0, 0.0, 0.5, 21106.77, 1501.0, 1.0, -7340.0, 0.012545258,
+    ...     0.006569, 0.01262, -0.002276, -0.00667, 1.9,
+    ... )
+    >>> with TemporaryDirectory() as folder:
+    ...     write_jpeg(Path(folder, "a.jpg"), np.full((48, 64), 18000, np.uint16), sc660, "2026-03-09T06:33:47")
+    ...     frame = read_frame(Path(folder, "a.jpg"))
+    >>> frame.counts.shape, str(frame.counts.dtype), frame.parameters.planck_b
+    ((48, 64), 'uint16', 1501.0)
     """
     path = Path(path)
     with path.open("rb", buffering=0) as file:
         first = next(_walk(file, path))
-        if isinstance(first, Rejected):
+        if isinstance(first, RejectedFrame):
             raise FlirFormatError(first.reason)
         return first._read_from(file)
 
 
-def index_frames(paths: Iterable[str | os.PathLike[str]]) -> tuple[list[FrameReference], list[Rejected]]:
-    """Find all frames of all files by reading their headers only.
+def index_frames(paths: Iterable[str | os.PathLike[str]]) -> tuple[list[FrameReference], list[RejectedFrame]]:
+    """List all frames of many radiometric FLIR files by reading their headers only.
 
     Parameters
     ----------
-    paths : paths of R-JPEG, SEQ, CSQ or FFF files
+    paths : iterable of str or path-like
+        Radiometric JPEG, SEQ, CSQ or FFF files, in any order.
 
     Returns
     -------
     frames : list of FrameReference
-        Sorted by time (frames without a time last), each time once.
-    rejected : list of Rejected
-        Everything that was left out: unreadable files, damaged or truncated frames, a second frame with the same time.
+        Sorted by time (UTC), frames without a time last; no time occurs twice.
+    rejected : list of RejectedFrame
+        Everything that is not in `frames`: unreadable files, damaged or truncated frames, a second frame with the same time.
+
+    Notes
+    -----
+    A file or frame that cannot be used is returned in `rejected`, never raised, so that one damaged file does not stop a series.
+    The frames of a sequence are found from the ends of their records, because the magic of a header also occurs among pixels.
+
+    Examples
+    --------
+    >>> frames, rejected = index_frames(["does_not_exist.seq"])
+    >>> frames, rejected[0].reason
+    ([], "[Errno 2] No such file or directory: 'does_not_exist.seq'")
     """
     frames: list[FrameReference] = []
-    rejected: list[Rejected] = []
+    rejected: list[RejectedFrame] = []
     for path in map(Path, paths):
         try:
             with path.open("rb", buffering=0) as file:
-                for found in _walk(file, path):
-                    (rejected if isinstance(found, Rejected) else frames).append(found)  # type: ignore[arg-type]
+                for result in _walk(file, path):
+                    (rejected if isinstance(result, RejectedFrame) else frames).append(result)  # type: ignore[arg-type]
         except (OSError, FlirFormatError) as error:
-            rejected.append(Rejected(path, 0, str(error)))
+            rejected.append(RejectedFrame(path, 0, str(error)))
     frames.sort(key=lambda frame: (np.isnat(frame.time), frame.time, str(frame.path), frame.index))
     kept: list[FrameReference] = []
     for frame in frames:
         if kept and frame.time == kept[-1].time:
             reason = f"{frame.path}: frame {frame.index} has the same time {frame.time} as frame {kept[-1].index} of {kept[-1].path}"
-            rejected.append(Rejected(frame.path, frame.index, reason))
+            rejected.append(RejectedFrame(frame.path, frame.index, reason))
         else:
             kept.append(frame)
     return kept, rejected
 
 
-def _walk(file: BinaryIO, path: Path) -> Iterator[FrameReference | Rejected]:
-    """Yield the frames of one file in their order; damaged ones as `Rejected`."""
+def _walk(file: BinaryIO, path: Path) -> Iterator[FrameReference | RejectedFrame]:
+    """Yield the frames of one file in file order; damaged ones as `RejectedFrame`."""
     start = file.read(4)
     if start[:2] == b"\xff\xd8":
         source = FffSource(file, path, _jpeg_segments(file, path))
@@ -188,20 +211,20 @@ def _walk(file: BinaryIO, path: Path) -> Iterator[FrameReference | Rejected]:
     elif start == MAGIC:
         yield from _walk_sequence(file, path)
     else:
-        found = start.hex(" ") or "an empty file"
-        raise FlirFormatError(f"{path}: at 0x0: expected a JPEG (FF D8) or an FFF record (46 46 46 00), found {found}")
+        actual = start.hex(" ") or "an empty file"
+        raise FlirFormatError(f"{path}: at 0x0: expected a JPEG (FF D8) or an FFF record (46 46 46 00), found {actual}")
 
 
 def _reference(source: FffSource, directory: Directory, index: int) -> FrameReference:
     """Read the headers of one FFF record."""
     place = find_camera_info(source, directory)
     header = read_header(source, place)
-    samples = read_sample_place(source, directory)
+    samples = locate_samples(source, directory)
     notes = header.notes
     missing = samples.offset + samples.length - source.size
     if missing > 0 and (samples.encoding == "raw" or missing >= 8):
         raise source.error(
-            samples.offset, f"{samples.length} bytes of samples", f"{missing} bytes fewer: the frame is cut short"
+            samples.offset, f"{samples.length} bytes of samples", f"{missing} bytes fewer: the frame is truncated"
         )
     if missing > 0:
         notes += (f"the last {missing} padding bytes of the samples are missing",)
@@ -215,8 +238,8 @@ def _reference(source: FffSource, directory: Directory, index: int) -> FrameRefe
     )
 
 
-def _walk_sequence(file: BinaryIO, path: Path) -> Iterator[FrameReference | Rejected]:
-    """Yield the frames of FFF records laid back to back, stepping over padding and damage."""
+def _walk_sequence(file: BinaryIO, path: Path) -> Iterator[FrameReference | RejectedFrame]:
+    """Yield the frames of consecutive FFF records; padding and damaged frames are skipped and reported."""
     size = file.seek(0, os.SEEK_END)
     start, index = 0, 0
     notes: tuple[str, ...] = ()
@@ -229,12 +252,12 @@ def _walk_sequence(file: BinaryIO, path: Path) -> Iterator[FrameReference | Reje
             reference = _reference(source, directory, index)
             yield replace(reference, notes=notes + reference.notes) if notes else reference
         except FlirFormatError as error:
-            yield Rejected(path, index, str(error))
+            yield RejectedFrame(path, index, str(error))
             end = following = _find_header(file, start + HEADER_SIZE, size)
-        notes = (f"{following - end} bytes of padding before the frame were stepped over",) if following > end else ()
+        notes = (f"{following - end} bytes of padding before the frame were skipped",) if following > end else ()
         if end < following == size and _holds_data(file, end):
             text = f"{path}: at 0x{end:X}: expected a frame or padding, found {size - end} bytes that are neither"
-            yield Rejected(path, index + 1, text)
+            yield RejectedFrame(path, index + 1, text)
         start, index = following, index + 1
 
 
@@ -244,10 +267,10 @@ def _holds_data(file: BinaryIO, offset: int) -> bool:
 
 
 def _next_frame(file: BinaryIO, start: int, size: int, directory: Directory) -> tuple[int, int]:
-    """Return where the frame that starts at `start` ends, and where the next one starts (offsets in the file).
+    """Return the end of the frame that starts at `start`, and the start of the next frame (offsets in the file).
 
     A frame ends after its last record, or at its declared length. Where no frame follows there, the next header decides: after
-    the end it means padding, before the end it means that this frame is cut short.
+    the end it means padding, before the end it means that this frame is truncated.
     """
     end = start + directory.end
     for candidate in (end, start + directory.declared_length):
@@ -259,7 +282,7 @@ def _next_frame(file: BinaryIO, start: int, size: int, directory: Directory) -> 
 
 def _header_at(file: BinaryIO, offset: int) -> bool:
     file.seek(offset)
-    return plausible_header(file.read(HEADER_SIZE))
+    return is_fff_header(file.read(HEADER_SIZE))
 
 
 def _find_header(file: BinaryIO, offset: int, size: int) -> int:
@@ -268,18 +291,18 @@ def _find_header(file: BinaryIO, offset: int, size: int) -> int:
     while offset < size:
         file.seek(offset)
         data = file.read(block)
-        at = data.find(MAGIC)
-        while at >= 0:
-            if _header_at(file, offset + at):
-                return offset + at
-            at = data.find(MAGIC, at + 1)
-        # The overlap finds a magic that lies across two blocks.
+        magic = data.find(MAGIC)
+        while magic >= 0:
+            if _header_at(file, offset + magic):
+                return offset + magic
+            magic = data.find(MAGIC, magic + 1)
+        # Blocks overlap by three bytes, so that a magic across the border of two blocks is found.
         offset += max(len(data) - len(MAGIC) + 1, 1)
     return size
 
 
 def _jpeg_segments(file: BinaryIO, path: Path) -> Segments:
-    r"""Return where the pieces of the FFF record lie in a radiometric JPEG, in their order.
+    r"""Return the segments of the FFF record in a radiometric JPEG, in their order.
 
     Each APP1 segment holds `FLIR\0 01 index last` and up to 65524 bytes; the segments may come in any order.
     """
@@ -297,7 +320,7 @@ def _jpeg_segments(file: BinaryIO, path: Path) -> Segments:
         (length,) = struct.unpack_from(">H", head, 2)
         if head[1] == 0xE1 and head[4:10] == b"FLIR\0\1" and length >= 10 and len(head) == 12:
             if head[10] in pieces:
-                raise FlirFormatError(f"{path}: at 0x{offset:X}: expected FLIR segment {head[10]} once, found it again")
+                raise FlirFormatError(f"{path}: at 0x{offset:X}: expected FLIR segment {head[10]} once, found it twice")
             pieces[head[10]] = (offset + 12, min(length - 10, size - offset - 12))
             last = head[11]
         offset += 2 + max(length, 2)

@@ -1,4 +1,4 @@
-"""Radiometric FLIR files as written: R-JPEG and SEQ that exiftool, flyr, flirpy and this package read back."""
+"""Writes radiometric FLIR files: radiometric JPEG, SEQ and CSQ that this package, ExifTool, flyr and flirpy read."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from thermography.io.fff_record import CAMERA_RECORD, ENTRY_SIZE, HEADER_SIZE, M
 from thermography.io.frame import CalibratedRange, CameraIdentity, CameraParameters, Encoding, Frame
 
 _CAMERA_INFO_SIZE = 2476
-#: Other readers expect 14 slots, and at least two more than are used.
+#: Slots of the directory: other readers expect 14, and at least two more than are used.
 _SLOTS = 14
 _SEGMENT_PAYLOAD = 65524
 _SUBTYPES: Mapping[Encoding, int] = {"raw": 2, "png": 3, "jpegls": 4}
-#: Other readers decide by this word of the Exif model whether a JPEG is theirs.
+#: Other readers recognise a FLIR JPEG by this word in the Exif model.
 _EXIF_MODEL = "FLIR"
 
 
@@ -38,32 +38,60 @@ def write_jpeg(
     utc_offset_minutes: int = 0,
     encoding: Encoding = "raw",
 ) -> None:
-    """Write a radiometric JPEG.
+    """Write one frame as a radiometric JPEG.
 
     Parameters
     ----------
-    path : path
-    counts : array of uint16, shape (row, column)
+    path : str or path-like
+        File to write; an existing file is replaced.
+    counts : (row, column) array of uint16
+        Signal of the detector, counts.
     parameters : CameraParameters
-    time : datetime64 or ISO string
-        UTC; milliseconds are kept.
+        Parameters of the measurement formula; stored as float32, `planck_o` as a whole number.
+    time : datetime64 or str
+        UTC, 1970 to 2106, as datetime64 or ISO 8601 text; stored to the millisecond. NaT stores none.
     camera : CameraIdentity, optional
+        Camera and lens; empty by default.
     limits : CalibratedRange, optional
+        Range in which the camera is calibrated; none by default.
     housekeeping : mapping of str to float, optional
-        Camera temperatures by name (up to 15 ASCII letters), K.
+        Temperatures inside the camera, 150 to 450 K, by sensor name (1 to 15 ASCII letters).
     utc_offset_minutes : int
-        Local time minus UTC.
+        Local time minus UTC, minutes.
     encoding : {"raw", "png", "jpegls"}
-        How the samples are packed.
+        Packing of the samples; all three are lossless.
 
     Raises
     ------
     ThermographyError
-        Where counts, time or housekeeping do not fit the format.
+        Where counts, time, housekeeping or encoding do not fit the format, or the frame is too large for a JPEG.
+
+    See Also
+    --------
+    write_sequence : Many frames in one file.
+
+    Notes
+    -----
+    The visible picture of the JPEG is a grey preview of the counts; the samples are in APP1 segments, as FLIR cameras store them.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from thermography.io.flir import read_frame
+    >>> sc660 = CameraParameters(
+    ...     0.95, 1.0, 293.15, 293.15, 293.15, 1.0, 0.0, 0.5, 21106.77, 1501.0, 1.0, -7340.0, 0.012545258,
+    ...     0.006569, 0.01262, -0.002276, -0.00667, 1.9,
+    ... )
+    >>> counts = np.full((48, 64), 18000, np.uint16)
+    >>> with TemporaryDirectory() as folder:
+    ...     write_jpeg(Path(folder, "a.jpg"), counts, sc660, "2026-03-09T06:33:47.125", encoding="png")
+    ...     frame = read_frame(Path(folder, "a.jpg"))
+    >>> str(frame.time), bool((frame.counts == counts).all())
+    ('2026-03-09T06:33:47.125', True)
     """
     frame = _frame(counts, parameters, time, camera, limits, housekeeping, utc_offset_minutes)
-    record = encode_record(frame, encoding=encoding)
-    pieces = [record[at : at + _SEGMENT_PAYLOAD] for at in range(0, len(record), _SEGMENT_PAYLOAD)]
+    record = _encode_record(frame, encoding=encoding)
+    pieces = [record[start : start + _SEGMENT_PAYLOAD] for start in range(0, len(record), _SEGMENT_PAYLOAD)]
     if len(pieces) > 256:
         raise ThermographyError(
             f"{path}: a frame of {len(record)} bytes does not fit the 256 segments of a JPEG; use write_sequence, or encoding='png'"
@@ -76,26 +104,51 @@ def write_jpeg(
 def write_sequence(
     path: str | os.PathLike[str], frames: Iterable[Frame], *, encoding: Encoding = "raw", padding: int = 0
 ) -> int:
-    """Write a SEQ file (a CSQ file with `encoding="jpegls"`), frame by frame.
+    """Write frames as one SEQ file, or as a CSQ file with `encoding="jpegls"`.
 
     Parameters
     ----------
-    path : path
+    path : str or path-like
+        File to write; an existing file is replaced.
     frames : iterable of Frame
-        Pixels and everything that is known about them; a generator is consumed one frame at a time.
+        Counts (row, column) uint16 with their headers; a generator is consumed one frame at a time.
     encoding : {"raw", "png", "jpegls"}
+        Packing of the samples; all three are lossless.
     padding : int
-        Zero bytes after each frame that no header declares, as some writers leave them.
+        Zero bytes after each frame that no header declares, as some cameras leave them.
 
     Returns
     -------
     int
         Number of frames written.
+
+    Raises
+    ------
+    ThermographyError
+        Where counts, time, housekeeping or encoding of a frame do not fit the format.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from thermography.io.flir import index_frames
+    >>> sc660 = CameraParameters(
+    ...     0.95, 1.0, 293.15, 293.15, 293.15, 1.0, 0.0, 0.5, 21106.77, 1501.0, 1.0, -7340.0, 0.012545258,
+    ...     0.006569, 0.01262, -0.002276, -0.00667, 1.9,
+    ... )
+    >>> counts = np.full((48, 64), 18000, np.uint16)
+    >>> start = np.datetime64("2026-03-09T06:33:47", "ms")
+    >>> recording = (Frame(counts=counts, parameters=sc660, time=start + 1000 * second) for second in range(3))
+    >>> with TemporaryDirectory() as folder:
+    ...     write_sequence(Path(folder, "a.seq"), recording)
+    ...     frames, rejected = index_frames([Path(folder, "a.seq")])
+    3
+    >>> [str(frame.time) for frame in frames], rejected
+    (['2026-03-09T06:33:47.000', '2026-03-09T06:33:48.000', '2026-03-09T06:33:49.000'], [])
     """
     count = 0
     with Path(path).open("wb") as file:
         for frame in frames:
-            file.write(encode_record(frame, encoding=encoding) + bytes(padding))
+            file.write(_encode_record(frame, encoding=encoding) + bytes(padding))
             count += 1
     return count
 
@@ -120,27 +173,29 @@ def _frame(
     )
 
 
-def encode_record(frame: Frame, *, encoding: Encoding = "raw") -> bytes:
-    """Return one FFF record: directory big-endian at 0x40, records little-endian, the raw image last."""
+def _encode_record(frame: Frame, *, encoding: Encoding = "raw") -> bytes:
+    """Return one FFF record: directory at 0x40 big-endian, records little-endian, the raw image last."""
     _check_counts(frame.counts)
     info = _camera_info(frame)
     raw = _raw_record(frame.counts, encoding)
-    at_info = HEADER_SIZE + _SLOTS * ENTRY_SIZE
-    at_raw = at_info + len(info)
-    head = bytearray(at_info)
-    total = at_raw + len(raw)
+    info_offset = HEADER_SIZE + _SLOTS * ENTRY_SIZE
+    raw_offset = info_offset + len(info)
+    head = bytearray(info_offset)
+    total = raw_offset + len(raw)
     struct.pack_into(">4s16s3I", head, 0, MAGIC, b"", 100, HEADER_SIZE, _SLOTS)
     struct.pack_into(">I", head, 0x20, 3)
     struct.pack_into(">I", head, 0x34, total)
-    entries = ((CAMERA_RECORD, 1, 1, at_info, info), (RAW_RECORD, _SUBTYPES[encoding], 2, at_raw, raw))
-    for slot, (kind, subtype, identifier, at, data) in enumerate(entries):
-        place = HEADER_SIZE + slot * ENTRY_SIZE
-        struct.pack_into(">2H7I", head, place, kind, subtype, 100, identifier, at, len(data), 0, 0, zlib.crc32(data))
+    entries = ((CAMERA_RECORD, 1, 1, info_offset, info), (RAW_RECORD, _SUBTYPES[encoding], 2, raw_offset, raw))
+    for slot, (kind, subtype, identifier, offset, data) in enumerate(entries):
+        entry = HEADER_SIZE + slot * ENTRY_SIZE
+        struct.pack_into(
+            ">2H7I", head, entry, kind, subtype, 100, identifier, offset, len(data), 0, 0, zlib.crc32(data)
+        )
     return bytes(head) + info + raw
 
 
 def _check_counts(counts: NDArray[np.uint16]) -> None:
-    """Refuse what is no picture of 16-bit counts."""
+    """Raise a ThermographyError unless the counts are a two-dimensional array of uint16."""
     if counts.ndim != 2 or counts.dtype.kind != "u" or counts.dtype.itemsize != 2:
         raise ThermographyError(
             f"counts: expected uint16 with dims (row, column), got {counts.dtype} of shape {counts.shape}"
@@ -150,7 +205,7 @@ def _check_counts(counts: NDArray[np.uint16]) -> None:
 
 
 def _camera_info(frame: Frame) -> bytes:
-    """Return the camera-info record; what the frame does not know stays 0."""
+    """Return the camera-information record; values that the frame does not hold are 0."""
     info = bytearray(_CAMERA_INFO_SIZE)
     rows, columns = frame.counts.shape
     p, limits, camera = frame.parameters, frame.limits, frame.camera
@@ -202,14 +257,14 @@ def _camera_info(frame: Frame) -> bytes:
         (0x190, 16, camera.lens_part),
         (0x1A0, 16, camera.lens_serial),
     )
-    for at, width, text in texts:
-        # One byte less than the field: readers expect the closing zero.
-        struct.pack_into(f"{width - 1}s", info, at, text.encode("latin-1", "replace"))
+    for offset, width, text in texts:
+        # One byte less than the field: readers expect the terminating zero.
+        struct.pack_into(f"{width - 1}s", info, offset, text.encode("latin-1", "replace"))
     struct.pack_into("<f", info, 0x1B4, camera.field_of_view_deg)
     struct.pack_into("<if2H", info, 0x308, round(p.planck_o), p.planck_r2, limits.raw_minimum, limits.raw_maximum)
     low, high = int(frame.counts.min()), int(frame.counts.max())
-    shown = (settings.raw_median, settings.raw_range) if settings.raw_range else ((low + high) // 2, high - low)
-    struct.pack_into("<2I", info, 0x338, *shown)
+    display = (settings.raw_median, settings.raw_range) if settings.raw_range else ((low + high) // 2, high - low)
+    struct.pack_into("<2I", info, 0x338, *display)
     struct.pack_into("<f4xH", info, 0x45C, settings.focus_distance_m, round(settings.frame_rate_Hz))
     _pack_time(info, frame)
     _pack_housekeeping(info, frame)
@@ -222,7 +277,7 @@ def _pack_time(info: bytearray, frame: Frame) -> None:
         return
     milliseconds = int(frame.time.astype("datetime64[ms]").astype(np.int64))
     if not 1000 <= milliseconds < 2**32 * 1000:
-        raise ThermographyError(f"time {frame.time}: a FLIR file holds times from 1970 to 2106 only")
+        raise ThermographyError(f"time {frame.time}: a FLIR file stores times from 1970 to 2106 only")
     struct.pack_into("<2Ih", info, 0x384, milliseconds // 1000, milliseconds % 1000, -frame.utc_offset_minutes)
 
 
@@ -231,7 +286,7 @@ def _pack_housekeeping(info: bytearray, frame: Frame) -> None:
     seconds, milliseconds = struct.unpack_from("<2I", info, 0x384)
     room = (_CAMERA_INFO_SIZE - 0x47C) // 28
     if len(frame.housekeeping) > room:
-        raise ThermographyError(f"housekeeping: a FLIR file holds {room} readings, not {len(frame.housekeeping)}")
+        raise ThermographyError(f"housekeeping: a FLIR file stores {room} readings, not {len(frame.housekeeping)}")
     for slot, (name, value) in enumerate(frame.housekeeping.items()):
         if not (name.isascii() and 0 < len(name) < 16 and 150 < value < 450):
             raise ThermographyError(
@@ -251,7 +306,7 @@ def _raw_record(counts: NDArray[np.uint16], encoding: Encoding) -> bytes:
     if encoding == "raw":
         samples = native.astype("<u2", copy=False).tobytes()
     elif encoding == "png":
-        # The cameras store the samples in the byte order of the record, which a PNG decoder then takes for big-endian.
+        # Cameras store the samples in the byte order of the record although PNG samples are big-endian, hence the swap.
         samples = cv2.imencode(".png", native.byteswap(), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
     elif encoding == "jpegls":
         samples = _without_spiff(bytes(imagecodecs.jpegls_encode(native)))
@@ -262,14 +317,15 @@ def _raw_record(counts: NDArray[np.uint16], encoding: Encoding) -> bytes:
 
 
 def _without_spiff(stream: bytes) -> bytes:
-    """Return a JPEG-LS stream that starts with its frame header, as the cameras write it, without the encoder's SPIFF segments."""
-    at = 2
-    while stream[at : at + 2] == b"\xff\xe8":
-        at += 2 + int.from_bytes(stream[at + 2 : at + 4], "big")
-    return stream[:2] + stream[at:]
+    """Return a JPEG-LS stream without the encoder's SPIFF segments; the cameras write the frame header first."""
+    offset = 2
+    while stream[offset : offset + 2] == b"\xff\xe8":
+        offset += 2 + int.from_bytes(stream[offset + 2 : offset + 4], "big")
+    return stream[:2] + stream[offset:]
 
 
 def _segment(payload: bytes) -> bytes:
+    """Return an APP1 segment."""
     return b"\xff\xe1" + struct.pack(">H", len(payload) + 2) + payload
 
 
@@ -280,19 +336,19 @@ def _exif(frame: Frame) -> bytes:
     if not np.isnat(frame.time):
         local = (frame.time + np.timedelta64(frame.utc_offset_minutes, "m")).astype("datetime64[s]")
         texts[0x0132] = str(local).replace("-", ":").replace("T", " ")
-    data_at = 8 + 2 + 12 * len(texts) + 4
+    data_offset = 8 + 2 + 12 * len(texts) + 4
     entries, data = b"", b""
     for tag, text in texts.items():
         value = text.encode("ascii", "replace") + b"\0"
-        # Values of up to four bytes stand in the entry itself.
-        place = value.ljust(4, b"\0") if len(value) <= 4 else struct.pack("<I", data_at + len(data))
+        # Values of up to four bytes are stored in the entry itself.
+        place = value.ljust(4, b"\0") if len(value) <= 4 else struct.pack("<I", data_offset + len(data))
         entries += struct.pack("<HHI", tag, 2, len(value)) + place
         data += value if len(value) > 4 else b""
     return b"Exif\0\0II*\0" + struct.pack("<IH", 8, len(texts)) + entries + bytes(4) + data
 
 
 def _preview(counts: NDArray[np.uint16]) -> bytes:
-    """Return an ordinary grey JPEG of the frame, stretched from its lowest to its highest count."""
+    """Return a grey JPEG of the frame, scaled from its lowest to its highest count."""
     low, high = int(counts.min()), int(counts.max())
     grey = ((counts.astype(np.float32) - low) * (255 / max(high - low, 1))).astype(np.uint8)
     encoded: bytes = cv2.imencode(".jpg", grey)[1].tobytes()

@@ -1,4 +1,4 @@
-"""What a FLIR frame is: parameters, camera, limits, header and counts; and the error of a file that is none."""
+"""The FLIR frame in memory: camera parameters, camera identity, calibrated range, header and counts."""
 
 from __future__ import annotations
 
@@ -15,15 +15,52 @@ Segments = tuple[tuple[int, int], ...]
 
 
 class FlirFormatError(ThermographyError):
-    """A FLIR file breaks a promise of its format; the message names file, offset, what was expected and what was found."""
+    """A FLIR file violates its format; the message names the file, the offset, what was expected and what was found."""
 
 
 @dataclass(frozen=True)
 class CameraParameters:
-    """What the vendor's formula needs, as the file stores it.
+    """Parameters of the measurement formula, in the units in which the file stores them.
 
-    Temperatures are kelvin, the distance is metres, humidity, emissivity and transmissions are fractions (0..1).
-    `stored_transmission` is the atmospheric transmission that a camera or program wrote; 0 means none.
+    Attributes
+    ----------
+    emissivity : float
+        Emissivity of the surface, above 0 and up to 1.
+    object_distance_m : float
+        Length of the air path from object to camera, m.
+    reflected_temperature_K : float
+        Reflected apparent temperature, K.
+    atmospheric_temperature_K : float
+        Temperature of the air path, K.
+    window_temperature_K, window_transmission : float
+        Temperature (K) and transmission (0 to 1) of an external infrared window; transmission 1 means that there is none.
+    stored_transmission : float
+        Atmospheric transmission (0 to 1) as written by the camera or another program; 0 means that none is stored.
+    relative_humidity : float
+        Relative humidity of the air path, 0 to 1.
+    planck_r1, planck_b, planck_f, planck_o, planck_r2 : float
+        Calibration constants of the camera in S(T) = R1 / (R2 (exp(B / T) - F)) - O: B in K, R1 / R2 and O in counts, F without unit.
+    atmosphere_alpha1, atmosphere_alpha2, atmosphere_beta1, atmosphere_beta2 : float
+        Attenuation constants of the two exponentials of the atmospheric transmission, m^-1/2 (beta per square root of the water
+        content, g/m3).
+    atmosphere_x : float
+        Weight of the first exponential.
+
+    Notes
+    -----
+    The formula is in `thermography.radiometry.planck` and in ``docs/method/radiometry.md``.
+
+    Examples
+    --------
+    A surface of emissivity 0.95 at a distance of 1 m, seen by an SC660 without a window:
+
+    >>> parameters = CameraParameters(
+    ...     emissivity=0.95, object_distance_m=1.0, reflected_temperature_K=293.15, atmospheric_temperature_K=293.15,
+    ...     window_temperature_K=293.15, window_transmission=1.0, stored_transmission=0.0, relative_humidity=0.5,
+    ...     planck_r1=21106.77, planck_b=1501.0, planck_f=1.0, planck_o=-7340.0, planck_r2=0.012545258,
+    ...     atmosphere_alpha1=0.006569, atmosphere_alpha2=0.01262,
+    ...     atmosphere_beta1=-0.002276, atmosphere_beta2=-0.00667, atmosphere_x=1.9,
+    ... )
     """
 
     emissivity: float
@@ -48,7 +85,17 @@ class CameraParameters:
 
 @dataclass(frozen=True)
 class CameraIdentity:
-    """Which camera and lens made a frame."""
+    """Camera and lens that recorded a frame; empty where the file does not name them.
+
+    Attributes
+    ----------
+    model, part, serial, software : str
+        Model name, part number, serial number and firmware version of the camera.
+    lens_model, lens_part, lens_serial : str
+        Name, part number and serial number of the lens.
+    field_of_view_deg : float
+        Horizontal field of view of the lens, degrees; 0 where it is not stored.
+    """
 
     model: str = ""
     part: str = ""
@@ -62,7 +109,15 @@ class CameraIdentity:
 
 @dataclass(frozen=True)
 class CalibratedRange:
-    """The temperatures (K) and counts between which the camera is calibrated; counts 0 and 65535 where it does not say."""
+    """Range in which the camera is calibrated.
+
+    Attributes
+    ----------
+    minimum_K, maximum_K : float
+        Limits in temperature, K; both 0 where the file does not store them.
+    raw_minimum, raw_maximum : int
+        Limits in counts; 0 and 65535 where the file does not store them.
+    """
 
     minimum_K: float = 0.0
     maximum_K: float = 0.0
@@ -72,9 +127,18 @@ class CalibratedRange:
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """How the camera was set: focus, frame rate, the temperatures (K) and counts between which it showed its picture.
+    """Settings of the camera at the time of the frame; 0 where the file does not store them.
 
-    0 where the file does not say.
+    Attributes
+    ----------
+    focus_distance_m : float
+        Distance to which the lens is focused, m.
+    frame_rate_Hz : float
+        Frame rate, Hz.
+    clip_maximum_K, clip_minimum_K, warn_maximum_K, warn_minimum_K, saturated_maximum_K, saturated_minimum_K : float
+        Temperatures (K) at which the display of the camera clips, warns and shows saturation.
+    raw_median, raw_range : int
+        Centre and width of the displayed range, counts.
     """
 
     focus_distance_m: float = 0.0
@@ -90,8 +154,20 @@ class CameraSettings:
 
 
 @dataclass(frozen=True)
-class Samples:
-    """Where the pixels of one record are: `offset` and `length` in bytes from the start of the FFF record."""
+class SampleLocation:
+    """Location and packing of the pixels in one FFF record.
+
+    Attributes
+    ----------
+    encoding : {"raw", "png", "jpegls"}
+        Packing of the pixels: plain 16-bit samples, 16-bit grey PNG, or JPEG-LS.
+    offset, length : int
+        First byte, counted from the start of the FFF record, and number of bytes.
+    little_endian : bool
+        Byte order of the samples.
+    shape : tuple of int
+        (rows, columns).
+    """
 
     encoding: Encoding
     offset: int
@@ -102,23 +178,27 @@ class Samples:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameHeader:
-    """Everything about a frame but its pixels.
+    """A frame without its pixels.
 
     Attributes
     ----------
     parameters : CameraParameters
+        Parameters of the measurement formula as stored.
     time : datetime64[ms]
         UTC; NaT where the file stores none.
     utc_offset_minutes : int
         Local time minus UTC as set in the camera, minutes.
     camera : CameraIdentity
+        Camera and lens.
     limits : CalibratedRange
+        Range in which the camera is calibrated.
     settings : CameraSettings
+        Focus, frame rate and display settings.
     housekeeping : dict of str to float
-        The camera's own temperatures by name, K (lens, shutter, aperture, capsule, detector); "sensor 1" to "sensor 4" in files
-        that do not name them.
+        Temperatures measured inside the camera by sensor name, K (lens, shutter, aperture, capsule, detector); "sensor 1" to
+        "sensor 4" in files that do not name them.
     notes : tuple of str
-        What the reader had to mend or assume.
+        Corrections and assumptions that the reader made.
     """
 
     parameters: CameraParameters
@@ -133,17 +213,18 @@ class FrameHeader:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Frame(FrameHeader):
-    """One frame with its pixels.
+    """A frame with its pixels; two frames are equal if their headers are.
 
     Attributes
     ----------
-    counts : ndarray of uint16, shape (row, column)
+    counts : (row, column) ndarray of uint16
+        Signal of the detector, counts.
     source : str
         Path of the file.
     index : int
-        Place of the frame in the file, from 0.
+        Index of the frame in the file, from 0.
     camera_info : bytes
-        The camera-info record as it stands in the file.
+        The camera-information record as stored in the file.
     """
 
     counts: NDArray[np.uint16]

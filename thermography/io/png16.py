@@ -1,6 +1,6 @@
-"""The 16-bit grey PNG in which FLIR cameras pack samples, decoded twice as fast as by libpng.
+"""Decodes the 16-bit grey PNG in which FLIR cameras pack samples, twice as fast as libpng.
 
-Source of the format: ISO/IEC 15948 (PNG), filter method 0, zlib by libdeflate.
+The format is ISO/IEC 15948 (PNG) with filter method 0; the zlib stream is inflated by libdeflate.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _BYTES_PER_PIXEL = 2
 
 
 class PngError(ThermographyError):
-    """A PNG that is damaged or not the promised one; the arguments are what was expected and what was found."""
+    """A PNG is damaged or of another kind than expected; the two arguments are what was expected and what was found."""
 
 
 def decode_png(data: bytes, shape: tuple[int, int]) -> NDArray[np.uint16]:
@@ -30,19 +30,23 @@ def decode_png(data: bytes, shape: tuple[int, int]) -> NDArray[np.uint16]:
     Parameters
     ----------
     data : bytes
-        From the signature on; bytes after the end of the picture are ignored.
+        The PNG from its signature on; bytes after its IEND chunk are ignored.
     shape : tuple of int
-        Rows and columns that the picture must have, so that it cannot cost more memory than promised.
+        (rows, columns) that the image must have; a file that claims another size is refused before memory is allocated.
 
     Returns
     -------
-    ndarray of uint16, shape (row, column)
-        As a PNG means them: big-endian samples, in native byte order.
+    (row, column) ndarray of uint16
+        Samples, interpreted as big-endian as the standard requires, in native byte order.
 
     Raises
     ------
     PngError
-        Where the PNG is damaged or another one than promised.
+        Where the PNG is damaged, or not a 16-bit grey image of this shape without interlacing.
+
+    References
+    ----------
+    ISO/IEC 15948:2004, clause 9 (filtering) and clause 11 (chunks).
     """
     rows, columns = shape
     packed = b"".join(_image_data(data, shape))
@@ -62,33 +66,33 @@ def decode_png(data: bytes, shape: tuple[int, int]) -> NDArray[np.uint16]:
 
 def _image_data(data: bytes, shape: tuple[int, int]) -> list[bytes]:
     """Return the contents of the IDAT chunks after checking every chunk's length and CRC."""
-    pieces, at = [], len(SIGNATURE)
+    pieces, start = [], len(SIGNATURE)
     if not data.startswith(SIGNATURE):
         raise PngError("the signature of a PNG", data[:8].hex(" "))
     while True:
-        if at + 12 > len(data):
+        if start + 12 > len(data):
             raise PngError("a PNG that ends with IEND", f"{len(data)} bytes without it")
-        length, kind = struct.unpack_from(">I4s", data, at)
-        end = at + 12 + length
+        length, kind = struct.unpack_from(">I4s", data, start)
+        end = start + 12 + length
         if end > len(data):
-            raise PngError(f"{length} bytes in PNG chunk {kind!r}", f"{max(len(data) - at - 12, 0)} before the end")
-        if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+            raise PngError(f"{length} bytes in PNG chunk {kind!r}", f"{max(len(data) - start - 12, 0)} before the end")
+        if zlib.crc32(data[start + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
             raise PngError(f"PNG chunk {kind!r} with its CRC", "another one: the samples are damaged")
-        if at == len(SIGNATURE):
-            found = struct.unpack_from(">2I5B", data, at + 8) if kind == b"IHDR" and length == 13 else None
-            if found != (shape[1], shape[0], *_GREY_16_BIT):
-                expected = (shape[1], shape[0], *_GREY_16_BIT)
-                raise PngError(f"a PNG header (width, height, bits, grey, ...) {expected}", str(found))
+        if start == len(SIGNATURE):
+            header = struct.unpack_from(">2I5B", data, start + 8) if kind == b"IHDR" and length == 13 else None
+            expected = (shape[1], shape[0], *_GREY_16_BIT)
+            if header != expected:
+                raise PngError(f"a PNG header (width, height, bits, grey, ...) {expected}", str(header))
         elif kind == b"IDAT":
-            pieces.append(data[at + 8 : end - 4])
+            pieces.append(data[start + 8 : end - 4])
         elif kind == b"IEND":
             return pieces
-        at = end
+        start = end
 
 
 @njit(cache=True, nogil=True)
 def _undo_filters(lines: NDArray[np.uint8]) -> bool:  # pragma: no cover - compiled
-    """Undo the filters in place; lines are (1 + row, filter + bytes) below a line of zeros; False where a filter is unknown."""
+    """Undo the filters in place; lines are (1 + row, filter type + bytes) below a line of zeros; return False for an unknown filter."""
     for row in range(1, len(lines)):
         line, above = lines[row], lines[row - 1]
         kind = line[0]

@@ -1,4 +1,4 @@
-"""A window of many frames, read where it lies in its file: from memory if it is there, else past the cache from the disk."""
+"""Reads a window of the sensor from many frames: from the page cache of the system if the file is there, else directly from disk."""
 
 from __future__ import annotations
 
@@ -16,21 +16,23 @@ from numpy.typing import NDArray
 
 from thermography.io.flir import FrameReference
 
-#: What a disk that is read directly wants offsets, lengths and memory to be multiples of, bytes.
+#: Offsets, lengths and buffers of direct disk reads must be multiples of this, bytes.
 _PAGE = mmap.PAGESIZE
+#: Bit of the result of mincore(2) that is set for a page in memory.
 _IN_MEMORY = 1
 
 
 class WindowReader:
-    """Reads a window of the sensor from many frames; raw samples row by row where they lie, packed ones as whole frames.
+    """Context manager that reads a window of the sensor from many frames.
 
-    A file that the system keeps in memory is copied from there. One that it does not keep is read directly from the disk, which is
-    faster than through the cache by a half and leaves the cache to others; where the system cannot do that, through the cache.
+    Of plain samples only the rows of the window are read; packed samples are decoded as whole frames. A file in the page cache of the
+    system is copied from there. Any other file is read directly from disk (O_DIRECT), which is half as fast again as through the cache
+    and does not evict the data of other programs; where the system has no direct reads, the cache is used.
 
     Parameters
     ----------
-    window
-        Rows and columns.
+    window : tuple of slice
+        Rows and columns of the sensor, both with start and stop.
     """
 
     def __init__(self, window: tuple[slice, slice]) -> None:
@@ -47,38 +49,52 @@ class WindowReader:
             self._file.close()
 
     def read(self, frames: Sequence[FrameReference], counts: NDArray[np.uint16]) -> NDArray[np.uint16]:
-        """Fill `counts`, (frames or more, row, column) uint16, with the window of every frame; return the part that was filled.
+        """Read the window of every frame into a buffer.
+
+        Parameters
+        ----------
+        frames : sequence of FrameReference
+            n frames; consecutive frames of one file cost one open file.
+        counts : (n or more, row, column) ndarray of uint16
+            Buffer of the shape of the window; its first n elements are overwritten.
+
+        Returns
+        -------
+        (n, row, column) ndarray of uint16
+            The part of `counts` that was filled, in native byte order.
 
         Raises
         ------
         OSError
-            A file has become shorter since it was indexed.
+            Where a file has become shorter since it was indexed.
+        FlirFormatError
+            Where packed samples are damaged.
         """
         rows, columns = self.window
         counts = counts[: len(frames)]
         checked = None
-        for own, frame in zip(counts, frames, strict=True):
+        for target, frame in zip(counts, frames, strict=True):
             samples = frame.samples
             if samples.encoding != "raw" or len(frame.segments) != 1:
-                own[...] = frame.read().counts[self.window]
+                target[...] = frame.read().counts[self.window]
                 continue
             width = samples.shape[1]
             place = frame.segments[0][0] + samples.offset + rows.start * width * 2
-            whole = width == own.shape[1]
-            wanted = own.reshape(-1) if whole else np.empty(own.shape[0] * width, np.uint16)
+            whole = width == target.shape[1]
+            rows_read = target.reshape(-1) if whole else np.empty(target.shape[0] * width, np.uint16)
             file = self._open(frame.path)
             if file is not checked:
-                # Once for the few frames of a call: what lies together is kept or forgotten together.
-                file.check(place, wanted.nbytes)
+                # Once per call: the few frames of a call are neighbours in the file and are cached or evicted together.
+                file.check(place, rows_read.nbytes)
                 checked = file
-            if file.read(place, wanted.view(np.uint8)) < wanted.nbytes:
+            if file.read(place, rows_read.view(np.uint8)) < rows_read.nbytes:
                 raise OSError(
                     f"{frame.path}: frame {frame.index} ends early; the file has become shorter since it was indexed"
                 )
             if samples.little_endian != (sys.byteorder == "little"):
-                wanted.byteswap(inplace=True)
+                rows_read.byteswap(inplace=True)
             if not whole:
-                own[...] = wanted.reshape(-1, width)[:, columns]
+                target[...] = rows_read.reshape(-1, width)[:, columns]
         return counts
 
     def _open(self, path: Path) -> _File:
@@ -90,31 +106,31 @@ class WindowReader:
 
 
 class _File:
-    """One open file: through the cache, or past it."""
+    """An open file that is read through the page cache or directly."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.cached: BinaryIO = path.open("rb", buffering=0)
         self.direct: BinaryIO | None = None
         self.buffer = mmap.mmap(-1, _PAGE)
-        # Never read through: it only tells what is in memory. A file of nothing cannot be mapped.
+        # Never accessed: the mapping only serves to ask which pages are in memory. An empty file cannot be mapped.
         size = os.fstat(self.cached.fileno()).st_size
         self.pages = mmap.mmap(self.cached.fileno(), 0, access=mmap.ACCESS_READ) if size else None
         self.in_memory = True
 
     def check(self, place: int, length: int) -> None:
-        """Find out whether the system keeps these bytes, and open the file directly if it does not."""
+        """Determine whether these bytes are in the page cache, and open the file for direct reads if they are not."""
         self.in_memory = self.pages is None or _resident(self.pages, place, length)
         if self.in_memory or self.direct is not None or not hasattr(os, "O_DIRECT"):
             return
         try:
             self.direct = os.fdopen(os.open(self.path, os.O_RDONLY | os.O_DIRECT), "rb", buffering=0)
         except OSError:
-            # Some file systems have no direct reading; `read` goes through the cache then.
+            # Some file systems have no direct reads; `read` uses the cache then.
             self.direct = None
 
     def read(self, place: int, target: NDArray[np.uint8]) -> int:
-        """Read bytes from `place` into `target`; return how many there were."""
+        """Read bytes from `place` on into `target`; return their number, which is smaller at the end of the file."""
         if self.in_memory or self.direct is None:
             self.cached.seek(place)
             return self.cached.readinto(target)  # type: ignore[attr-defined]
@@ -125,27 +141,27 @@ class _File:
             self.buffer = mmap.mmap(-1, length)
         self.direct.seek(first)
         with memoryview(self.buffer) as pages:
-            got = self.direct.readinto(pages[:length])  # type: ignore[attr-defined]
-            found = max(min(got - (place - first), target.size), 0)
-            target[:found] = np.frombuffer(pages, np.uint8, found, place - first)
-        return int(found)
+            read = self.direct.readinto(pages[:length])  # type: ignore[attr-defined]
+            available = max(min(read - (place - first), target.size), 0)
+            target[:available] = np.frombuffer(pages, np.uint8, available, place - first)
+        return int(available)
 
     def close(self) -> None:
-        """Give everything back."""
-        for one in (self.cached, self.direct, self.buffer, self.pages):
-            if one is not None:
-                one.close()
+        """Close the file and release its buffers."""
+        for resource in (self.cached, self.direct, self.buffer, self.pages):
+            if resource is not None:
+                resource.close()
 
 
 def _resident(pages: mmap.mmap, place: int, length: int) -> bool:
-    """Whether the system keeps all of these bytes of a mapped file in memory; also where it does not say."""
+    """Return whether all of these bytes of a mapped file are in memory; True where the system cannot tell."""
     try:
-        ask = ctypes.CDLL(None).mincore
+        mincore = ctypes.CDLL(None).mincore
     except (AttributeError, OSError, TypeError):
         return True
     first = place // _PAGE
     count = -(-(place + length) // _PAGE) - first
     state = (ctypes.c_ubyte * count)()
     address = np.frombuffer(pages, np.uint8).ctypes.data + first * _PAGE
-    refused = ask(ctypes.c_void_p(address), ctypes.c_size_t(count * _PAGE), state)
-    return bool(refused) or all(one & _IN_MEMORY for one in state)
+    failed = mincore(ctypes.c_void_p(address), ctypes.c_size_t(count * _PAGE), state)
+    return bool(failed) or all(page & _IN_MEMORY for page in state)

@@ -1,4 +1,7 @@
-"""FLIR files as an xarray backend: ``xarray.open_dataset(path_or_list, engine="flir")``, lazy and one frame at a time."""
+"""Opens FLIR files with xarray: ``xarray.open_dataset(path_or_list, engine="flir")``, lazily and one frame at a time.
+
+Counts become temperature with `thermography.radiometry.planck.calibrate`; the variables of the Dataset hold its parameters.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +18,11 @@ import xarray as xr
 from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
-from thermography.io.flir import FrameReference, Rejected, index_frames
-from thermography.io.frame import CameraParameters, FlirFormatError
+from thermography.io.flir import FrameReference, RejectedFrame, index_frames
+from thermography.io.frame import FlirFormatError
 
 #: Camera parameter -> (name in a Dataset, units, units_metadata).
-PARAMETERS: dict[str, tuple[str, str, str]] = {
+_PARAMETERS: dict[str, tuple[str, str, str]] = {
     "emissivity": ("emissivity", "1", ""),
     "object_distance_m": ("object_distance", "m", ""),
     "reflected_temperature_K": ("reflected_temperature", "K", "temperature: on_scale"),
@@ -42,20 +45,45 @@ PARAMETERS: dict[str, tuple[str, str, str]] = {
 
 
 class FlirBackendEntrypoint(BackendEntrypoint):
-    """Opens radiometric JPEG, SEQ, CSQ and FFF files."""
+    """Entry point of xarray for radiometric JPEG, SEQ, CSQ and FFF files."""
 
     description = "FLIR radiometric JPEG, SEQ, CSQ and FFF files"
     open_dataset_parameters = ("filename_or_obj", "drop_variables")
 
     def open_dataset(self, filename_or_obj: Any, *, drop_variables: str | Iterable[str] | None = None) -> xr.Dataset:
-        """Open one file or a list of files; see `open_frames`."""
+        """List the frames of radiometric FLIR files and present them as one lazy Dataset.
+
+        Parameters
+        ----------
+        filename_or_obj : str, path-like, or list of them
+            Radiometric JPEG, SEQ, CSQ or FFF files of one camera.
+        drop_variables : str or iterable of str, optional
+            Variables to leave out.
+
+        Returns
+        -------
+        Dataset
+            ``counts`` (time, row, column) uint16, read on access; one variable per camera parameter, along ``time`` where it varies;
+            ``camera_temperature`` (time, sensor), K; coordinate ``time``, UTC. The attribute ``rejected`` lists as JSON the files and
+            frames that could not be used.
+
+        Raises
+        ------
+        FlirFormatError
+            Where no frame can be read, or the frames differ in size.
+
+        Warns
+        -----
+        UserWarning
+            Where files or frames could not be used.
+        """
         several = isinstance(filename_or_obj, (list, tuple))
-        dataset = open_frames(filename_or_obj if several else [filename_or_obj])
+        dataset = _open_frames(filename_or_obj if several else [filename_or_obj])
         dropped = [drop_variables] if isinstance(drop_variables, str) else list(drop_variables or ())
         return dataset.drop_vars(dropped, errors="ignore")
 
     def guess_can_open(self, filename_or_obj: Any) -> bool:
-        """Whether a path starts like an FFF record; a JPEG may be anything, so its engine must be named."""
+        """Return whether a file starts as an FFF record; not every JPEG is radiometric, so for these the engine must be named."""
         if not isinstance(filename_or_obj, (str, os.PathLike)):
             return False
         try:
@@ -65,29 +93,8 @@ class FlirBackendEntrypoint(BackendEntrypoint):
             return False
 
 
-def open_frames(paths: Iterable[str | os.PathLike[str]]) -> xr.Dataset:
-    """Index FLIR files and present their frames as one lazy Dataset.
-
-    Parameters
-    ----------
-    paths : paths of R-JPEG, SEQ, CSQ or FFF files of one camera
-
-    Returns
-    -------
-    Dataset
-        `counts` (time, row, column) uint16, read on access; one variable per camera parameter, along `time` where it varies;
-        `camera_temperature` (time, sensor) K; `time` UTC. The attribute `rejected` lists as JSON what was left out.
-
-    Raises
-    ------
-    FlirFormatError
-        Where no frame can be read, or frames differ in size.
-
-    Warns
-    -----
-    UserWarning
-        Where frames were left out.
-    """
+def _open_frames(paths: Iterable[str | os.PathLike[str]]) -> xr.Dataset:
+    """Return the frames of all files as one lazy Dataset."""
     frames, rejected = index_frames(paths)
     if not frames:
         reason = rejected[0].reason if rejected else "no files were given"
@@ -96,10 +103,11 @@ def open_frames(paths: Iterable[str | os.PathLike[str]]) -> xr.Dataset:
         if frame.shape != frames[0].shape:
             raise FlirFormatError(
                 f"{frame.path}: frame {frame.index} has (rows, columns) {frame.shape}, {frames[0].path} has "
-                f"{frames[0].shape}; open files of different cameras apart"
+                f"{frames[0].shape}; open the files of each camera separately"
             )
     if rejected:
-        warnings.warn(f"{len(rejected)} frames left out, the first: {rejected[0].reason}", UserWarning, stacklevel=2)
+        text = f"{len(rejected)} files or frames could not be used, the first: {rejected[0].reason}"
+        warnings.warn(text, UserWarning, stacklevel=3)
     counts = xr.Variable(
         ("time", "row", "column"),
         indexing.LazilyIndexedArray(_FrameStack(frames)),
@@ -114,17 +122,8 @@ def open_frames(paths: Iterable[str | os.PathLike[str]]) -> xr.Dataset:
     return dataset
 
 
-def parameters_at(dataset: xr.Dataset, index: int) -> CameraParameters:
-    """Return the camera parameters of one frame of such a Dataset."""
-    values = {}
-    for field, (name, _, _) in PARAMETERS.items():
-        variable = dataset[name]
-        values[field] = float(variable[index] if "time" in variable.dims else variable)
-    return CameraParameters(**values)
-
-
 class _FrameStack(BackendArray):
-    """Frames as one array (time, row, column); holds paths and offsets only, so it pickles and costs no open file."""
+    """Frames as one array (time, row, column); it holds only paths and offsets, so it can be pickled and keeps no file open."""
 
     def __init__(self, frames: list[FrameReference]) -> None:
         self.frames = frames
@@ -147,8 +146,9 @@ class _FrameStack(BackendArray):
 
 
 def _parameter_variables(frames: list[FrameReference]) -> dict[str, xr.Variable]:
+    """Return one variable per camera parameter: a scalar, or along time where it varies."""
     variables = {}
-    for field, (name, units, metadata) in PARAMETERS.items():
+    for field, (name, units, metadata) in _PARAMETERS.items():
         values = np.array([getattr(frame.parameters, field) for frame in frames])
         attrs = {"units": units, **({"units_metadata": metadata} if metadata else {})}
         constant = (values == values[0]).all()
@@ -157,7 +157,7 @@ def _parameter_variables(frames: list[FrameReference]) -> dict[str, xr.Variable]
 
 
 def _camera_temperatures(frames: list[FrameReference]) -> xr.Variable:
-    """Return the camera's own temperatures (time, sensor), NaN where a frame does not state one."""
+    """Return the temperatures inside the camera (time, sensor), K; NaN where a frame does not store one."""
     names = _sensors(frames)
     values = np.array([[frame.housekeeping.get(name, np.nan) for name in names] for frame in frames])
     attrs = {
@@ -181,19 +181,19 @@ def _coordinates(frames: list[FrameReference]) -> dict[str, Any]:
         "column": ("column", np.arange(columns), {"long_name": "sensor column", "units": "1"}),
         "sensor": ("sensor", np.array(_sensors(frames), dtype=object)),
         "source": ("time", np.array([str(frame.path) for frame in frames], dtype=object)),
-        "frame": ("time", np.array([frame.index for frame in frames]), {"long_name": "place in the file, from 0"}),
+        "frame": ("time", np.array([frame.index for frame in frames]), {"long_name": "index in the file, from 0"}),
     }
 
 
-def _attributes(frames: list[FrameReference], rejected: list[Rejected]) -> dict[str, str]:
+def _attributes(frames: list[FrameReference], rejected: list[RejectedFrame]) -> dict[str, str]:
     notes = list(
         dict.fromkeys(f"{frame.path}: frame {frame.index}: {note}" for frame in frames for note in frame.notes)
     )
-    left_out = [{"path": str(each.path), "index": each.index, "reason": each.reason} for each in rejected]
+    unused = [{"path": str(each.path), "index": each.index, "reason": each.reason} for each in rejected]
     return {
         "Conventions": "CF-1.11",
         "camera": json.dumps(asdict(frames[0].camera)),
         "calibrated_range": json.dumps(asdict(frames[0].limits)),
         "notes": json.dumps(notes),
-        "rejected": json.dumps(left_out),
+        "rejected": json.dumps(unused),
     }

@@ -1,4 +1,4 @@
-"""Stacks of fields over time as zarr: written piece by piece, read in any direction without loading the whole."""
+"""Stores stacks of fields over time as zarr, readable frame by frame or cell by cell without loading the whole stack."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from zarr.codecs import BloscCodec
 
 from thermography.errors import ThermographyError
 
-#: Fields per chunk: one field costs one chunk, and the series of one cell reads time / 64 of them.
-CHUNK_TIMES = 64
+#: Fields per chunk: one field costs one chunk, the series of one cell one chunk per 64 fields.
+_CHUNK_TIMES = 64
 
 
 class StackError(ThermographyError):
-    """A stack cannot be written or read; the message names the folder and what to do."""
+    """A stack cannot be written or read; the message names the folder and the remedy."""
 
 
 def write_stack(path: str | Path, stack: xr.DataArray) -> None:
-    """Write a stack (time, y, x) as a zarr folder that appears whole or not at all.
+    """Write a stack of fields as a zarr folder.
 
     Parameters
     ----------
-    path
-        Folder to write; it must not exist.
-    stack
-        For example `frame_temperature`; its name, coordinates and attributes are kept.
+    path : str or Path
+        Folder to write; it must not exist, and it is written as a whole or not at all.
+    stack : (time, y, x) DataArray
+        For example ``frame_temperature``, degC; name, coordinates and attributes are stored with it.
 
     Raises
     ------
     StackError
-        The folder exists, or the array is not a stack over time.
+        Where the folder exists, or the dims are not (time, y, x).
     """
     path = Path(path)
     if stack.dims != ("time", "y", "x"):
         raise StackError(f"{path}: the array has dims {stack.dims}; a stack is (time, y, x)")
     if path.exists():
-        raise StackError(f"{path}: exists already; choose another name or remove it")
+        raise StackError(f"{path}: already exists; choose another name or remove it")
     name = str(stack.name or "temperature")
-    chunks = (min(CHUNK_TIMES, stack.sizes["time"]), stack.sizes["y"], stack.sizes["x"])
+    chunks = (min(_CHUNK_TIMES, stack.sizes["time"]), stack.sizes["y"], stack.sizes["x"])
     encoding = {name: {"chunks": chunks, "compressors": (BloscCodec(cname="zstd", clevel=1, shuffle="bitshuffle"),)}}
     temporary = path.with_name(f".{path.name}.part")
     shutil.rmtree(temporary, ignore_errors=True)
@@ -52,12 +52,22 @@ def write_stack(path: str | Path, stack: xr.DataArray) -> None:
 
 
 def open_stack(path: str | Path) -> xr.DataArray:
-    """Open a stack written by `write_stack`; its values are read when they are used.
+    """Open a stack that `write_stack` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        The zarr folder.
+
+    Returns
+    -------
+    (time, y, x) DataArray
+        The stack with its coordinates and attributes; values are read on access.
 
     Raises
     ------
     StackError
-        The folder is no such stack.
+        Where the folder is not a zarr store or does not hold exactly one stack over time.
     """
     path = Path(path)
     try:

@@ -1,1 +1,1 @@
-"""Counts become temperatures (level 1): the camera's calibration, its uncertainty budget, emissivity and artefacts of the camera."""
+"""Converts counts to temperature: calibration, uncertainty budget, emissivity, averaging, and artefacts of the camera."""

@@ -1,4 +1,9 @@
-"""Temperature of averaged counts: exact to the second order, with a bound on what is left."""
+"""Averages counts over frames and converts the average to temperature, exact to second order and with a bound on the rest.
+
+Calibrating every frame is slower than reading it. Frames that share their parameters are therefore reduced in counts: `Accumulator`
+sums the counts of each pixel and their squares in whole numbers, `CountStatistics` holds the sums, and `mean_temperature` converts mean
+and variance of the counts to those of the temperature. `MeanTemperature.bound_K` tells where that is not accurate enough.
+"""
 
 from __future__ import annotations
 
@@ -13,30 +18,33 @@ from thermography.errors import ThermographyError
 from thermography.io.frame import CameraParameters
 from thermography.radiometry.planck import ZERO_CELSIUS_K, count_line
 
-#: Where averaging counts may err by more than this, frames are calibrated one by one.
+#: Where averaging counts may err by more than this, the frames are calibrated one by one.
 AVERAGING_LIMIT_K = 0.5e-3
-#: Frames read and added at once, so that they are still in the cache when they are added and looked at.
+#: Frames that are read and added at once, few enough to be still in the cache when they are added.
 CHUNK_FRAMES = 8
-#: Pixels per tile, whose sums stay in the first cache while the frames of a chunk are added to them.
-TILE_PX = 2048
-#: Steps below this from the first frame are squared and added in 32 bits, ...
-NEAR = 2048
-#: ... which hold them, and the sums of all steps, for as many frames as this.
-MOST_FRAMES = 1000
+#: Pixels per tile: its sums stay in the first-level cache while the frames of a chunk are added to them.
+_TILE_PX = 2048
+#: Deviations from the first frame below this are near: their squares are summed in 32 bits. A power of two.
+_NEAR = 2048
+#: Maximum number of frames of one `Accumulator`. The largest sum of near squares, 1000 * 2047**2 = 4.19e9, fits uint32 (below 2**32 =
+#: 4.29e9), and the largest sum of deviations, 1000 * 65535 = 6.6e7, fits int32.
+_MAX_FRAMES = 1000
 
 
 @dataclass(frozen=True)
 class CountStatistics:
-    """Sums over frames that share their parameters; whole numbers, so that merging them is exact in any order.
+    """Sums of counts over frames that share their parameters; whole numbers, so that merging is exact in any order.
 
     Attributes
     ----------
-    frames
-        How many frames.
-    total, squares
-        Sum of the counts and of their squares per pixel, uint64.
-    lowest, highest
-        Smallest and largest count per pixel, uint16.
+    frames : int
+        Number of frames.
+    total : ndarray of uint64
+        Sum of the counts of each pixel.
+    squares : ndarray of uint64
+        Sum of the squared counts of each pixel.
+    lowest, highest : ndarray of uint16
+        Smallest and largest count of each pixel.
     """
 
     frames: int
@@ -46,7 +54,7 @@ class CountStatistics:
     highest: NDArray[np.uint16]
 
     def merge(self, other: CountStatistics) -> CountStatistics:
-        """Statistics of both sets of frames."""
+        """Return the statistics of both sets of frames together."""
         return CountStatistics(
             self.frames + other.frames,
             self.total + other.total,
@@ -57,77 +65,29 @@ class CountStatistics:
 
     @property
     def mean(self) -> Array:
-        """Mean count per pixel, float64."""
+        """Mean count of each pixel, float64."""
         return self.total / self.frames
 
     @property
     def variance(self) -> Array:
-        """Mean squared deviation per pixel from its mean (divided by the number of frames), counts squared."""
-        # About the smallest count, in whole numbers: the squares of the counts themselves would cancel in floating point.
+        """Mean squared deviation of each pixel from its mean (divided by the number of frames), counts squared."""
+        # About the smallest count and in whole numbers: with the squares of the counts themselves, nearly all digits would cancel.
         lowest = self.lowest.astype(np.uint64)
         total = self.total - np.uint64(self.frames) * lowest
         squares = self.squares + np.uint64(self.frames) * lowest * lowest - np.uint64(2) * lowest * self.total
         return np.maximum(squares / self.frames - (total / self.frames) ** 2, 0.0)
 
 
-@dataclass(frozen=True)
-class MeanTemperature:
-    """Temperature over frames: mean and mean squared deviation per pixel, and how wrong the mean may be at most.
-
-    Attributes
-    ----------
-    frames
-        How many frames.
-    mean
-        degC, float64; NaN where any of the counts was below what any temperature gives.
-    variance
-        Mean squared deviation (divided by the number of frames), K2.
-    bound_K
-        Bound on the error of averaging counts to the second order. Where it exceeds `AVERAGING_LIMIT_K`, the frames were
-        calibrated one by one instead.
-    """
-
-    frames: int
-    mean: Array
-    variance: Array
-    bound_K: Array
-
-    def merge(self, other: MeanTemperature) -> MeanTemperature:
-        """Both sets of frames together (Chan, Golub and LeVeque 1983)."""
-        frames = self.frames + other.frames
-        step = other.mean - self.mean
-        part = other.frames / frames
-        return MeanTemperature(
-            frames,
-            self.mean + step * part,
-            (1 - part) * self.variance + part * other.variance + part * (1 - part) * step**2,
-            np.maximum(self.bound_K, other.bound_K),
-        )
-
-
-def accumulate(counts: NDArray[np.uint16]) -> CountStatistics:
-    """Sum counts, shape (time, ...), over time.
-
-    Raises
-    ------
-    ThermographyError
-        Not uint16, no frame, or more than `MOST_FRAMES`.
-    """
-    sums = Accumulator(counts.shape[1:])
-    sums.add(counts)
-    return sums.statistics()
-
-
 class Accumulator:
-    """Sums that grow by chunks of frames, so that a block of any length takes the memory of one chunk.
+    """Sums of counts that grow by chunks of frames, so that a block of up to 1000 frames needs the memory of one chunk.
 
-    What is added up are the steps from the first frame: they and nearly all their squares fit 32 bits, of which a processor
-    adds twice as many at once as of 64. Where a pixel goes further, the squares of its tile are added in 64 bits.
+    The deviations from the first frame are summed: they and nearly all their squares fit 32 bits, of which a processor adds twice as
+    many at once as of 64. Where a pixel deviates further, the squares of its tile are summed in 64 bits.
 
     Parameters
     ----------
-    shape
-        Of one frame.
+    shape : tuple of int
+        Shape of one frame.
     """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
@@ -135,32 +95,43 @@ class Accumulator:
         pixels = int(np.prod(shape))
         self.frames = 0
         self.first, self.lowest, self.highest = (np.empty(pixels, np.uint16) for _ in range(3))
-        self.steps, self.squares, self.far_squares = (
+        self.deviations, self.squares, self.far_squares = (
             np.zeros(pixels, kind) for kind in (np.int32, np.uint32, np.uint64)
         )
 
     def add(self, counts: NDArray[np.uint16]) -> None:
-        """Add frames of counts, shape (time, ...)."""
+        """Add frames.
+
+        Parameters
+        ----------
+        counts : (time, ...) ndarray of uint16
+            One or more frames of the shape of this accumulator, counts.
+
+        Raises
+        ------
+        ThermographyError
+            Where shape or type differ, there is no frame, or the sum of all frames exceeds 1000.
+        """
         if counts.dtype != np.uint16 or len(counts) == 0 or counts.shape[1:] != self.shape:
             raise ThermographyError(
                 f"counts: expected frames of {self.shape} uint16, got {counts.shape} {counts.dtype}"
             )
-        if self.frames + len(counts) > MOST_FRAMES:
+        if self.frames + len(counts) > _MAX_FRAMES:
             raise ThermographyError(
-                f"counts: {self.frames + len(counts)} frames, but the sums hold {MOST_FRAMES}; merge the statistics of several"
+                f"counts: {self.frames + len(counts)} frames, but the sums hold {_MAX_FRAMES}; merge the statistics of several accumulators"
             )
         flat = np.ascontiguousarray(counts).reshape(len(counts), -1)
         if self.frames == 0:
-            for start in (self.first, self.lowest, self.highest):
-                start[:] = flat[0]
-        _add(flat, self.first, self.steps, self.squares, self.far_squares, self.lowest, self.highest)
+            for reference in (self.first, self.lowest, self.highest):
+                reference[:] = flat[0]
+        _add(flat, self.first, self.deviations, self.squares, self.far_squares, self.lowest, self.highest)
         self.frames += len(flat)
 
     def statistics(self) -> CountStatistics:
-        """What has been added so far."""
+        """Return the statistics of the frames added so far; raise a ThermographyError where there is none."""
         if self.frames == 0:
             raise ThermographyError("no frame has been added")
-        total, squares = _sums(self.frames, self.first, self.steps, self.squares, self.far_squares)
+        total, squares = _sums(self.frames, self.first, self.deviations, self.squares, self.far_squares)
         shape = self.shape
         return CountStatistics(
             self.frames,
@@ -173,27 +144,31 @@ class Accumulator:
 
 @numba.njit(cache=True, nogil=True)
 def _add(
-    counts: Array, first: Array, steps: Array, squares: Array, far_squares: Array, lowest: Array, highest: Array
+    counts: Array, first: Array, deviations: Array, squares: Array, far_squares: Array, lowest: Array, highest: Array
 ) -> None:
+    """Add frames (time, pixel) to the sums, tile by tile and four frames at once."""
     frames, pixels = counts.shape
-    for start in range(0, pixels, TILE_PX):
-        tile = slice(start, min(start + TILE_PX, pixels))
+    for start in range(0, pixels, _TILE_PX):
+        tile = slice(start, min(start + _TILE_PX, pixels))
         origin = first[tile]
         for frame in range(0, frames, 4):
-            # Four at once, so that the sums are loaded and stored once for all of them; missing ones are the first, a step of zero.
+            # Four at once, so that the sums are loaded and stored once for all of them; a missing one is the first, a deviation of zero.
             a = counts[frame, tile]
             b = counts[frame + 1, tile] if frame + 1 < frames else origin
             c = counts[frame + 2, tile] if frame + 2 < frames else origin
             d = counts[frame + 3, tile] if frame + 3 < frames else origin
-            if _add_limits(origin, a, b, c, d, lowest[tile], highest[tile]) < NEAR:
-                _add_near(origin, a, b, c, d, steps[tile], squares[tile])
+            if _add_limits(origin, a, b, c, d, lowest[tile], highest[tile]) < _NEAR:
+                _add_near(origin, a, b, c, d, deviations[tile], squares[tile])
             else:
-                _add_far(origin, a, b, c, d, steps[tile], far_squares[tile])
+                _add_far(origin, a, b, c, d, deviations[tile], far_squares[tile])
 
 
 @numba.njit(cache=True, nogil=True)
 def _add_limits(first: Array, a: Array, b: Array, c: Array, d: Array, lowest: Array, highest: Array) -> np.uint16:
-    """Update the limits; return a number that is below `NEAR`, a power of two, if all steps so far are."""
+    """Update smallest and largest counts; return the bitwise or of all deviations from the first frame.
+
+    `_NEAR` is a power of two, so the result is below it if and only if every deviation so far is.
+    """
     reach = np.uint16(0)
     for i in range(len(first)):
         low = min(lowest[i], min(min(a[i], b[i]), min(c[i], d[i])))
@@ -204,11 +179,16 @@ def _add_limits(first: Array, a: Array, b: Array, c: Array, d: Array, lowest: Ar
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_near(first: Array, a: Array, b: Array, c: Array, d: Array, steps: Array, squares: Array) -> None:
+def _add_near(first: Array, a: Array, b: Array, c: Array, d: Array, deviations: Array, squares: Array) -> None:
+    """Add four frames whose deviations from the first are all below `_NEAR` in size."""
+    # The difference of two unsigned counts wraps around where it is negative. Its lower 16 bits, read as int16, are the signed deviation
+    # if that lies within -2**15 to 2**15 - 1: it does, being below _NEAR = 2**11 in size, and so does the sum of four, below 2**13.
+    # In 16 bits a processor handles twice as many pixels at once as in 32. A square is below 2**22, so it needs 32 bits; for the sum of
+    # all squares see _MAX_FRAMES.
     for i in range(len(first)):
         w, x = np.int16(a[i] - first[i]), np.int16(b[i] - first[i])
         y, z = np.int16(c[i] - first[i]), np.int16(d[i] - first[i])
-        steps[i] += np.int32(np.int16(np.int16(w + x) + np.int16(y + z)))
+        deviations[i] += np.int32(np.int16(np.int16(w + x) + np.int16(y + z)))
         squares[i] += (
             np.uint32(np.int32(w) * np.int32(w))
             + np.uint32(np.int32(x) * np.int32(x))
@@ -218,48 +198,98 @@ def _add_near(first: Array, a: Array, b: Array, c: Array, d: Array, steps: Array
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_far(first: Array, a: Array, b: Array, c: Array, d: Array, steps: Array, squares: Array) -> None:
+def _add_far(first: Array, a: Array, b: Array, c: Array, d: Array, deviations: Array, squares: Array) -> None:
+    """Add four frames with deviations of any size."""
     for i in range(len(first)):
         for value in (a[i], b[i], c[i], d[i]):
-            step = np.int64(value) - np.int64(first[i])
-            steps[i] += np.int32(step)
-            squares[i] += np.uint64(step * step)
+            deviation = np.int64(value) - np.int64(first[i])
+            deviations[i] += np.int32(deviation)
+            squares[i] += np.uint64(deviation * deviation)
 
 
 @numba.njit(cache=True, nogil=True)
-def _sums(frames: int, first: Array, steps: Array, squares: Array, far_squares: Array) -> tuple[Array, Array]:
-    """Sums of the counts and of their squares, from those of the steps."""
+def _sums(frames: int, first: Array, deviations: Array, squares: Array, far_squares: Array) -> tuple[Array, Array]:
+    """Return the sums of the counts and of their squares from those of the deviations."""
     total, all_squares = np.empty(len(first), np.uint64), np.empty(len(first), np.uint64)
     for i in range(len(first)):
-        origin, step = np.int64(first[i]), np.int64(steps[i])
-        total[i] = np.uint64(frames * origin + step)
-        own = 2 * origin * step + frames * origin * origin + np.int64(squares[i])
-        all_squares[i] = np.uint64(own) + far_squares[i]
+        origin, deviation = np.int64(first[i]), np.int64(deviations[i])
+        total[i] = np.uint64(frames * origin + deviation)
+        near_squares = 2 * origin * deviation + frames * origin * origin + np.int64(squares[i])
+        all_squares[i] = np.uint64(near_squares) + far_squares[i]
     return total, all_squares
+
+
+@dataclass(frozen=True)
+class MeanTemperature:
+    """Mean and variance of the temperature of each pixel over frames.
+
+    Attributes
+    ----------
+    frames : int
+        Number of frames.
+    mean : ndarray of float64
+        Mean temperature, degC; NaN where a count was below that of any temperature.
+    variance : ndarray of float64
+        Mean squared deviation from the mean (divided by the number of frames), K^2.
+    bound_K : ndarray of float64
+        Bound on the error of the mean from averaging counts to second order, K. Where it exceeds `AVERAGING_LIMIT_K`, the frames
+        should be calibrated one by one.
+    """
+
+    frames: int
+    mean: Array
+    variance: Array
+    bound_K: Array
+
+    def merge(self, other: MeanTemperature) -> MeanTemperature:
+        """Return mean and variance of both sets of frames together.
+
+        Source: T. F. Chan, G. H. Golub and R. J. LeVeque, The American Statistician 37 (1983) 242-247.
+        """
+        frames = self.frames + other.frames
+        difference = other.mean - self.mean
+        share = other.frames / frames
+        return MeanTemperature(
+            frames,
+            self.mean + difference * share,
+            (1 - share) * self.variance + share * other.variance + share * (1 - share) * difference**2,
+            np.maximum(self.bound_K, other.bound_K),
+        )
 
 
 def mean_temperature(
     statistics: CountStatistics, parameters: CameraParameters, *, used: NDArray[np.bool_] | None = None
 ) -> MeanTemperature:
-    """Return mean and variance of the temperature from sums of counts, without going through the frames again.
-
-    The mean of a curved function is the function of the mean plus half its curvature times the variance; the rest is bounded by
-    the largest third derivative between the smallest and the largest count (it falls with the count, so it is the one at the
-    smallest) times a sixth of the mean absolute third moment, itself at most the variance times the largest deviation.
+    """Return mean and variance of the temperature from sums of counts, without reading the frames again.
 
     Parameters
     ----------
-    statistics
+    statistics : CountStatistics
         Sums over frames that share `parameters`.
-    parameters
-        Of these frames.
-    used
-        Pixels to work out, of the same shape; the others come back as zero.
+    parameters : CameraParameters
+        Parameters to calibrate these frames with.
+    used : ndarray of bool, optional
+        Pixels to evaluate, of the shape of the frames; the others are returned as zero. All by default.
 
     Returns
     -------
     MeanTemperature
-        Same pixel shape.
+        Mean (degC), variance (K^2) and error bound (K), of the shape of the frames.
+
+    Raises
+    ------
+    RadiometryError
+        Where a parameter makes the measurement formula meaningless.
+
+    Notes
+    -----
+    With T(n) the calibration curve, T1, T2 and T3 its derivatives, and m and v the mean and variance of the counts n, Taylor's theorem
+    about m gives
+
+        mean(T) = T(m) + T2(m) v / 2 + r,  abs(r) <= max(abs(T3)) mean(abs(n - m)^3) / 6 <= abs(T3(lowest)) v max(abs(n - m)) / 6,
+
+    because abs(T3) falls with the counts, and the third absolute moment is at most the variance times the largest deviation. The
+    variance of the temperature is T1(m)^2 v. See ``docs/method/radiometry.md``.
     """
     p = parameters
     gain, offset = count_line(p)
@@ -268,29 +298,30 @@ def mean_temperature(
         values.ravel() for values in (statistics.total, statistics.squares, statistics.lowest, statistics.highest)
     )
     shape = statistics.total.shape
-    wanted = np.ones(total.shape, bool) if used is None else used.ravel()
-    mean, variance, bound = _mean_temperature(statistics.frames, total, squares, lowest, highest, curve, wanted)
+    evaluated = np.ones(total.shape, bool) if used is None else used.ravel()
+    mean, variance, bound = _mean_temperature(statistics.frames, total, squares, lowest, highest, curve, evaluated)
     return MeanTemperature(statistics.frames, mean.reshape(shape), variance.reshape(shape), bound.reshape(shape))
 
 
 @numba.njit(cache=True, nogil=True)
 def _mean_temperature(
-    frames: int, total: Array, squares: Array, lowest: Array, highest: Array, curve: Array, wanted: Array
+    frames: int, total: Array, squares: Array, lowest: Array, highest: Array, curve: Array, evaluated: Array
 ) -> tuple[Array, Array, Array]:
+    """Return mean (degC), variance (K^2) and error bound (K) of each pixel; for `curve` see `_derivatives`."""
     pixels = len(total)
     mean, variance, bound = np.zeros(pixels), np.zeros(pixels), np.zeros(pixels)
     n = np.uint64(frames)
     least, most = 65535, 0
     for i in range(pixels):
-        if wanted[i]:
+        if evaluated[i]:
             least, most = min(least, lowest[i]), max(most, highest[i])
-    # Temperature and its derivatives at whole counts: from the nearest one on, the third derivative adds less than a nanokelvin.
+    # Temperature and its derivatives at whole counts: from the nearest one, the third derivative adds less than a nanokelvin.
     table = np.empty((max(most - least, 0) + 1, 3))
     for k in range(len(table)):
         table[k, 0], table[k, 1], table[k, 2] = _derivatives(float(least + k), curve)
     steepest = abs(_third_derivative(float(least), curve))
     for i in range(pixels):
-        if not wanted[i]:
+        if not evaluated[i]:
             continue
         low = np.uint64(lowest[i])
         first_moment = float(total[i] - n * low) / frames
@@ -304,10 +335,10 @@ def _mean_temperature(
         reach = max(highest[i] - counts, counts - float(low))
         limit = steepest / 6 * spread * reach
         if not limit <= AVERAGING_LIMIT_K:
-            # The smallest count of the whole window is a coarse bound; only where it does not do, the pixel's own is worked out.
-            own = abs(_third_derivative(float(low), curve))
-            limit = own / 6 * spread * reach
-            if np.isnan(own):
+            # The smallest count of the whole window gives a coarse bound; where it does not suffice, that of the pixel is evaluated.
+            steepest_of_pixel = abs(_third_derivative(float(low), curve))
+            limit = steepest_of_pixel / 6 * spread * reach
+            if np.isnan(steepest_of_pixel):
                 temperature = np.nan
         mean[i] = temperature + 0.5 * second * spread
         variance[i] = first**2 * spread
@@ -317,7 +348,10 @@ def _mean_temperature(
 
 @numba.njit(cache=True, nogil=True)
 def _derivatives(counts: float, curve: Array) -> tuple[float, float, float]:
-    """Temperature (degC) and its first two derivatives by the counts, K per count to their power; NaN below any temperature."""
+    """Return the temperature (degC) and its first two derivatives by the counts (K/count, K/count^2); NaN below any temperature.
+
+    T = B / ln(a / s + F) with s = (counts - offset) / gain = S + O, where `curve` is a = R1 / R2, B, F, gain and offset.
+    """
     a, b, f, gain, offset = curve
     s = (counts - offset) / gain
     if s <= 0 or a / s + f <= 1:
@@ -333,7 +367,7 @@ def _derivatives(counts: float, curve: Array) -> tuple[float, float, float]:
 
 @numba.njit(cache=True, nogil=True)
 def _third_derivative(counts: float, curve: Array) -> float:
-    """Third derivative of the temperature by the counts, K per count cubed; it falls as the counts rise."""
+    """Return the third derivative of the temperature by the counts, K/count^3; its size falls as the counts rise."""
     a, b, f, gain, offset = curve
     s = (counts - offset) / gain
     if s <= 0 or a / s + f <= 1:

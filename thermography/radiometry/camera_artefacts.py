@@ -1,9 +1,9 @@
-"""What the camera itself adds to a series of frames: flat-field steps, repeated frames, bad pixels, slow drift.
+"""Detects artefacts of the camera in a series of frames: flat-field steps, repeated frames, slow drift and bad pixels.
 
-A bolometer camera closes its shutter now and then to re-zero its pixels (flat-field correction, FFC); afterwards the whole picture
-sits a few tenths of a kelvin higher or lower. `read_levels` reduces each frame to the level of a reference in one pass; the finders
-work on these levels, so they cost nothing and never touch the frames again. Every finding is a `CameraFlag`; `anchor` says what to
-add to each frame.
+A bolometer camera closes its shutter from time to time to re-zero its pixels (flat-field correction, an NUC/FFC event); afterwards the
+whole thermogram is a few tenths of a kelvin higher or lower. `read_levels` reduces each frame to the level of a reference in one pass.
+`find_steps`, `find_repeats` and `regress_drift` work on these levels and do not read the frames again; `anchor` returns the correction
+of the steps. See ``docs/method/radiometry.md``.
 """
 
 from __future__ import annotations
@@ -21,28 +21,31 @@ from thermography.io.frame import CameraParameters
 from thermography.radiometry.planck import RadiometryError, calibrate
 
 Cause = Literal["flat_field_step", "transient", "repeated_frame", "frozen_frames", "camera_drift"]
-#: More equal frames in a row than this are a stopped camera, not a frame written twice.
-_REPEATS_OF_A_FROZEN_CAMERA = 2
-#: Share of the reference that must move with a step: a scene change moves a part, the shutter moves everything.
-_SHARE_THAT_MOVES = 0.75
+#: More repeats in a row than this mean that the camera output was frozen, not that a frame was written twice.
+_MAX_REPEATS = 2
+#: Share of the reference that must shift with a step: a change of the scene shifts a part of it, an FFC event all of it.
+_SHIFTED_SHARE = 0.75
+#: Frames on each side of a step that are compared.
 _NEIGHBOUR_FRAMES = 8
 
+#: Flags of `find_bad_pixels`.
 DEAD, OFFSET, NOISY = 1, 2, 4
 
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """The reference of each frame, dims (time,).
+    """Level of the reference in each of n frames.
 
     Attributes
     ----------
-    time : ndarray of datetime64[ms]
-    change : ndarray of float64
-        Median change of the reference since the frame before, K; 0 for the first.
-    share : ndarray of float64
-        Share of the reference's pixels that moved at least half as far, in the same direction.
-    repeated : ndarray of bool
-        Frames whose counts all equal those of the frame before.
+    time : (n,) ndarray of datetime64[ms]
+        UTC.
+    change : (n,) ndarray of float64
+        Median change of the reference since the previous frame, K; 0 for the first.
+    share : (n,) ndarray of float64
+        Share of the pixels of the reference that changed by at least half of `change`, in the same direction.
+    repeated : (n,) ndarray of bool
+        True where all counts equal those of the previous frame.
     """
 
     time: NDArray[np.datetime64]
@@ -52,7 +55,7 @@ class Levels:
 
     @property
     def level(self) -> NDArray[np.float64]:
-        """Level of the reference against the first frame, K."""
+        """Level of the reference relative to the first frame, (n,), K."""
         return np.cumsum(self.change)
 
 
@@ -62,14 +65,16 @@ class CameraFlag:
 
     Attributes
     ----------
-    cause : Cause
+    cause : {"flat_field_step", "transient", "repeated_frame", "frozen_frames", "camera_drift"}
+        Kind of artefact.
     index : int
-        First frame that shows it.
-    time : datetime64
+        Index of the first frame that shows it.
+    time : datetime64[ms]
+        Time of this frame, UTC.
     value_K, value_u_K : float
-        Size of a step or drift and its standard uncertainty; 0 where there is none.
+        Size of a step or drift and its standard uncertainty, K; 0 for repeated frames.
     message : str
-        What was seen and what was done.
+        Description in one sentence, without a full stop.
     """
 
     cause: Cause
@@ -91,21 +96,24 @@ def read_levels(
     Parameters
     ----------
     frames : sequence of FrameReference
-        In time order.
+        n frames in order of time.
     parameters : callable, optional
-        From a frame to the parameters to calibrate it with; those of the file by default.
-    reference : ndarray of bool, shape (row, column), optional
-        Pixels of a patch that keeps its temperature. Left out, the median over the scene stands for its unmoved parts, which
-        holds as long as less than half of the picture moves between two frames.
+        Maps a frame to the parameters to calibrate it with; those of the file by default.
+    reference : (row, column) ndarray of bool, optional
+        Pixels of a surface of constant temperature. By default the whole frame: its median change is that of the unchanged parts of
+        the scene as long as less than half of the pixels change between two frames.
 
     Returns
     -------
     Levels
+        Change of the reference from frame to frame, (n,), K.
 
     Raises
     ------
     RadiometryError
         Where the reference has another shape than the frames, or no pixels.
+    FlirFormatError
+        Where the pixels of a frame are damaged.
     """
     if reference is not None and (reference.shape != frames[0].shape or not reference.any()):
         raise RadiometryError(
@@ -113,80 +121,106 @@ def read_levels(
         )
     change, share = np.zeros(len(frames)), np.ones(len(frames))
     repeated = np.zeros(len(frames), bool)
-    before_counts, before = None, None
+    previous_counts, previous = None, None
     for index, frame in enumerate(frames):
         counts = frame.read_counts()
         temperature = calibrate(counts, parameters(frame) if parameters else frame.parameters)
-        seen = temperature.ravel() if reference is None else temperature[reference]
-        if before is not None and before_counts is not None:
-            repeated[index] = np.array_equal(counts, before_counts)
-            difference = seen - before
+        current = temperature.ravel() if reference is None else temperature[reference]
+        if previous is not None and previous_counts is not None:
+            repeated[index] = np.array_equal(counts, previous_counts)
+            difference = current - previous
             valid = difference[np.isfinite(difference)]
             if valid.size:
                 change[index] = np.median(valid)
                 share[index] = np.mean(valid * np.sign(change[index]) >= abs(change[index]) / 2)
-        before_counts, before = counts, seen
+        previous_counts, previous = counts, current
     return Levels(np.array([frame.time for frame in frames], "datetime64[ms]"), change, share, repeated)
 
 
 def find_repeats(levels: Levels) -> list[CameraFlag]:
-    """Find frames written twice and stretches in which the camera stood still: noise never repeats a whole picture."""
+    """Find frames that were written twice and intervals in which the camera output was frozen.
+
+    Parameters
+    ----------
+    levels : Levels
+        Levels of all frames, without gaps. Noise never repeats a whole frame, so equal counts are the same frame.
+
+    Returns
+    -------
+    list of CameraFlag
+        Cause "repeated_frame" for up to two repeats in a row, "frozen_frames" for more.
+    """
     flags = []
     labels, count = ndimage.label(levels.repeated)
     for (run,) in ndimage.find_objects(labels)[:count]:
         length = run.stop - run.start
-        frozen = length > _REPEATS_OF_A_FROZEN_CAMERA
-        text = f"{length} frames repeat the counts of frame {run.start - 1}" + (
-            ": the camera stood still" if frozen else ""
-        )
+        frozen = length > _MAX_REPEATS
+        text = f"{length} {'frame repeats' if length == 1 else 'frames repeat'} the counts of frame {run.start - 1}"
+        text += ": the camera output was frozen" if frozen else ""
         cause: Cause = "frozen_frames" if frozen else "repeated_frame"
         flags.append(CameraFlag(cause, run.start, levels.time[run.start], 0.0, 0.0, text))
     return flags
 
 
 def find_steps(levels: Levels, *, smallest_step_K: float = 0.1, threshold: float = 8.0) -> list[CameraFlag]:
-    """Find the jumps of the reference that the shutter makes.
+    """Find the steps that a flat-field correction of the camera causes in the level of the reference.
 
-    A step is a change between two frames that stands out of the local rate of change by `threshold` robust standard deviations, moves
-    the whole reference, and stays.
+    A step is a change between two frames that exceeds the local rate of change by `threshold` robust standard deviations, shifts the
+    whole reference, and remains.
 
     Parameters
     ----------
     levels : Levels
+        Levels of at least 5 frames that are not repeated; with fewer, no step is reported.
     smallest_step_K : float
-        Smaller jumps are left to the drift.
+        Smaller changes are not reported, K.
     threshold : float
+        Multiple of the robust standard deviation (1.4826 MAD) of the changes beyond the local rate.
 
     Returns
     -------
     list of CameraFlag
-        Cause "flat_field_step"; or "transient" for a jump that comes back or moves only a part of the reference, which is
-        reported and not corrected.
+        Cause "flat_field_step" with the fitted size of the step and its standard uncertainty, K (NaN with too few neighbours for a
+        fit); or "transient" for a change that returns or shifts only a part of the reference, which `anchor` does not correct.
     """
-    fresh = np.flatnonzero(~levels.repeated)
-    if fresh.size < 5:
+    distinct = np.flatnonzero(~levels.repeated)
+    if distinct.size < 5:
         return []
-    excess, rate, sigma = _excess_change(levels, fresh)
+    excess, rate, sigma = _excess_change(levels, distinct)
     candidates = np.flatnonzero(np.abs(excess) > max(smallest_step_K, threshold * sigma))
-    level = levels.level[fresh]
+    level = levels.level[distinct]
     flags = []
     for place in candidates:
-        step, u = _fit_step(levels.time[fresh], level, int(place), candidates)
-        index = int(fresh[place])
-        stays = _remainder(levels.time[fresh], level, int(place), float(rate[place])) / excess[place] > 0.5
-        together = levels.share[index] >= _SHARE_THAT_MOVES
-        if stays and together:
-            text = f"the picture jumped by {step:+.3f} K between two frames and stayed (flat-field correction)"
+        step, u = _fit_step(levels.time[distinct], level, int(place), candidates)
+        index = int(distinct[place])
+        remains = _lasting_shift(levels.time[distinct], level, int(place), float(rate[place])) / excess[place] > 0.5
+        whole = levels.share[index] >= _SHIFTED_SHARE
+        if remains and whole:
+            text = f"the level of the thermogram shifted by {step:+.3f} K between two frames and remained (flat-field correction)"
             flags.append(CameraFlag("flat_field_step", index, levels.time[index], step, u, text))
         else:
-            why = "came back" if together else f"moved {levels.share[index]:.0%} of the reference only"
-            text = f"the picture jumped by {excess[place]:+.3f} K and {why}: not taken for a flat-field correction"
+            why = "returned" if whole else f"in only {levels.share[index]:.0%} of the reference"
+            shift = f"the level of the thermogram shifted by {excess[place]:+.3f} K"
+            text = f"{shift} {'and ' if whole else ''}{why}: not attributed to a flat-field correction"
             flags.append(CameraFlag("transient", index, levels.time[index], float(excess[place]), sigma, text))
     return flags
 
 
 def anchor(levels: Levels, steps: Sequence[CameraFlag]) -> NDArray[np.float64]:
-    """Return what to add to the temperature of each frame (time,), K, so that steps vanish; the first frame stays."""
+    """Return the correction that removes flat-field steps from a series of frames.
+
+    Parameters
+    ----------
+    levels : Levels
+        Levels of the n frames.
+    steps : sequence of CameraFlag
+        From `find_steps`; only those with the cause "flat_field_step" are corrected.
+
+    Returns
+    -------
+    (n,) ndarray of float64
+        Correction to add to the temperature of each frame, K; 0 for the frames before the first step.
+    """
     correction = np.zeros(len(levels.time))
     for step in steps:
         if step.cause == "flat_field_step":
@@ -194,10 +228,12 @@ def anchor(levels: Levels, steps: Sequence[CameraFlag]) -> NDArray[np.float64]:
     return correction
 
 
-def _excess_change(levels: Levels, fresh: NDArray[np.intp]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return each change beyond what the local rate explains (K), that rate (K/s), and the robust standard deviation of the excess."""
-    level = levels.level[fresh]
-    seconds = (levels.time[fresh] - levels.time[fresh[0]]).astype(np.int64) / 1000
+def _excess_change(
+    levels: Levels, distinct: NDArray[np.intp]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Return the change of each frame beyond the local rate (K), this rate (K/s), and the robust standard deviation of the excess (K)."""
+    level = levels.level[distinct]
+    seconds = (levels.time[distinct] - levels.time[distinct[0]]).astype(np.int64) / 1000
     interval, change = np.diff(seconds), np.diff(level)
     rate = change / np.where(interval > 0, interval, 1)
     local_rate = ndimage.median_filter(rate, size=2 * _NEIGHBOUR_FRAMES + 1, mode="nearest")
@@ -206,18 +242,18 @@ def _excess_change(levels: Levels, fresh: NDArray[np.intp]) -> tuple[NDArray[np.
     return excess, np.concatenate(([0.0], local_rate)), sigma
 
 
-def _remainder(time: NDArray[np.datetime64], level: NDArray[np.float64], place: int, rate: float) -> float:
-    """Return how much higher the frames after `place` lie than those before it, beyond the local rate, K."""
+def _lasting_shift(time: NDArray[np.datetime64], level: NDArray[np.float64], place: int, rate: float) -> float:
+    """Return the difference between the median levels after and before `place`, less the local rate of change, K."""
     before, after = slice(max(place - _NEIGHBOUR_FRAMES, 0), place), slice(place, place + _NEIGHBOUR_FRAMES)
     seconds = (time - time[place]).astype(np.int64) / 1000
-    between = np.median(seconds[after]) - np.median(seconds[before])
-    return float(np.median(level[after]) - np.median(level[before]) - rate * between)
+    interval = np.median(seconds[after]) - np.median(seconds[before])
+    return float(np.median(level[after]) - np.median(level[before]) - rate * interval)
 
 
 def _fit_step(
     time: NDArray[np.datetime64], level: NDArray[np.float64], place: int, others: NDArray[np.intp]
 ) -> tuple[float, float]:
-    """Fit a straight line with a step to the frames around `place`, up to the neighbouring jumps; return step and its u, K."""
+    """Fit a straight line with a step at `place` by least squares, up to the neighbouring steps; return the step and its u, K."""
     first = max([place - _NEIGHBOUR_FRAMES, 0, *(others[others < place])])
     last = min([place + _NEIGHBOUR_FRAMES, len(level), *(others[others > place])])
     seconds = (time[first:last] - time[place]).astype(np.int64) / 1000
@@ -232,20 +268,21 @@ def _fit_step(
 
 @dataclass(frozen=True, eq=False)
 class CameraDrift:
-    """Slow drift of the camera as its own temperatures explain it.
+    """Slow drift of the camera, as far as its internal temperatures explain it.
 
     Attributes
     ----------
-    correction : ndarray (time,)
-        What to add to each frame, K; 0 at the first frame, and 0 everywhere where the housekeeping explains nothing.
+    correction : (n,) ndarray of float64
+        Correction to add to the temperature of each of n frames, K; 0 for the first frame, and for all where the regression is not
+        significant.
     coefficients : dict of str to float
-        K per K of each sensor.
+        Drift per change of each internal temperature, K/K; empty where the regression is not significant.
     explained : float
-        Share of the variance of the level that the housekeeping explains.
+        Share of the variance of the level that the internal temperatures explain, 0 to 1.
     p_value : float
-        Of that share, with the number of independent frames reduced by their autocorrelation.
+        p-value of this share under the null hypothesis of no relation, for autocorrelated series.
     flag : CameraFlag or None
-        What was corrected; None where nothing was.
+        The correction as a camera artefact; None where nothing was corrected.
     """
 
     correction: NDArray[np.float64]
@@ -263,56 +300,64 @@ def regress_drift(
     *,
     significance: float = 0.01,
 ) -> CameraDrift:
-    """Regress the level of a reference patch on the camera's own temperatures.
+    """Regress the level of a reference on the temperatures inside the camera.
 
     Parameters
     ----------
     levels : Levels
-        Of a patch that keeps its temperature: what it does is the camera's doing.
+        Levels of a surface of constant temperature in n frames, so that every change is due to the camera.
     steps : sequence of CameraFlag
-        From `find_steps`; taken out first.
-    camera_temperature : ndarray (time, sensor)
-        K; sensors with gaps or without change are left out.
+        Flat-field steps from `find_steps`; they are corrected before the regression.
+    camera_temperature : (n, k) ndarray
+        Temperatures inside the camera, K; sensors with gaps or without change are not used.
     sensors : sequence of str
+        Names of the k sensors.
     significance : float
-        Above this p-value nothing is corrected.
+        Nothing is corrected where the p-value exceeds this.
 
     Returns
     -------
     CameraDrift
+        Correction of each frame (K), coefficients (K/K) and p-value.
+
+    Notes
+    -----
+    Least squares on the principal components of the temperatures, without those that hold less than 1 % of the amplitude of the first.
+    The p-value is that of an F test whose degrees of freedom use the effective number of independent frames of two autocorrelated
+    series, n (1 - r s) / (1 + r s) with their lag-one autocorrelations r and s (M. S. Bartlett, J. R. Stat. Soc. 98 (1935) 536-543).
     """
     level = levels.level + anchor(levels, steps)
-    moving = np.isfinite(camera_temperature).all(axis=0) & (np.ptp(camera_temperature, axis=0) > 0)
-    names = [name for name, use in zip(sensors, moving, strict=True) if use]
+    usable = np.isfinite(camera_temperature).all(axis=0) & (np.ptp(camera_temperature, axis=0) > 0)
+    names = [name for name, use in zip(sensors, usable, strict=True) if use]
     nothing = CameraDrift(np.zeros(len(level)), {}, 0.0, 1.0)
     if not names or len(level) < len(names) + 3 or np.ptp(level) == 0:
         return nothing
-    centred = camera_temperature[:, moving] - camera_temperature[:, moving].mean(axis=0)
-    # Sensors of one camera move together: directions with less than 1 % of the movement would only fit noise.
-    left, singular, right = np.linalg.svd(centred, full_matrices=False)
+    centred = camera_temperature[:, usable] - camera_temperature[:, usable].mean(axis=0)
+    # The sensors of a camera are nearly collinear: components with less than 1 % of the amplitude would only fit noise.
+    scores, singular, loadings = np.linalg.svd(centred, full_matrices=False)
     kept = singular > 0.01 * singular[0]
     target = level - level.mean()
-    projection = left[:, kept].T @ target
-    fitted = left[:, kept] @ projection
+    projection = scores[:, kept].T @ target
+    fitted = scores[:, kept] @ projection
     explained = float(fitted @ fitted / (target @ target))
     p_value = _p_value(explained, int(kept.sum()), target - fitted, target)
-    coefficients = right[kept].T @ (projection / singular[kept])
+    coefficients = loadings[kept].T @ (projection / singular[kept])
     if p_value > significance:
         return CameraDrift(nothing.correction, {}, explained, p_value)
     by_name = dict(zip(names, coefficients.tolist(), strict=True))
     size, u = float(np.ptp(fitted)), float(np.std(target - fitted))
-    text = f"the camera's own temperatures explain {explained:.0%} of a drift; up to {size:.3f} K were taken out"
+    text = f"the temperatures inside the camera explain {explained:.0%} of a drift; up to {size:.3f} K were corrected"
     flag = CameraFlag("camera_drift", 0, levels.time[0], size, u, text)
     return CameraDrift(fitted[0] - fitted, by_name, explained, p_value, flag)
 
 
 def _p_value(explained: float, regressors: int, residual: NDArray[np.float64], target: NDArray[np.float64]) -> float:
-    """Return the p-value of a share of variance, for series whose neighbours are alike."""
+    """Return the p-value of an explained share of variance, for autocorrelated series."""
 
     def lag_one(series: NDArray[np.float64]) -> float:
         return float(np.clip(series[1:] @ series[:-1] / (series @ series), 0, 0.999)) if series.any() else 0.0
 
-    # Bartlett: two autocorrelated series have fewer independent pairs than points.
+    # Bartlett (1935): two autocorrelated series have fewer independent pairs than points.
     product = lag_one(residual) * lag_one(target)
     independent = len(target) * (1 - product) / (1 + product)
     freedom = independent - regressors - 1
@@ -323,43 +368,43 @@ def _p_value(explained: float, regressors: int, residual: NDArray[np.float64], t
 
 
 def find_bad_pixels(counts: NDArray[np.uint16], *, threshold: float = 8.0) -> NDArray[np.uint8]:
-    """Find pixels that do not follow their neighbours.
+    """Find pixels whose mean or noise differs from that of their neighbours.
 
     Parameters
     ----------
-    counts : ndarray (time, row, column)
-        A few dozen frames of a scene that hardly changes.
+    counts : (time, row, column) ndarray of uint16
+        A few dozen frames of a nearly constant scene; with fewer than 8, only offsets are found.
     threshold : float
-        How many times further than its neighbours a pixel must be off.
+        Minimum deviation from the neighbours, as a multiple of the 90th percentile of this deviation in the surroundings.
 
     Returns
     -------
-    ndarray of uint8, shape (row, column)
-        Sum of flags: 1 dead (never changes), 2 offset (off its neighbours), 4 noisy; 0 for a good pixel.
+    (row, column) ndarray of uint8
+        Sum of flags: `DEAD` = 1 (never changes), `OFFSET` = 2 (mean differs), `NOISY` = 4 (noise differs); 0 for a good pixel.
     """
     stack = counts.astype(np.float32)
     mean, noise = stack.mean(axis=0), stack.std(axis=0)
-    flags = np.where(_stands_out(mean, threshold), OFFSET, 0).astype(np.uint8)
+    flags = np.where(_outliers(mean, threshold), OFFSET, 0).astype(np.uint8)
     if len(stack) >= 8:
         flags |= np.where((noise == 0) & (np.median(noise) > 0), DEAD, 0).astype(np.uint8)
-        flags |= np.where(_stands_out(noise, threshold) & (noise > np.median(noise)), NOISY, 0).astype(np.uint8)
+        flags |= np.where(_outliers(noise, threshold) & (noise > np.median(noise)), NOISY, 0).astype(np.uint8)
     return flags
 
 
-def _stands_out(picture: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
-    """Whether a pixel is off its neighbours much further than the pixels around it are off theirs.
+def _outliers(image: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
+    """Return which pixels deviate from their neighbours much further than the pixels of their surroundings do.
 
-    Off means: further from all but two of the eight neighbours. On an edge or corner of the scene at least three neighbours
-    belong to the same surface, while clusters of up to three bad pixels still stand out.
+    The deviation of a pixel is its third smallest absolute difference from the eight neighbours. On an edge or corner of the scene at
+    least three neighbours belong to the same surface, and clusters of up to three bad pixels are still detected.
     """
-    rows, columns = picture.shape
-    padded = np.pad(picture, 1, mode="reflect")
+    rows, columns = image.shape
+    padded = np.pad(image, 1, mode="reflect")
     shifts = [(row, column) for row in range(3) for column in range(3) if (row, column) != (1, 1)]
-    distances = [np.abs(picture - padded[row : row + rows, column : column + columns]) for row, column in shifts]
-    off = np.partition(distances, 2, axis=0)[2]
+    differences = [np.abs(image - padded[row : row + rows, column : column + columns]) for row, column in shifts]
+    deviation = np.partition(differences, 2, axis=0)[2]
     ring = np.ones((5, 5), bool)
     ring[2, 2] = False
-    around = ndimage.percentile_filter(off, 90, footprint=ring)
-    typical = max(float(np.median(off)), 1.0)
-    result: NDArray[np.bool_] = off > threshold * np.maximum(around, typical)
+    surroundings = ndimage.percentile_filter(deviation, 90, footprint=ring)
+    typical = max(float(np.median(deviation)), 1.0)
+    result: NDArray[np.bool_] = deviation > threshold * np.maximum(surroundings, typical)
     return result

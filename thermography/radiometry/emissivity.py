@@ -1,4 +1,4 @@
-"""Emissivity of a region from two states of known temperature."""
+"""Estimates the emissivity of a region from two states of known temperature."""
 
 from __future__ import annotations
 
@@ -12,21 +12,29 @@ from thermography.radiometry.planck import (
     ZERO_CELSIUS_K,
     RadiometryError,
     black_body_signal,
-    check,
+    check_parameters,
     signal_slope,
     temperature_of_signal,
     transmission,
 )
 
-#: Below this the camera sees more of the surroundings than of the surface.
-_MORE_REFLECTION_THAN_SURFACE = 0.5
-#: A standard uncertainty above this says nothing about a surface.
-_LARGEST_USEFUL_U = 0.1
+#: Below this emissivity the reflected radiation exceeds that of the surface.
+_MIN_EMISSIVITY = 0.5
+#: Above this standard uncertainty an estimate does not distinguish surfaces.
+_MAX_U = 0.1
 
 
 @dataclass(frozen=True)
 class KnownState:
-    """Mean counts of a region while its temperature was known, each with its standard uncertainty."""
+    """Mean counts of a region at a known temperature.
+
+    Attributes
+    ----------
+    counts, counts_u : float
+        Mean counts of the region and their standard uncertainty.
+    temperature_degC, temperature_u_K : float
+        Temperature of the surface, degC, and its standard uncertainty, K.
+    """
 
     counts: float
     counts_u: float
@@ -36,16 +44,17 @@ class KnownState:
 
 @dataclass(frozen=True)
 class EmissivityEstimate:
-    """Emissivity of a region with its standard uncertainty.
+    """Emissivity of a region.
 
     Attributes
     ----------
     emissivity, emissivity_u : float
+        Estimate and standard uncertainty, without unit.
     reflected_temperature_degC : float
-        What the region reflects by the same two states; NaN where it reflects too little to tell.
+        Reflected apparent temperature that agrees with the first state, degC; NaN for an emissivity of 0.99 or more or 0 or less.
     quality : {"usable", "too_reflective", "undetermined"}
-        "too_reflective": the camera sees more of the surroundings than of the surface. "undetermined": the two states are too
-        alike, or they disagree with any emissivity.
+        "too_reflective": the emissivity may be below 0.5. "undetermined": the standard uncertainty exceeds 0.1, or the states
+        contradict every emissivity from 0 to 1.
     """
 
     emissivity: float
@@ -55,28 +64,33 @@ class EmissivityEstimate:
 
 
 def estimate_emissivity(first: KnownState, second: KnownState, parameters: CameraParameters) -> EmissivityEstimate:
-    """Estimate the emissivity of a region from two states.
-
-    What the surface reflects is the same in both states and drops out of the difference of the counts,
-    ``N2 - N1 = tau_window tau e (S(T2) - S(T1))``, so it need not be known; it must only not change between them.
+    """Estimate the emissivity of a region from two states of known temperature.
 
     Parameters
     ----------
     first, second : KnownState
-        From a contact sensor, or from a region of known emissivity at the same temperature.
+        Counts of the region and its temperature from a contact sensor, or from a region of known emissivity at the same temperature.
+        The reflected radiation must be the same in both states; it need not be known.
     parameters : CameraParameters
-        Everything but the emissivity and the reflected temperature is used.
+        Parameters of both states; emissivity and reflected apparent temperature are not used.
 
     Returns
     -------
     EmissivityEstimate
+        Emissivity with its standard uncertainty, the reflected apparent temperature (degC), and a class.
 
     Raises
     ------
     RadiometryError
-        Where both states have the same temperature.
+        Where both states have the same temperature, or a parameter makes the measurement formula meaningless.
+
+    Notes
+    -----
+    The reflected radiation cancels in the difference of the measurement formula for the two states,
+    N2 - N1 = tau_w tau e (S(T2) - S(T1)). The uncertainty is that of the law of propagation for uncorrelated inputs (JCGM 100:2008,
+    5.1.2) with the two counts and the two temperatures as inputs.
     """
-    check(parameters)
+    check_parameters(parameters)
     path = parameters.window_transmission * transmission(parameters)
     kelvin = np.array([first.temperature_degC, second.temperature_degC]) + ZERO_CELSIUS_K
     signals = black_body_signal(kelvin, parameters)
@@ -99,14 +113,14 @@ def estimate_emissivity(first: KnownState, second: KnownState, parameters: Camer
 
 
 def _quality(emissivity: float, u: float) -> Literal["usable", "too_reflective", "undetermined"]:
-    """Class an estimate; two standard uncertainties decide."""
-    if u > _LARGEST_USEFUL_U or emissivity - 2 * u > 1 or emissivity + 2 * u <= 0:
+    """Classify an estimate by its interval of plus and minus two standard uncertainties."""
+    if u > _MAX_U or emissivity - 2 * u > 1 or emissivity + 2 * u <= 0:
         return "undetermined"
-    return "too_reflective" if emissivity - 2 * u < _MORE_REFLECTION_THAN_SURFACE else "usable"
+    return "too_reflective" if emissivity - 2 * u < _MIN_EMISSIVITY else "usable"
 
 
 def _reflected(state: KnownState, emissivity: float, signal: float, parameters: CameraParameters) -> float:
-    """Return the reflected temperature (degC) that explains the first state."""
+    """Return the reflected apparent temperature (degC) that agrees with a state; NaN where the surface hardly reflects."""
     if not 0 < emissivity < 0.99:
         return float("nan")
     p, tau = parameters, transmission(parameters)

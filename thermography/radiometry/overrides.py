@@ -1,4 +1,4 @@
-"""What a campaign knows better than the camera: parameters for all frames, over time, and per region."""
+"""Replaces stored camera parameters by those of the campaign: constants, logged series, and emissivities of regions."""
 
 from __future__ import annotations
 
@@ -14,8 +14,21 @@ from thermography.radiometry.planck import RadiometryError, override
 
 
 @dataclass(frozen=True, eq=False)
-class Series:
-    """A parameter that was logged: `times` (n,) datetime64, increasing, and `values` (n,) in the parameter's unit."""
+class ParameterLog:
+    """A camera parameter that was logged over time.
+
+    Attributes
+    ----------
+    times : (n,) ndarray of datetime64
+        UTC, increasing.
+    values : (n,) ndarray of float64
+        Values in the unit of the parameter, finite.
+
+    Raises
+    ------
+    RadiometryError
+        Where times and values differ in number, times do not increase, or a value is not finite.
+    """
 
     times: NDArray[np.datetime64]
     values: NDArray[np.float64]
@@ -23,17 +36,31 @@ class Series:
     def __post_init__(self) -> None:
         times, values = np.asarray(self.times), np.asarray(self.values, np.float64)
         if times.shape != values.shape or times.ndim != 1 or times.size == 0:
-            raise RadiometryError(f"series: expected as many times as values, got {times.shape} and {values.shape}")
+            raise RadiometryError(
+                f"log of a parameter: expected as many times as values, got {times.shape} and {values.shape}"
+            )
         if not (np.diff(times) > np.timedelta64(0)).all() or not np.isfinite(values).all():
-            raise RadiometryError("series: expected increasing times and finite values; sort the log and remove gaps")
+            raise RadiometryError(
+                "log of a parameter: expected increasing times and finite values; sort the log and remove gaps"
+            )
 
-    def at(self, time: np.datetime64) -> float:
+    def interpolate(self, time: np.datetime64) -> float:
         """Interpolate linearly to a time.
+
+        Parameters
+        ----------
+        time : datetime64
+            UTC.
+
+        Returns
+        -------
+        float
+            Value in the unit of the parameter.
 
         Raises
         ------
         RadiometryError
-            Where the log does not reach: ambient conditions are not extrapolated.
+            Where the time is NaT or outside the log; ambient conditions are not extrapolated.
         """
         times = np.asarray(self.times).astype("datetime64[ms]")
         if np.isnat(time) or not times[0] <= time <= times[-1]:
@@ -44,13 +71,14 @@ class Series:
 
 @dataclass(frozen=True)
 class Overrides:
-    """Parameters of each frame: those of the file, replaced by constants and by what was logged at the frame's time.
+    """Camera parameters of each frame: those of the file, replaced by constants and by logged values at the time of the frame.
 
     Attributes
     ----------
-    constants : mapping of parameter name to value
-    series : mapping of parameter name to Series
-        Logged values win over constants.
+    constants : mapping of str to float
+        Values by name of the parameter, in its unit.
+    logs : mapping of str to ParameterLog
+        Logs by name of the parameter; they take precedence over constants.
 
     Examples
     --------
@@ -58,18 +86,28 @@ class Overrides:
     """
 
     constants: Mapping[str, float] = field(default_factory=dict)
-    series: Mapping[str, Series] = field(default_factory=dict)
+    logs: Mapping[str, ParameterLog] = field(default_factory=dict)
 
     def __call__(self, frame: FrameHeader) -> CameraParameters:
         """Return the parameters to calibrate a frame with."""
-        logged = {name: series.at(frame.time) for name, series in self.series.items()}
+        logged = {name: log.interpolate(frame.time) for name, log in self.logs.items()}
         changes = {**self.constants, **logged}
         return override(frame.parameters, **changes) if changes else frame.parameters
 
 
 @dataclass(frozen=True)
-class Region:
-    """A surface of its own emissivity: a polygon of (x, y) plan points in mm."""
+class EmissivityRegion:
+    """A part of the table with an emissivity of its own.
+
+    Attributes
+    ----------
+    name : str
+        Name, for messages.
+    polygon_mm : tuple of (x, y)
+        Corners in plan coordinates, mm; at least three.
+    emissivity : float
+        Above 0 and up to 1.
+    """
 
     name: str
     polygon_mm: tuple[tuple[float, float], ...]
@@ -77,34 +115,35 @@ class Region:
 
 
 def emissivity_map(
-    x_mm: ArrayLike, y_mm: ArrayLike, regions: Sequence[Region], *, default: float
+    x_mm: ArrayLike, y_mm: ArrayLike, regions: Sequence[EmissivityRegion], *, default: float
 ) -> NDArray[np.float64]:
     """Return the emissivity of points of the table plan.
 
     Parameters
     ----------
     x_mm, y_mm : arrays that broadcast together
-        Plan coordinates: of the cells of a grid, or of each sensor pixel by the registration.
-    regions : sequence of Region
-        A later region lies on top of an earlier one.
+        Plan coordinates, mm: those of the cells of a grid, or of each sensor pixel from the registration.
+    regions : sequence of EmissivityRegion
+        A later region covers an earlier one.
     default : float
-        Emissivity outside every region.
+        Emissivity outside all regions, above 0 and up to 1.
 
     Returns
     -------
-    ndarray of float64, the broadcast shape
+    ndarray of float64
+        Emissivity of each point, of the broadcast shape; see `thermography.radiometry.planck.temperature_from_counts`.
 
     Raises
     ------
     RadiometryError
-        Where an emissivity is no fraction or a polygon has fewer than three corners.
+        Where an emissivity is not above 0 and up to 1, or a polygon has fewer than three corners.
     """
     x, y = np.broadcast_arrays(np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64))
     points = np.column_stack((x.ravel(), y.ravel()))
     result = np.full(len(points), default, np.float64)
     for name, emissivity in (("default", default), *((region.name, region.emissivity) for region in regions)):
         if not 0 < emissivity <= 1:
-            raise RadiometryError(f"emissivity of {name}: {emissivity:g} is no fraction above 0 and up to 1")
+            raise RadiometryError(f"emissivity of {name}: {emissivity:g} is not a fraction above 0 and up to 1")
     for region in regions:
         if len(region.polygon_mm) < 3:
             raise RadiometryError(f"region {region.name}: expected at least 3 corners, got {len(region.polygon_mm)}")

@@ -1,8 +1,9 @@
-"""Standard uncertainty of every temperature, with its budget, for levels and for rises.
+"""Evaluates the standard uncertainty of temperatures and of temperature rises, with its budget.
 
-Two parts behave differently. The common part (emissivity, reflections, air, humidity, distance, window, camera accuracy) is the
-same error in every frame of a campaign and largely cancels in a difference; the per-frame part (noise, quantisation) does not, and
-averages out instead. First-order propagation through the measurement formula, held to Monte Carlo in the tests.
+The common part (emissivity, reflections, air, humidity, distance, window, accuracy of the camera) is the same error in every frame of a
+campaign and largely cancels in a difference; the per-frame part (noise, quantisation) does not cancel, but averages out. Uncertainties
+propagate to first order through the measurement formula (JCGM 100:2008, 5.1 and 5.2); the tests compare them with Monte Carlo
+simulations. See ``docs/method/radiometry.md``.
 """
 
 from __future__ import annotations
@@ -10,14 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from thermography._typing import Array
 from thermography.errors import ThermographyError
 from thermography.io.frame import CameraParameters
 from thermography.radiometry.planck import ZERO_CELSIUS_K, black_body_signal, count_line, override, signal_slope
 
-_Array = NDArray[np.float64]
-#: Parameters of the formula that may be uncertain, with their range.
+#: Parameters of the measurement formula that may be uncertain, with their range.
 _RANGES = {
     "emissivity": (1e-3, 1.0),
     "reflected_temperature_K": (100.0, 3000.0),
@@ -31,19 +32,32 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class InputUncertainty:
-    """Standard uncertainties of what the formula uses (coverage factor 1).
+    """Standard uncertainties (coverage factor 1) of the inputs of the measurement formula.
 
-    The defaults are a painted surface in a workshop and the data sheet of a bolometer camera: accuracy +-2 K taken as a rectangular
-    distribution, NETD 50 mK at 30 degC.
+    The defaults apply to a painted surface in a workshop and to the data sheet of a bolometer camera: accuracy of +-2 K as a rectangular
+    distribution (JCGM 100:2008, 4.3.7), NETD of 50 mK at 30 degC.
 
     Attributes
     ----------
+    emissivity, relative_humidity, window_transmission : float
+        Standard uncertainties of these parameters, without unit.
+    reflected_temperature_K, atmospheric_temperature_K, window_temperature_K : float
+        Standard uncertainties of the reflected apparent temperature, the air and the window, K.
+    object_distance_m : float
+        Standard uncertainty of the distance, m.
     camera_offset_K : float
-        Accuracy of the camera that is the same at all temperatures.
+        Standard uncertainty of the camera that is the same at all temperatures, K.
     camera_scale : float
-        Relative accuracy of the camera's signal above zero ("2 % of reading").
+        Relative standard uncertainty of the signal of the camera above zero (for an accuracy of "2 % of reading"), without unit.
     netd_K : float
-        Noise of one pixel in one frame on a black body at `netd_temperature_degC`.
+        Noise equivalent temperature difference: standard deviation of one pixel in one frame on a black body, K.
+    netd_temperature_degC : float
+        Temperature of this black body, degC.
+
+    Raises
+    ------
+    ThermographyError
+        Where an uncertainty is negative or not finite.
     """
 
     emissivity: float = 0.01
@@ -66,32 +80,32 @@ class InputUncertainty:
 
 
 @dataclass(frozen=True, eq=False)
-class Budget:
-    """Standard uncertainty of temperatures and where it comes from.
+class TemperatureBudget:
+    """Uncertainty budget of temperatures or temperature rises; all arrays have their shape.
 
     Attributes
     ----------
     common : dict of str to ndarray
-        Signed contribution of each common input, K: sensitivity times standard uncertainty.
+        Contribution of each input that all frames share, K: sensitivity coefficient, with its sign, times standard uncertainty.
     per_frame : dict of str to ndarray
-        Contribution of noise and quantisation, K.
+        Contributions of noise and quantisation, K.
     """
 
-    common: dict[str, _Array]
-    per_frame: dict[str, _Array]
+    common: dict[str, Array]
+    per_frame: dict[str, Array]
 
     @property
-    def common_u(self) -> _Array:
-        """Standard uncertainty of the part that all frames share, K."""
+    def common_u(self) -> Array:
+        """Standard uncertainty from the inputs that all frames share, K."""
         return _root_sum_square(self.common)
 
     @property
-    def per_frame_u(self) -> _Array:
-        """Standard uncertainty of the part that is new in each frame, K."""
+    def per_frame_u(self) -> Array:
+        """Standard uncertainty from noise and quantisation, which are independent between frames, K."""
         return _root_sum_square(self.per_frame)
 
     @property
-    def total_u(self) -> _Array:
+    def total_u(self) -> Array:
         """Combined standard uncertainty, K."""
         return np.hypot(self.common_u, self.per_frame_u)
 
@@ -102,23 +116,45 @@ def temperature_uncertainty(
     inputs: InputUncertainty | None = None,
     *,
     frames: ArrayLike = 1,
-) -> Budget:
-    """Return the uncertainty of surface temperatures.
+) -> TemperatureBudget:
+    """Return the standard uncertainty of surface temperatures with its budget.
 
     Parameters
     ----------
     temperature : array, any shape
-        degC, as `calibrate` gives it.
+        Surface temperature from `thermography.radiometry.planck.calibrate`, degC.
     parameters : CameraParameters
-        Those with which it was calibrated.
+        Parameters with which it was calibrated.
     inputs : InputUncertainty, optional
-    frames : int, or array of the same shape
+        Standard uncertainties of the inputs; by default those of a painted surface in a workshop and a common bolometer camera.
+    frames : int or array of the same shape
         Number of frames that were averaged.
 
     Returns
     -------
-    Budget
-        Arrays of the shape of the temperature, K.
+    TemperatureBudget
+        Contributions, common, per-frame and combined standard uncertainty, K, of the shape of the temperature.
+
+    Raises
+    ------
+    RadiometryError
+        Where a parameter makes the measurement formula meaningless.
+
+    Notes
+    -----
+    Law of propagation of uncertainty for uncorrelated inputs, JCGM 100:2008, eq. (10). With counts = g S(T) + o, a change of gain g and
+    offset o changes the temperature by -(S dg + do) / (g dS/dT). The noise of a pixel is constant in counts; the quantisation to whole
+    counts has a standard uncertainty of 1 / sqrt(12) (JCGM 100:2008, F.2.2.1).
+
+    Examples
+    --------
+    >>> sc660 = CameraParameters(
+    ...     0.95, 1.0, 293.15, 293.15, 293.15, 1.0, 0.0, 0.5, 21106.77, 1501.0, 1.0, -7340.0, 0.012545258,
+    ...     0.006569, 0.01262, -0.002276, -0.00667, 1.9,
+    ... )
+    >>> budget = temperature_uncertainty([25.0, 40.0], sc660, frames=10)
+    >>> budget.total_u.round(3), budget.per_frame_u.round(3), budget.common["emissivity"].round(3)
+    (array([1.157, 1.171]), array([0.018, 0.015]), array([-0.051, -0.191]))
     """
     inputs = inputs or InputUncertainty()
     kelvin = np.asarray(temperature, np.float64) + ZERO_CELSIUS_K
@@ -135,10 +171,10 @@ def temperature_uncertainty(
         common["camera_offset"] = np.full(kelvin.shape, inputs.camera_offset_K)
     if inputs.camera_scale > 0:
         common["camera_scale"] = kelvin_per_count * (signal + parameters.planck_o) * inputs.camera_scale
-    # The noise of a pixel in counts does not depend on what it looks at.
+    # The noise of a pixel in counts does not depend on the scene.
     noise = inputs.netd_K * signal_slope(inputs.netd_temperature_degC + ZERO_CELSIUS_K, parameters)
     per_count = kelvin_per_count / (gain * np.sqrt(frames))
-    return Budget(common, {"noise": per_count * noise, "quantisation": per_count / 12**0.5})
+    return TemperatureBudget(common, {"noise": per_count * noise, "quantisation": per_count / 12**0.5})
 
 
 def temperature_rise_uncertainty(
@@ -150,42 +186,53 @@ def temperature_rise_uncertainty(
     reference_parameters: CameraParameters | None = None,
     frames: ArrayLike = 1,
     reference_frames: ArrayLike = 1,
-) -> Budget:
-    """Return the uncertainty of the rise from `reference` to `temperature` of the same surface.
-
-    The common contributions are subtracted before they are squared, because their errors are the same in both.
+) -> TemperatureBudget:
+    """Return the standard uncertainty of the rise of a surface from one temperature to another, with its budget.
 
     Parameters
     ----------
     temperature, reference : arrays that broadcast together
-        degC.
+        Temperatures after and before the rise, degC.
     parameters : CameraParameters
-        Of `temperature`; also of the reference unless `reference_parameters` are given.
+        Parameters with which `temperature` was calibrated.
     inputs : InputUncertainty, optional
+        Standard uncertainties of the inputs; defaults as in `temperature_uncertainty`.
+    reference_parameters : CameraParameters, optional
+        Parameters with which `reference` was calibrated; the same by default.
     frames, reference_frames : int or array
         Numbers of frames that were averaged.
 
     Returns
     -------
-    Budget
-        K.
+    TemperatureBudget
+        Contributions, common, per-frame and combined standard uncertainty of the rise, K, of the broadcast shape.
+
+    Raises
+    ------
+    RadiometryError
+        Where a parameter makes the measurement formula meaningless.
+
+    Notes
+    -----
+    The errors of the common inputs are the same in both temperatures (correlation 1), so their contributions are subtracted before they
+    are squared (JCGM 100:2008, 5.2.2, note 1); noise and quantisation are independent.
     """
     later = temperature_uncertainty(temperature, parameters, inputs, frames=frames)
     earlier = temperature_uncertainty(reference, reference_parameters or parameters, inputs, frames=reference_frames)
     common = {name: later.common[name] - earlier.common[name] for name in later.common}
     per_frame = {name: np.hypot(later.per_frame[name], earlier.per_frame[name]) for name in later.per_frame}
-    return Budget(common, per_frame)
+    return TemperatureBudget(common, per_frame)
 
 
-def _root_sum_square(parts: dict[str, _Array]) -> _Array:
+def _root_sum_square(parts: dict[str, Array]) -> Array:
     return np.sqrt(np.sum([part**2 for part in parts.values()], axis=0))
 
 
-def _line_slopes(parameters: CameraParameters, name: str, u: float) -> tuple[_Array, _Array]:
-    """Return how gain and offset of the count line change with one parameter.
+def _line_slopes(parameters: CameraParameters, name: str, u: float) -> tuple[Array, Array]:
+    """Return the derivatives of gain and offset of `count_line` by one parameter.
 
-    The secant over plus and minus one standard uncertainty, inside the parameter's range, also serves where the formula bends: the
-    transmission goes with the square root of the distance.
+    They are secants over plus and minus one standard uncertainty inside the range of the parameter (JCGM 100:2008, 5.1.3, note 2), which
+    stay finite at a distance of 0 m, where the transmission depends on the square root of the distance.
     """
     value = getattr(parameters, name)
     lowest, highest = _RANGES[name]

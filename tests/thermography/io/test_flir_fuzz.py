@@ -1,4 +1,4 @@
-"""Damaged files: an error that names file and place, or a frame of the promised size; never anything else."""
+"""Damaged files give an error that names file and place, or a frame of the declared size, and nothing else."""
 
 from __future__ import annotations
 

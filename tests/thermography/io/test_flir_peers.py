@@ -50,12 +50,12 @@ def _by_flirpy(frame: FrameReference) -> bool | None:
     """Whether flirpy's counts equal ours; None where it offers no reader or gives no finite temperature."""
     if frame.path.suffix.lower() == ".jpg":
         return None
-    found = Seq(str(frame.path))[frame.index]
+    theirs = Seq(str(frame.path))[frame.index]
     # It takes compressed samples for counts: of these it says nothing, so its own temperatures must judge.
     with np.errstate(all="ignore"):
-        if frame.samples.encoding != "raw" or not np.isfinite(found.get_radiometric_image()).any():
+        if frame.samples.encoding != "raw" or not np.isfinite(theirs.get_radiometric_image()).any():
             return None
-    return bool(np.array_equal(found.get_image(), frame.read_counts()))
+    return bool(np.array_equal(theirs.get_image(), frame.read_counts()))
 
 
 def _exiftool(paths: Sequence[Path]) -> list[dict[str, object]]:
@@ -64,9 +64,9 @@ def _exiftool(paths: Sequence[Path]) -> list[dict[str, object]]:
     if program is None:
         pytest.skip("exiftool is not installed (Debian: libimage-exiftool-perl)")
     command = [program, "-n", "-j", "-FLIR:all", *map(str, paths)]
-    found: list[dict[str, object]] = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
-    assert [each["SourceFile"] for each in found] == [str(path) for path in paths]
-    return found
+    printed: list[dict[str, object]] = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    assert [each["SourceFile"] for each in printed] == [str(path) for path in paths]
+    return printed
 
 
 def _agrees_with_exiftool(frame: FrameReference, printed: dict[str, object]) -> bool | None:
@@ -144,7 +144,7 @@ def test_flirpy_and_exiftool_read_our_sequence(tmp_path: Path) -> None:
     assert [_by_flirpy(frame) for frame in frames] == [True] * 4
     assert _agrees_with_exiftool(frames[0], *_exiftool([path])) is True
     seconds = [frame.time.astype("datetime64[s]").astype(int) for frame in written]
-    assert [found.meta["Timestamp"] for found in Seq(str(path))] == seconds
+    assert [theirs.meta["Timestamp"] for theirs in Seq(str(path))] == seconds
 
 
 def test_ordinary_viewers_open_our_jpeg(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""FLIR files as written: what goes in comes back, and what the format cannot hold is refused."""
+"""Written FLIR files: values survive a round trip, and values that the format cannot store are refused."""
 
 from __future__ import annotations
 
@@ -62,12 +62,12 @@ def test_writing_leaves_its_input_alone_and_streams(tmp_path: Path) -> None:
             r"counts: expected uint16 with dims \(row, column\), got float64 of shape \(3, 3\)",
         ),
         ({"counts": np.zeros(3, np.uint16)}, r"got uint16 of shape \(3,\)"),
-        ({"time": "1965-01-01"}, "a FLIR file holds times from 1970 to 2106 only"),
+        ({"time": "1965-01-01"}, "a FLIR file stores times from 1970 to 2106 only"),
         (
             {"housekeeping": {"TSLens": 20.0}},
             r"housekeeping 'TSLens' = 20\.0: expected an ASCII name .* and 150 to 450 K",
         ),
-        ({"housekeeping": {f"T{i}": 300.0 for i in range(60)}}, "a FLIR file holds 47 readings, not 60"),
+        ({"housekeeping": {f"T{i}": 300.0 for i in range(60)}}, "a FLIR file stores 47 readings, not 60"),
         ({"encoding": "tiff"}, "encoding 'tiff': expected 'raw', 'png' or 'jpegls'"),
     ],
 )

@@ -1,4 +1,4 @@
-"""PNG samples: equal to the general decoder on every filter, and no damage goes unseen."""
+"""PNG samples: equal to those of the general decoder for every filter, and every damage is detected."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ def test_random_lines_with_all_filters_equal_libpng(rows: int, columns: int, see
     lines[:, 0] = rng.integers(0, 5, rows)
     data = _png((rows, columns), lines.tobytes())
     expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    found = decode_png(data, (rows, columns))
-    np.testing.assert_array_equal(found, expected)
-    assert found.dtype == np.uint16 and found.dtype.isnative and found.flags.writeable
+    decoded = decode_png(data, (rows, columns))
+    np.testing.assert_array_equal(decoded, expected)
+    assert decoded.dtype == np.uint16 and decoded.dtype.isnative and decoded.flags.writeable
 
 
 def test_data_in_several_chunks_and_bytes_after_the_end_are_fine() -> None:
@@ -53,7 +53,7 @@ def test_data_in_several_chunks_and_bytes_after_the_end_are_fine() -> None:
 
 
 @pytest.mark.parametrize(
-    ("data", "expected", "found"),
+    ("data", "expected", "actual"),
     [
         (b"GIF89a..", "the signature of a PNG", "47 49 46 38 39 61 2e 2e"),
         (_png((2, 3), bytes(14))[:50], "bytes in PNG chunk b'IDAT'", "5 before the end"),
@@ -67,11 +67,11 @@ def test_data_in_several_chunks_and_bytes_after_the_end_are_fine() -> None:
     ],
     ids=["signature", "short chunk", "no end", "other size", "other kind", "no header", "short", "bomb", "filter"],
 )
-def test_what_is_no_sound_picture_is_refused(data: bytes, expected: str, found: str) -> None:
+def test_what_is_no_sound_picture_is_refused(data: bytes, expected: str, actual: str) -> None:
     with pytest.raises(PngError) as caught:
         decode_png(data, (2, 3))
     assert len(caught.value.args) == 2
-    assert re.search(expected, caught.value.args[0]) and re.search(found, caught.value.args[1]), caught.value.args
+    assert re.search(expected, caught.value.args[0]) and re.search(actual, caught.value.args[1]), caught.value.args
 
 
 def test_every_single_flipped_bit_is_noticed_or_harmless(rng: np.random.Generator) -> None:
@@ -82,9 +82,9 @@ def test_every_single_flipped_bit_is_noticed_or_harmless(rng: np.random.Generato
         damaged = bytearray(data)
         damaged[place // 8] ^= 1 << place % 8
         try:
-            found = decode_png(bytes(damaged), counts.shape)
+            decoded = decode_png(bytes(damaged), counts.shape)
         except PngError:
             continue
-        np.testing.assert_array_equal(found, counts)
+        np.testing.assert_array_equal(decoded, counts)
     # A decoder that loses references to None ends the interpreter after some ten thousand damaged frames.
     assert sys.getrefcount(None) > before - 100

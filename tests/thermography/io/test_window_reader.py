@@ -1,4 +1,4 @@
-"""A window of frames comes out the same from memory, past the cache, from whole rows, from parts of them, and from packed frames."""
+"""A window of frames is the same from the cache, directly from disk, from whole rows, from parts of rows, and from packed frames."""
 
 import os
 from dataclasses import replace
@@ -20,7 +20,7 @@ def film(path, **options):
     write_sequence(path, frames, **options)
     references, rejected = index_frames([path])
     assert not rejected
-    return references, np.stack([one.counts for one in frames])
+    return references, np.stack([each.counts for each in frames])
 
 
 def forget(path):
@@ -59,21 +59,23 @@ def test_file_that_is_not_in_memory_is_read_past_the_cache(tmp_path):
 
 
 def test_frames_of_several_files_and_a_system_without_direct_reading(tmp_path, monkeypatch):
-    one, first = film(tmp_path / "a.seq")
-    other, second = film(tmp_path / "b.seq")
+    first_film, first = film(tmp_path / "a.seq")
+    second_film, second = film(tmp_path / "b.seq")
     monkeypatch.delattr(os, "O_DIRECT", raising=False)
-    for path in (one[0].path, other[0].path):
+    for path in (first_film[0].path, second_film[0].path):
         forget(path)
     with WindowReader(WINDOW) as reader:
-        got = reader.read([one[2], other[3], other[4], one[5]], np.empty((4, 164, 320), np.uint16))
+        counts = reader.read(
+            [first_film[2], second_film[3], second_film[4], first_film[5]], np.empty((4, 164, 320), np.uint16)
+        )
     expected = np.stack([first[2], second[3], second[4], first[5]])
-    assert (got == expected[(slice(None), *WINDOW)]).all()
+    assert (counts == expected[(slice(None), *WINDOW)]).all()
 
 
-@pytest.mark.parametrize("left", [0, 700_000])
-def test_file_that_became_shorter_is_named(tmp_path, left):
+@pytest.mark.parametrize("length", [0, 700_000])
+def test_file_that_became_shorter_is_named(tmp_path, length):
     references, _ = film(tmp_path / "a.seq")
-    os.truncate(references[0].path, left)
+    os.truncate(references[0].path, length)
     with (
         WindowReader(WINDOW) as reader,
         pytest.raises(OSError, match=r"a\.seq: frame \d+ ends early; the file has become shorter since it was indexed"),

@@ -1,4 +1,4 @@
-"""FLIR files through xarray: lazy, with parameters as variables, honest about what was left out."""
+"""FLIR files opened with xarray: lazy, with parameters as variables, and with a list of what could not be used."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.thermography.flir_mutations import PARAMETERS, TIME, frame, jpeg, seq
 from thermography.io.flir import FrameReference, read_frame
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import FlirFormatError
-from thermography.io.xarray_backend import FlirBackendEntrypoint, open_frames, parameters_at
+from thermography.io.xarray_backend import FlirBackendEntrypoint
 from thermography.radiometry.planck import override
 
 
@@ -61,8 +61,9 @@ def test_contents_of_a_dataset(tmp_path: Path) -> None:
     assert dataset["reflected_temperature"].attrs == {"units": "K", "units_metadata": "temperature: on_scale"}
     assert dataset["camera_temperature"].sel(sensor="TSLens").values.tolist() == [299.25] * 3
     assert json.loads(dataset.attrs["camera"])["serial"] == "404003980"
+    scalars = [float(variable) for variable in dataset.data_vars.values() if variable.ndim == 0]
+    assert sorted(scalars) == sorted(vars(PARAMETERS).values())
     assert json.loads(dataset.attrs["rejected"]) == [] and json.loads(dataset.attrs["notes"]) == []
-    assert parameters_at(dataset, 1) == PARAMETERS
 
 
 def test_parameters_that_vary_lie_along_time(tmp_path: Path) -> None:
@@ -71,7 +72,7 @@ def test_parameters_that_vary_lie_along_time(tmp_path: Path) -> None:
         write_jpeg(tmp_path / f"{second}.jpg", each.counts, override(PARAMETERS, emissivity=emissivity), each.time)
     dataset = _open(sorted(tmp_path.iterdir()))
     assert dataset["emissivity"].dims == ("time",) and dataset["emissivity"].values.tolist() == [0.5, 0.75]
-    assert parameters_at(dataset, 1).emissivity == 0.75 and dataset["camera_temperature"].shape == (2, 0)
+    assert dataset["camera_temperature"].shape == (2, 0)
 
 
 def test_dask_chunks_read_in_parallel_and_pickle(tmp_path: Path) -> None:
@@ -95,7 +96,9 @@ def test_a_dataset_survives_netcdf(tmp_path: Path) -> None:
 def test_what_is_left_out_is_warned_of_and_listed(tmp_path: Path) -> None:
     jpeg(tmp_path / "a.jpg")
     (tmp_path / "b.jpg").write_bytes(b"nothing")
-    with pytest.warns(UserWarning, match=r"1 frames left out, the first: .*b\.jpg: at 0x0: expected a JPEG"):
+    with pytest.warns(
+        UserWarning, match=r"1 files or frames could not be used, the first: .*b\.jpg: at 0x0: expected a JPEG"
+    ):
         dataset = _open(sorted(tmp_path.iterdir()))
     (rejected,) = json.loads(dataset.attrs["rejected"])
     assert rejected["path"].endswith("b.jpg") and "expected a JPEG" in rejected["reason"]
@@ -106,10 +109,11 @@ def test_no_frame_at_all_and_frames_of_other_sizes_are_refused(tmp_path: Path) -
     with pytest.raises(FlirFormatError, match=r"no FLIR frame can be read: .*b\.seq"):
         _open(tmp_path / "b.seq")
     with pytest.raises(FlirFormatError, match="no FLIR frame can be read: no files were given"):
-        open_frames([])
+        FlirBackendEntrypoint().open_dataset([])
     write_sequence(tmp_path / "b.seq", [frame(8, 9), frame(9, 8, seconds=1)])
     with pytest.raises(
-        FlirFormatError, match=r"frame 1 has \(rows, columns\) \(9, 8\), .* has \(8, 9\); open files of diff"
+        FlirFormatError,
+        match=r"frame 1 has \(rows, columns\) \(9, 8\), .* has \(8, 9\); open the files of each camera separately",
     ):
         _open(tmp_path / "b.seq")
 

@@ -1,4 +1,4 @@
-"""Camera artefacts: planted ones are found, corrected and named; none is found where none is."""
+"""Camera artefacts: planted ones are detected, corrected and named; none is detected where none was planted."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ def _record(
             yield replace(frame(1, 1), counts=counts, time=frame(1, 1).time + np.timedelta64(int(second * 1000), "ms"))
 
     write_sequence(path, frames_of_scene())
-    found, rejected = index_frames([path])
+    references, rejected = index_frames([path])
     assert rejected == []
-    return found, offset
+    return references, offset
 
 
 def _levels(change: np.ndarray, *, share: float = 1.0, seconds: float = 5.0) -> Levels:
@@ -76,8 +76,8 @@ def test_planted_steps_are_found_where_they_are_and_re_anchored(
         assert step.value_K == pytest.approx(planted[step.index], abs=0.03)
         assert 0 < step.value_u_K < 0.02
     smooth = offset - sum(np.where(np.arange(200) >= index, height, 0) for index, height in planted.items())
-    left = offset + anchor(levels, steps) - smooth
-    assert np.abs(left).max() < 0.030
+    remaining = offset + anchor(levels, steps) - smooth
+    assert np.abs(remaining).max() < 0.030
 
 
 def test_a_reference_region_serves_when_the_scene_warms_everywhere(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -111,11 +111,11 @@ def test_what_comes_back_or_moves_a_part_is_named_and_not_corrected() -> None:
     passing[41] -= 0.5
     flags = find_steps(_levels(passing))
     assert {flag.cause for flag in flags} == {"transient"}
-    assert "came back: not taken for a flat-field correction" in flags[0].message
+    assert "and returned: not attributed to a flat-field correction" in flags[0].message
     moved = change.copy()
     moved[40] += 0.5
     (flag,) = find_steps(_levels(moved, share=0.6))
-    assert flag.cause == "transient" and "moved 60% of the reference only" in flag.message
+    assert flag.cause == "transient" and "in only 60% of the reference" in flag.message
     np.testing.assert_array_equal(anchor(_levels(moved), [flag]), 0)
 
 
@@ -149,8 +149,8 @@ def test_repeated_and_frozen_frames_are_told_apart(tmp_path: Path) -> None:
     levels = read_levels(index_frames([tmp_path / "a.seq"])[0])
     flags = find_repeats(levels)
     assert [(flag.cause, flag.index) for flag in flags] == [("repeated_frame", 2), ("frozen_frames", 6)]
-    assert flags[0].message == "1 frames repeat the counts of frame 1"
-    assert flags[1].message == "4 frames repeat the counts of frame 5: the camera stood still"
+    assert flags[0].message == "1 frame repeats the counts of frame 1"
+    assert flags[1].message == "4 frames repeat the counts of frame 5: the camera output was frozen"
 
 
 # Slow drift ----------------------------------------------------------------------------------------------------------
@@ -171,25 +171,25 @@ def _temperatures(frames: int, rng: np.random.Generator) -> np.ndarray:
 
 def test_drift_with_the_camera_is_explained_and_removed(rng: np.random.Generator) -> None:
     temperature = _temperatures(400, rng)
-    drift = 0.08 * (temperature[:, 0] - 300) - 0.05 * (temperature[:, 1] - 299)
-    level = drift - drift[0] + rng.normal(0, 0.005, 400)
-    found = regress_drift(_of(level), [], temperature, ["TSCapsule", "TSLens", "TSShutter"])
-    assert found.p_value < 1e-6 and found.explained > 0.9
-    assert found.coefficients["TSCapsule"] == pytest.approx(0.08, abs=0.01)
-    assert found.coefficients["TSLens"] == pytest.approx(-0.05, abs=0.015)
-    assert "TSShutter" not in found.coefficients
-    assert found.flag is not None and found.flag.cause == "camera_drift"
-    assert found.flag.value_K == pytest.approx(np.ptp(drift), rel=0.05)
-    assert "of a drift; up to 0." in found.flag.message
-    assert np.std(level + found.correction) < 0.007 < np.std(level)
+    planted = 0.08 * (temperature[:, 0] - 300) - 0.05 * (temperature[:, 1] - 299)
+    level = planted - planted[0] + rng.normal(0, 0.005, 400)
+    drift = regress_drift(_of(level), [], temperature, ["TSCapsule", "TSLens", "TSShutter"])
+    assert drift.p_value < 1e-6 and drift.explained > 0.9
+    assert drift.coefficients["TSCapsule"] == pytest.approx(0.08, abs=0.01)
+    assert drift.coefficients["TSLens"] == pytest.approx(-0.05, abs=0.015)
+    assert "TSShutter" not in drift.coefficients
+    assert drift.flag is not None and drift.flag.cause == "camera_drift"
+    assert drift.flag.value_K == pytest.approx(np.ptp(planted), rel=0.05)
+    assert "of a drift; up to 0." in drift.flag.message
+    assert np.std(level + drift.correction) < 0.007 < np.std(level)
 
 
 def test_noise_is_not_explained_by_the_camera() -> None:
     corrected = 0
     for seed in range(100):
         rng = np.random.default_rng(seed)
-        found = regress_drift(_of(rng.normal(0, 0.01, 300)), [], _temperatures(300, rng), ["a", "b", "c"])
-        corrected += bool(found.correction.any())
+        drift = regress_drift(_of(rng.normal(0, 0.01, 300)), [], _temperatures(300, rng), ["a", "b", "c"])
+        corrected += bool(drift.correction.any())
     # One in a hundred by chance at a significance of 0.01; 5 or more has a probability of 0.4 %.
     assert corrected < 5
 
@@ -200,15 +200,15 @@ def test_a_wandering_level_is_not_easily_explained() -> None:
     for seed in range(100):
         rng = np.random.default_rng(seed)
         wander = np.cumsum(rng.normal(0, 1, (300, 2)), axis=0)
-        found = regress_drift(_of(wander[:, 0] * 0.01), [], 300 + wander[:, 1:], ["TSLens"])
-        corrected += bool(found.correction.any())
+        drift = regress_drift(_of(wander[:, 0] * 0.01), [], 300 + wander[:, 1:], ["TSLens"])
+        corrected += bool(drift.correction.any())
     assert corrected <= 10
 
 
 @pytest.mark.parametrize("temperature", [np.full((50, 1), 300.0), np.full((50, 1), np.nan)])
 def test_sensors_without_change_or_with_gaps_explain_nothing(temperature: np.ndarray) -> None:
-    found = regress_drift(_of(np.linspace(0, 1, 50)), [], temperature, ["TSLens"])
-    assert not found.correction.any() and found.coefficients == {} and found.p_value == 1.0 and found.flag is None
+    drift = regress_drift(_of(np.linspace(0, 1, 50)), [], temperature, ["TSLens"])
+    assert not drift.correction.any() and drift.coefficients == {} and drift.p_value == 1.0 and drift.flag is None
 
 
 def test_steps_are_no_drift(rng: np.random.Generator) -> None:
@@ -218,9 +218,9 @@ def test_steps_are_no_drift(rng: np.random.Generator) -> None:
     levels = _of(level)
     steps = find_steps(levels)
     assert [step.index for step in steps] == [150]
-    found = regress_drift(levels, steps, temperature, ["a", "b", "c"])
+    drift = regress_drift(levels, steps, temperature, ["a", "b", "c"])
     # The step is known to about 3 mK, and only that rest may look like drift.
-    assert np.ptp(found.correction) < 0.01
+    assert np.ptp(drift.correction) < 0.01
 
 
 # Bad pixels ----------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Emissivity from two known states: unbiased, with an honest uncertainty, and honest about metal."""
+"""Emissivity from two known states: unbiased, with a valid uncertainty, and classified for reflecting surfaces."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ def test_classes() -> None:
     assert estimate_emissivity(cold, impossible, PARAMETERS).quality == "undetermined"
 
 
-def test_equal_states_are_refused() -> None:
+def test_equal_states_raise() -> None:
     state = _states(0.9)[0]
     with pytest.raises(RadiometryError, match="both states have 22 degC: heat the surface between them"):
         estimate_emissivity(state, state, PARAMETERS)
 
 
-def test_a_black_surface_reflects_nothing_to_tell() -> None:
+def test_the_reflected_temperature_of_a_black_surface_is_undetermined() -> None:
     assert np.isnan(estimate_emissivity(*_states(0.995), PARAMETERS).reflected_temperature_degC)

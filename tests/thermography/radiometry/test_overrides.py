@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.thermography.flir_mutations import PARAMETERS, TIME, frame
-from thermography.radiometry.overrides import Overrides, Region, Series, emissivity_map
+from thermography.radiometry.overrides import EmissivityRegion, Overrides, ParameterLog, emissivity_map
 from thermography.radiometry.planck import RadiometryError
 
 TIMES = TIME + np.array([0, 100, 300]).astype("timedelta64[s]")
@@ -20,7 +20,7 @@ def test_constants_replace_what_the_file_says() -> None:
 
 
 def test_logged_conditions_are_interpolated_to_each_frame_and_win() -> None:
-    air = Series(TIMES, np.array([293.0, 295.0, 294.0]))
+    air = ParameterLog(TIMES, np.array([293.0, 295.0, 294.0]))
     overrides = Overrides({"atmospheric_temperature_K": 300.0, "emissivity": 0.9}, {"atmospheric_temperature_K": air})
     assert overrides(frame(seconds=0)).atmospheric_temperature_K == 293.0
     assert overrides(frame(seconds=25)).atmospheric_temperature_K == pytest.approx(293.5)
@@ -29,11 +29,11 @@ def test_logged_conditions_are_interpolated_to_each_frame_and_win() -> None:
 
 
 def test_a_log_is_not_extrapolated() -> None:
-    air = Series(TIMES.astype("datetime64[ns]"), np.array([293.0, 295.0, 294.0]))
+    air = ParameterLog(TIMES.astype("datetime64[ns]"), np.array([293.0, 295.0, 294.0]))
     with pytest.raises(
         RadiometryError, match=r"frame at 2026-03-09T06:38:48\.125: the log reaches from .* only; extend it"
     ):
-        Overrides(series={"atmospheric_temperature_K": air})(frame(seconds=301))
+        Overrides(logs={"atmospheric_temperature_K": air})(frame(seconds=301))
 
 
 @pytest.mark.parametrize(
@@ -46,18 +46,18 @@ def test_a_log_is_not_extrapolated() -> None:
 )
 def test_a_broken_log_is_refused(times: np.ndarray, values: list[float], message: str) -> None:
     with pytest.raises(RadiometryError, match=message):
-        Series(times, np.array(values))
+        ParameterLog(times, np.array(values))
 
 
 def test_an_unknown_parameter_is_refused() -> None:
-    with pytest.raises(RadiometryError, match="parameter 'humidity' is not known"):
+    with pytest.raises(RadiometryError, match="parameter 'humidity' is unknown"):
         Overrides({"humidity": 0.4})(frame())
 
 
 def test_regions_of_paint_foil_and_metal() -> None:
     x, y = np.meshgrid(np.arange(0.5, 10), np.arange(0.5, 5))
-    foil = Region("foil", ((2, 1), (6, 1), (6, 4), (2, 4)), 0.1)
-    patch = Region("paint on foil", ((3, 2), (4, 2), (4, 3), (3, 3)), 0.95)
+    foil = EmissivityRegion("foil", ((2, 1), (6, 1), (6, 4), (2, 4)), 0.1)
+    patch = EmissivityRegion("paint on foil", ((3, 2), (4, 2), (4, 3), (3, 3)), 0.95)
     result = emissivity_map(x, y, [foil, patch], default=0.97)
     assert result.shape == (5, 10)
     assert (result == 0.1).sum() == 4 * 3 - 1
@@ -66,7 +66,7 @@ def test_regions_of_paint_foil_and_metal() -> None:
 
 
 def test_impossible_regions_are_refused() -> None:
-    with pytest.raises(RadiometryError, match=r"emissivity of foil: 97 is no fraction above 0 and up to 1"):
-        emissivity_map(0.0, 0.0, [Region("foil", ((0, 0), (1, 0), (0, 1)), 97.0)], default=0.9)
+    with pytest.raises(RadiometryError, match=r"emissivity of foil: 97 is not a fraction above 0 and up to 1"):
+        emissivity_map(0.0, 0.0, [EmissivityRegion("foil", ((0, 0), (1, 0), (0, 1)), 97.0)], default=0.9)
     with pytest.raises(RadiometryError, match="region line: expected at least 3 corners, got 2"):
-        emissivity_map(0.0, 0.0, [Region("line", ((0, 0), (1, 0)), 0.9)], default=0.9)
+        emissivity_map(0.0, 0.0, [EmissivityRegion("line", ((0, 0), (1, 0)), 0.9)], default=0.9)

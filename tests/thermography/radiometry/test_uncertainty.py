@@ -1,4 +1,4 @@
-"""Uncertainty of temperatures and rises, held to Monte Carlo simulation of the measurement itself."""
+"""Uncertainty of temperatures and rises, compared with Monte Carlo simulations of the measurement."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _inputs(window: bool) -> InputUncertainty:
 
 
 def _draw(parameters: CameraParameters, inputs: InputUncertainty, rng: np.random.Generator) -> list[CameraParameters]:
-    """Draw what the parameters may really have been; uniform for the fractions that must stay below one."""
+    """Draw possible true parameters, uniformly distributed; fractions stay between 0 and 1."""
     names = [name for name in asdict(inputs) if name in asdict(parameters)]
     drawn = []
     for _ in range(DRAWS // 10):
@@ -45,7 +45,7 @@ def _draw(parameters: CameraParameters, inputs: InputUncertainty, rng: np.random
 def _simulate(
     temperatures: np.ndarray, parameters: CameraParameters, inputs: InputUncertainty, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return the standard deviation of what the camera would have measured: wrong parameters, noise, rounding, its offset."""
+    """Return the standard deviation of simulated temperatures: wrong parameters, noise, rounding, offset of the camera."""
     black = override(parameters, emissivity=1.0, object_distance_m=0.0, window_transmission=1.0)
     counts_per_kelvin = np.diff(counts_from_temperature([30.0, 30.001], black))[0] / 0.001
     true = counts_from_temperature(temperatures, parameters)
@@ -87,15 +87,15 @@ def test_rise_uncertainty_equals_monte_carlo_and_not_twice_the_level(rng: np.ran
     level = float(temperature_uncertainty(after, parameters, inputs).common_u)
     assert float(budget.common_u) < 0.06 < 1.0 < level
     # Noise of two frames: sqrt(2) of one, within the 0.6 % that its sensitivity changes over 5 K.
-    one = float(temperature_uncertainty(after, parameters, inputs).per_frame_u)
-    assert float(budget.per_frame_u) == pytest.approx(np.sqrt(2) * one, rel=0.05)
+    single = float(temperature_uncertainty(after, parameters, inputs).per_frame_u)
+    assert float(budget.per_frame_u) == pytest.approx(np.sqrt(2) * single, rel=0.05)
 
 
 def test_averaging_reduces_the_per_frame_part_only() -> None:
-    one = temperature_uncertainty(25.0, PARAMETERS)
+    single = temperature_uncertainty(25.0, PARAMETERS)
     hundred = temperature_uncertainty(25.0, PARAMETERS, frames=100)
-    assert float(hundred.common_u) == float(one.common_u)
-    assert float(hundred.per_frame_u) == pytest.approx(float(one.per_frame_u) / 10)
+    assert float(hundred.common_u) == float(single.common_u)
+    assert float(hundred.per_frame_u) == pytest.approx(float(single.per_frame_u) / 10)
 
 
 def test_budget_names_its_parts_and_adds_them_up() -> None:
