@@ -14,7 +14,7 @@ import numpy as np
 
 from fusion._typing import Array
 from fusion.diagnosis import remainder
-from fusion.effects.candidates import off_the_cycle
+from fusion.effects.events import off_the_cycle
 from fusion.model.fit import ModelFit, unexplained_drift
 
 _PERMUTATIONS = 400

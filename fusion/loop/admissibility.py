@@ -14,7 +14,8 @@ import numpy as np
 
 from fusion._typing import Array
 from fusion.alignment.readings import Readings, Series, sample_noise
-from fusion.effects.candidates import Candidate, warm_up
+from fusion.effects.effect import Candidate
+from fusion.effects.states import warm_up
 from fusion.loop.decisions import Decision, Reason
 from fusion.model.fit import ModelFit
 from fusion.model.least_squares import residual_squares

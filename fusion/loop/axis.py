@@ -16,9 +16,9 @@ from threadpoolctl import threadpool_limits
 
 from fusion.alignment.readings import Readings
 from fusion.diagnosis import remainder
-from fusion.effects.candidates import Candidate
+from fusion.effects.effect import Candidate, Effect
 from fusion.effects.jumps import cycle_starts
-from fusion.effects.library import LIBRARY, Effect, library
+from fusion.effects.library import LIBRARY, library
 from fusion.errors import FusionError
 from fusion.loop.admissibility import AxisGrounds, refuse
 from fusion.loop.axis_pattern import wrong_patterns

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.effects.candidates import Candidate
+from fusion.effects.effect import Candidate
 from fusion.loop.scoring import Families, Gains
 from fusion.loop.state import Confirmation, Confirmed, Score
 from fusion.model.drift_variances import SHIFT_AND_STRETCH, scaled_systems

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.effects.candidates import Candidate, hidden_leads_mm
-from fusion.effects.library import Effect
+from fusion.effects.effect import Candidate, Effect
+from fusion.effects.geometry import hidden_leads_mm
 from fusion.loop.admissibility import WARM_UP_SHARE, warm_up_share
 from fusion.loop.confirmation import CandidateScorer
 from fusion.loop.state import DetectionLimit, Score

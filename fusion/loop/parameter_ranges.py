@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from fusion._typing import Array
-from fusion.effects.candidates import Candidate
+from fusion.effects.effect import Candidate
 
 #: Log-likelihood by which the best may beat a value that a 95 % interval still holds: half of chi-squared, 1 degree of freedom.
 _WITHIN = 1.92

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.effects.candidates import Candidate
+from fusion.effects.effect import Candidate
 from fusion.loop.decisions import Decision, Reason
 from fusion.loop.parameter_ranges import DERIVED_WORDS, parameter_ranges
 from fusion.loop.state import Score, SearchError

@@ -12,7 +12,7 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from fusion.effects.candidates import Candidate
+from fusion.effects.effect import Candidate
 from fusion.errors import FusionError
 from fusion.loop.decisions import BLOCKING, FINAL, NOT_TRIED, Decision, Reason
 from fusion.loop.parameter_ranges import Range

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from fusion._typing import Array
 from fusion.alignment.readings import Readings
-from fusion.effects.candidates import Candidate, Prior
-from fusion.effects.library import Effect
+from fusion.effects.effect import Candidate, Effect, Prior
 from interferometry.drift.gls import DriftFit, estimate, fit_fixed_effects
 from interferometry.drift.state_space import DriftSystem
 

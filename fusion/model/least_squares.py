@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from fusion._typing import Array
-from fusion.effects.candidates import Candidate
+from fusion.effects.effect import Candidate
 
 #: A candidate of which the model explains all but this share adds nothing that these data can show.
 _SEPARABLE_SHARE = 1e-4

@@ -12,8 +12,9 @@ from fusion.alignment.align import align
 from fusion.alignment.readings import Readings, read_fused
 from fusion.campaign.inputs import Source, counted
 from fusion.diagnosis.residual_tests import ResidualTests, examine_residual
-from fusion.effects.candidates import Prior
-from fusion.effects.library import EXPANSION_U_PPM_PER_K, Effect, library
+from fusion.effects.effect import Effect, Prior
+from fusion.effects.library import library
+from fusion.effects.thermal import EXPANSION_U_PPM_PER_K, QUASI_STATIC
 from fusion.loop.axis import close_loop, on_corrected_fields, set_aside_sites
 from fusion.loop.camera_correction import FieldError, correct_fields, corrected_variables, find_field_errors
 from fusion.loop.result import LoopResult
@@ -23,7 +24,6 @@ from fusion.products import store
 from fusion.products.grouped import joined
 from fusion.products.progress import Report
 from fusion.products.results import Notice, Outcome
-from fusion.record.effects import QUASI_STATIC
 
 
 def effect_names() -> tuple[str, ...]:

@@ -11,10 +11,10 @@ import xarray as xr
 from fusion.campaign.config import Campaign
 from fusion.campaign.inputs import counted, left_out_notices, listed
 from fusion.campaign.logged_tables import read_record
+from fusion.effects.thermal import QUASI_STATIC
 from fusion.products.progress import Report
 from fusion.products.results import Notice, Outcome
 from fusion.record.blocks import Record, reduce_record
-from fusion.record.effects import QUASI_STATIC
 from fusion.record.hold_out import declare
 from fusion.record.loop import close_record
 from fusion.record.result import RecordResult

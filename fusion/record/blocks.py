@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from fusion._typing import Array
 from fusion.alignment.readings import Readings, Series, sample_noise
+from fusion.effects.thermal import SENSOR_PREFIX
 from fusion.errors import FusionError
 
 #: Blocks that a record is averaged to at most: more cost time and hold no more of what is slow.
@@ -87,7 +88,7 @@ class Record:
         one = np.ones(self.seconds.size)
         series = {"mean_rise": Series(self.seconds, self.rise.mean(axis=1), "K")}
         series |= {
-            f"temperature {name}": Series(self.seconds, self.rise[:, k], "K") for k, name in enumerate(self.sensors)
+            f"{SENSOR_PREFIX}{name}": Series(self.seconds, self.rise[:, k], "K") for k, name in enumerate(self.sensors)
         }
         series |= {name: Series(self.seconds, powers[1], "1") for name, powers in self.drivers.items()}
         return Readings(

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion.alignment.readings import Series
-from fusion.effects.candidates import LAGS_MIN, Candidate, periods_min
+from fusion.effects.effect import Candidate, Effect
+from fusion.effects.events import periods_min
 from fusion.effects.jumps import jumps
-from fusion.effects.library import LIBRARY, Effect, library
+from fusion.effects.library import LIBRARY, library
+from fusion.effects.states import LAGS_MIN
 from fusion.record.blocks import EXPONENTS, Record
 
-#: What a record is modelled with where nothing else is declared: every displacement a linear function of the temperatures.
-QUASI_STATIC = "quasi_static"
 #: Name of the mean of all sensors among the sensors that may lag.
 MEAN = "mean of all"
 #: A load acts at once (bearings widen with the speed), warms the part beside it, then what that part is joined to: states a factor of
@@ -53,11 +53,6 @@ class RecordEffect:
     candidates: Callable[[Record, Candidate | None], Iterator[Candidate]]
     needs: Callable[[Record], str | None]
     excited_by: str = ""
-
-
-def quasi_static_columns(record: Record) -> Candidate:
-    """Rise of every sensor, K: the declared model of a record."""
-    return Candidate(record.rise, {}, ("um/K",) * len(record.sensors))
 
 
 def thermal_lag_candidates(record: Record, near: Candidate | None) -> Iterator[Candidate]:

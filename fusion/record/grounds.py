@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from fusion._typing import Array
-from fusion.effects.candidates import Candidate
+from fusion.effects.effect import Candidate
 from fusion.loop.admissibility import NOISE_SHARE
 from fusion.loop.decisions import Decision, Reason
 from fusion.record.blocks import Record

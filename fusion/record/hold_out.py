@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.effects.thermal import QUASI_STATIC, QUASI_STATIC_RESPONSE
 from fusion.loop.closed_loop import HOLD_OUT_SHARE
 from fusion.model.fit import Term
 from fusion.record.blocks import Record, RecordError
-from fusion.record.effects import QUASI_STATIC, quasi_static_columns
 
 
 def hold_out(record: Record) -> tuple[NDArray[np.bool_], str]:
@@ -54,5 +54,5 @@ def declare(declared: Sequence[str], record: Record) -> list[Term]:
                 f'declared effect {name!r} cannot be computed from a record; declare "{QUASI_STATIC}" (every displacement linear '
                 "in the temperatures), the search tries the rest of the library"
             )
-        terms.append(Term(QUASI_STATIC, quasi_static_columns(record)))
+        terms += [Term(QUASI_STATIC, one) for one in QUASI_STATIC_RESPONSE.candidates(record.view(), {}, None)]
     return terms

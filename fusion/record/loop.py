@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from fusion.effects.library import Effect
+from fusion.effects.effect import Effect
 from fusion.loop.closed_loop import MOST_EFFECTS, Progress, no_progress, open_hold_out, withdraw
 from fusion.loop.decisions import Decision, Reason
 from fusion.record.blocks import Record

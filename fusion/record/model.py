@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.effects.candidates import Candidate
+from fusion.effects.effect import Candidate
 from fusion.loop.scoring import Gains
 from fusion.model.drift_variances import SINGLE, plausible_ratios, scaled_systems
 from fusion.model.fit import Term

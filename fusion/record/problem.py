@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from fusion._typing import Array
-from fusion.effects.candidates import Candidate
-from fusion.effects.library import LIBRARY, Effect
+from fusion.effects.effect import Candidate, Effect
+from fusion.effects.library import LIBRARY
 from fusion.loop.admissibility import refuse
 from fusion.loop.closed_loop import MAY_REPEAT, Progress, no_progress, search
 from fusion.loop.decisions import Decision, Reason

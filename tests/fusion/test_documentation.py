@@ -12,8 +12,9 @@ from typer.main import get_command
 
 from fusion import cli
 from fusion.campaign.config import EFFECT_NAMES, load_campaign
-from fusion.effects.library import LIBRARY, Effect
-from fusion.record.effects import QUASI_STATIC
+from fusion.effects.effect import Effect
+from fusion.effects.library import LIBRARY
+from fusion.effects.thermal import QUASI_STATIC
 from fusion.report.wording import CAUSES, EFFECTS
 
 ROOT = Path(__file__).resolve().parents[2]

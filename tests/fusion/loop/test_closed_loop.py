@@ -10,9 +10,9 @@ import pytest
 
 from fusion.alignment.align import AxisGeometry, align
 from fusion.alignment.readings import Readings, ReadingsError, Series, read_fused
-from fusion.effects.candidates import Candidate, Prior
+from fusion.effects.effect import Candidate, Effect, Prior
 from fusion.effects.jumps import event_instants, instants_near
-from fusion.effects.library import Effect, library
+from fusion.effects.library import library
 from fusion.loop.axis import LoopError, close_loop, set_aside_sites
 from fusion.twin import simulate
 from fusion.twin.datasets import deviations_of, fields_of

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusion.effects.candidates import Candidate, pitch_error_candidates
+from fusion.effects.effect import Candidate
+from fusion.effects.geometry import PITCH_ERROR
 from fusion.loop.parameter_ranges import parameter_ranges
 from fusion.report.model_section import parameters_with_ranges
 from tests.fusion.loop_bench import readings_of
@@ -56,8 +57,8 @@ def test_a_closer_look_stays_among_waves_that_a_screw_can_make():
     """Half a travel is the longest wave that is tried; the states that scale it are all offered again."""
     readings = readings_of(seed=3)
     travel = float(np.ptp(readings.positions_mm))
-    longest = next(candidate for candidate in pitch_error_candidates(readings, {}, None))
+    longest = next(candidate for candidate in PITCH_ERROR.candidates(readings, {}, None))
     assert longest.parameters["period_mm"] == pytest.approx(travel / 2)
-    near = list(pitch_error_candidates(readings, {}, longest))
+    near = list(PITCH_ERROR.candidates(readings, {}, longest))
     assert max(candidate.parameters["period_mm"] for candidate in near) <= travel / 2 * 1.001
     assert {candidate.parameters["follows"] for candidate in near} == {"mean_rise", "duty", "warm_up"}

@@ -11,8 +11,8 @@ import pytest
 
 from fusion.campaign.config import load_campaign
 from fusion.campaign.logged_tables import read_record
-from fusion.effects.candidates import Candidate
-from fusion.effects.library import Effect, library
+from fusion.effects.effect import Candidate, Effect
+from fusion.effects.library import library
 from fusion.loop.admissibility import refuse
 from fusion.loop.closed_loop import open_hold_out
 from fusion.loop.decisions import Reason

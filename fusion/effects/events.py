@@ -1,0 +1,85 @@
+"""What happens at an instant or in a rhythm: a slip of the set-up, and disturbances that switch in a fixed period."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from fusion._typing import Array
+from fusion.alignment.readings import Readings
+from fusion.effects.effect import Candidate, Effect
+from fusion.effects.jumps import cycle_starts, event_instants, instants_near
+
+#: Periods that are tried at most: all down to 3 min in a record of 7.5 h, down to 11 min in one of 28 h.
+_MOST_PERIODS = 300
+
+
+def _step_event(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+    """Steps at the instants that can be tried."""
+    tried = event_instants(readings) if near is None or near.event_s is None else instants_near(readings, near.event_s)
+    for instant in tried:
+        late = (readings.seconds >= instant).astype(float)
+        yield Candidate(late[:, None], {"time_s": float(instant)}, ("um",), instant)
+
+
+def periods_min(readings: Readings) -> Array:
+    """Periods that are tried: evenly spaced in frequency at half the resolution of the record, 3 min to a third of it.
+
+    Periods that the cycle or its halves would imitate are left out: every slow change of the profile has lines there.
+    """
+    span = _span_min(readings)
+    return np.asarray(1.0 / off_the_cycle(readings, np.arange(3.0 / span, 1.0 / 3.0, 0.5 / span, dtype=np.float64)))
+
+
+def _span_min(readings: Readings) -> float:
+    return float(readings.seconds[-1] - readings.seconds[0]) / 60.0
+
+
+def off_the_cycle(readings: Readings, frequencies: Array) -> Array:
+    """Those frequencies (1/min) that are not within four lines of the cycle or its parts."""
+    cycle = 60.0 / float(np.median(np.diff(cycle_starts(readings))))
+    order = np.maximum(1.0, np.round(frequencies / cycle))
+    return np.asarray(frequencies[np.abs(frequencies - order * cycle) > 4.0 / _span_min(readings)])
+
+
+def _periodic_disturbance(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
+    """Waves in time, flat or along the axis."""
+    # A long campaign tells so many periods apart that the shortest are left out: the search stays linear in the readings.
+    periods = (
+        periods_min(readings)[:_MOST_PERIODS]
+        if near is None
+        else _close_periods(readings, float(near.parameters["period_min"]))
+    )
+    for period in periods:
+        phase = 2 * np.pi * readings.seconds / (60.0 * period)
+        waves = np.column_stack([np.cos(phase), np.sin(phase)])
+        yield Candidate(waves, {"period_min": float(period), "shape": "flat"}, ("um", "um"))
+        linear = waves * readings.share[:, None]
+        yield Candidate(linear, {"period_min": float(period), "shape": "linear"}, ("um", "um"))
+
+
+def _close_periods(readings: Readings, found_min: float) -> Array:
+    """Periods around one that was found, as close as the record can tell apart; none that the search would not have tried."""
+    span = _span_min(readings)
+    near = 1.0 / found_min + np.linspace(-0.5, 0.5, 21) / span
+    near = near[(near > 2.999 / span) & (near < 1.001 / 3.0)]
+    return np.asarray(1.0 / off_the_cycle(readings, near))
+
+
+STEP_EVENT = Effect(
+    name="step_event",
+    physics="A mount, clamp or optic slips once: all readings after that instant are shifted.",
+    source="level shift at one instant",
+    candidates=_step_event,
+    label="sudden step",
+    remedy="Look at the clamping of optics and laser head, and at what happened at that time.",
+)
+PERIODIC_DISTURBANCE = Effect(
+    name="periodic_disturbance",
+    physics="Cooling, coolant or air conditioning switches in a fixed rhythm.",
+    source="line in the spectrum of the readings' own times",
+    candidates=_periodic_disturbance,
+    label="periodic disturbance",
+    remedy="Compare its period with coolant, hydraulics and air conditioning.",
+)

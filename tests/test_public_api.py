@@ -1,0 +1,117 @@
+"""The public names: importable, documented for a user, with examples that run; and the share of documented functions everywhere."""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import importlib
+import inspect
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import thermofuse
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("thermography", "interferometry", "fusion")
+PUBLIC = [(package, name) for package in PACKAGES for name in importlib.import_module(package).__all__]
+#: Words by which a docstring names its source: an equation, a paper, a clause of a standard, or a page of the method.
+SOURCES = ("Notes", "References")
+
+
+@pytest.mark.parametrize(("package", "name"), PUBLIC)
+def test_a_public_name_is_documented_for_a_user(package: str, name: str) -> None:
+    thing = getattr(importlib.import_module(package), name)
+    text = inspect.getdoc(thing) or ""
+    assert text, f"{package}.{name} has no docstring"
+    if inspect.isclass(thing):
+        # An error has a message, a record has attributes with units.
+        assert issubclass(thing, Exception) or "Attributes" in text or "Parameters" in text
+        return
+    signature = inspect.signature(thing)
+    headings = ["Raises", *(["Parameters"] if signature.parameters else [])]
+    if signature.return_annotation not in (None, "None"):
+        headings.append("Returns")
+    missing = [heading for heading in headings if f"\n{heading}\n---" not in text]
+    assert not missing, f"{package}.{name} lacks {missing}"
+    assert any(f"\n{heading}\n---" in text for heading in SOURCES), f"{package}.{name} names no source"
+    described = text.split("Parameters\n", 1)[-1]
+    for parameter in signature.parameters.values():
+        bare = {parameter.VAR_POSITIONAL: "*", parameter.VAR_KEYWORD: "**"}.get(parameter.kind, "") + parameter.name
+        assert bare in described, f"{package}.{name} does not describe {bare}"
+
+
+def test_the_root_module_re_exports_names_of_the_packages() -> None:
+    for name in thermofuse.__all__:
+        thing = getattr(thermofuse, name)
+        assert any(getattr(importlib.import_module(package), name, None) is thing for package in PACKAGES), name
+    assert set(thermofuse.__all__) <= set(dir(thermofuse))
+    assert thermofuse.__version__.count(".") == 2
+    with pytest.raises(AttributeError, match="module 'thermofuse' has no attribute 'nothing'"):
+        thermofuse.nothing  # noqa: B018
+
+
+def test_each_package_has_one_error_base_class() -> None:
+    for package, base in zip(PACKAGES, ("ThermographyError", "InterferometryError", "FusionError"), strict=True):
+        root = getattr(importlib.import_module(package), base)
+        assert issubclass(root, ValueError)
+        for path in (ROOT / package).rglob("*.py"):
+            module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+                if isinstance(node, ast.ClassDef) and node.name.endswith("Error") and node.bases:
+                    thing = getattr(importlib.import_module(module), node.name)
+                    # A record of what went wrong is no exception, whatever its name.
+                    assert not issubclass(thing, Exception) or issubclass(thing, root), f"{module}.{node.name}"
+
+
+def modules_with_examples() -> list[str]:
+    """Modules whose docstrings hold an example."""
+    paths = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    return sorted(
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        for path in paths
+        if ">>> " in path.read_text(encoding="utf-8")
+    )
+
+
+@pytest.mark.parametrize("module", modules_with_examples())
+def test_examples_in_docstrings_run(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = doctest.testmod(
+        importlib.import_module(module), optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+    )
+    assert result.attempted > 0
+    assert result.failed == 0
+
+
+def test_public_functions_document_their_parameters() -> None:
+    undocumented, total = [], 0
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+                if not isinstance(node, ast.FunctionDef) or node.name.startswith("_"):
+                    continue
+                if node.args.args or node.args.kwonlyargs:
+                    total += 1
+                    if "Parameters" not in (ast.get_docstring(node) or ""):
+                        undocumented.append(f"{path.relative_to(ROOT)}:{node.name}")
+    assert len(undocumented) <= 0.05 * total, f"{len(undocumented)} of {total}: {undocumented}"
+
+
+@pytest.mark.parametrize("package", [*PACKAGES, "thermofuse"])
+def test_importing_a_package_is_quick_because_it_imports_nothing_large(package: str) -> None:
+    code = (
+        f"import sys, {package}; print(sorted({{'numpy', 'xarray', 'cv2', 'numba', 'matplotlib'}} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    assert done.stdout.strip() == "[]"
