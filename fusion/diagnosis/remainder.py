@@ -1,14 +1,14 @@
-"""Does a shape remain? Tests of what a model leaves, and a description of it in words a metrologist can check.
+"""Permutation tests for structure in the residual, and a description of it in words a metrologist can check.
 
 The noise that the fit estimates for every reading is laid out as a matrix of cycles and sites (target and direction). Where the
 model is complete, cycles are exchangeable within a site; permuting them gives every statistic its null, whatever the tails or the
 scatter of the single site. The shape is described from the readings minus the fixed effects, freed of offset and stretch per cycle,
-not from the whitened noise: the drift swallows a part of slow patterns (statistics study, section 3.3).
+not from the whitened noise: the drift swallows a part of slow patterns (docs/method/closed-loop.md).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -23,10 +23,52 @@ from interferometry.drift.gls import DriftFit
 
 _PERMUTATIONS = 400
 _BLOCK = 5
-#: Chance at which "a shape remains" is said though nothing does, over all statistics together.
+#: Probability of reporting a shape where none is left, over all statistics together.
 LEVEL = 0.02
-#: A drift without a name counts as a remainder from this share of a reading's noise on.
+#: An unexplained drift counts as a remainder from this share of a reading's noise on.
 _DRIFT_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class PermutationTest:
+    """Several statistics of a residual against their permutation distribution.
+
+    Attributes
+    ----------
+    p_value : family-wise, over all statistics
+    p_values : of each statistic alone
+    strongest : name of the most unusual statistic
+    """
+
+    p_value: float
+    p_values: dict[str, float]
+    strongest: str
+
+
+def permutation_test(
+    residual: Array,
+    statistics: Callable[[Array], Array],
+    permute: Callable[[Array], Array],
+    *,
+    names: Sequence[str],
+) -> PermutationTest:
+    """Test a residual for structure.
+
+    Parameters
+    ----------
+    residual : (rows, columns) standardised; exchangeable in the way ``permute`` exchanges it where the model is complete
+    statistics : from such a matrix to (k,) statistics that grow with structure
+    permute : a random permutation of such a matrix
+    names : (k,) of the statistics
+
+    Returns
+    -------
+    PermutationTest
+        From 400 permutations.
+    """
+    null = np.array([statistics(permute(residual)) for _ in range(_PERMUTATIONS)])
+    each, p_value, strongest = family_wise(statistics(residual), null)
+    return PermutationTest(p_value, dict(zip(names, each.tolist(), strict=True)), names[strongest])
 
 
 @dataclass(frozen=True)
@@ -35,7 +77,7 @@ class Remainder:
 
     Attributes
     ----------
-    p_value : chance of so much structure where nothing is missing, over all statistics
+    p_value : probability of so much structure where nothing is missing, family-wise over all statistics
     p_values : the same for each statistic alone
     shape : in words, empty where nothing remains
     rms_um : root mean square of the described shape over the readings
@@ -82,36 +124,45 @@ def examine(
     share_of = readings.positions_mm / readings.span_mm
     place = np.array([share_of[np.flatnonzero(readings.targets == sites[k][0])[0]] for k in kept])
 
-    observed = _statistics(tested, signs, place)
-    null = np.array([_statistics(_permuted(tested, rng), signs, place) for _ in range(_PERMUTATIONS)])
-    names = ("pattern", "slow pattern", "one place", "direction", "direction along the axis", "curvature")
-    each, p_value, _ = family_wise(observed, null)
-    p_values = dict(zip(names, each.tolist(), strict=True))
+    # Cycles are shuffled within each site; missing readings move along.
+    test = permutation_test(
+        tested,
+        lambda matrix: _statistics(matrix, signs, place),
+        lambda matrix: rng.permuted(matrix, axis=0),
+        names=("pattern", "slow pattern", "one place", "direction", "direction along the axis", "curvature"),
+    )
     unwhitened = _freed(readings, fit.residual()[:, None])[:, 0]
     _, _, residual = _matrix(readings, unwhitened)
     along_time, along_sites, rms = _leading(residual[:, kept])
     named_sites = [sites[k] for k in kept]
-    shape = _describe(cycles, along_time, named_sites, along_sites, readings) if p_value < LEVEL else ""
+    shape = _describe(cycles, along_time, named_sites, along_sites, readings) if test.p_value < LEVEL else ""
     free = partial(_freed, readings)
     series = free(_at_readings(readings, cycles, along_time, named_sites, along_sites)[:, None])[:, 0]
     rms = rms if shape else 0.0
-    return Remainder(p_value, p_values, shape, rms, cycles, along_time, named_sites, along_sites, series, free)
+    return Remainder(
+        test.p_value, test.p_values, shape, rms, cycles, along_time, named_sites, along_sites, series, free
+    )
 
 
-def with_drift(found: Remainder, fit: DriftFit) -> Remainder:
+def with_drift(remainder: Remainder, fit: DriftFit) -> Remainder:
     """Count a common drift or a stretch as a remainder where it is larger than half the noise of a reading.
 
     The fit lets both wander freely, so no test of the residual can see them; their size is what the model leaves unexplained.
+
+    Parameters
+    ----------
+    remainder : without a shape of its own
+    fit : of the model
     """
     drift, basis = unexplained_drift(fit)
     sizes = np.sqrt(np.mean(drift**2, axis=0))
     largest = int(np.argmax(sizes))
     if sizes[largest] <= _DRIFT_SHARE * fit.sigma:
-        return found
+        return remainder
     course = "smooth" if fit.system.order == 2 else "irregular"
     where = ("all positions alike", "growing along the axis")[largest] if sizes.size == 2 else f"channel {largest + 1}"
     return replace(
-        found,
+        remainder,
         shape=f"a slow, {course} drift that no effect of the library follows; {where}, both directions",
         rms_um=float(sizes[largest]),
         series=drift[:, largest],
@@ -138,11 +189,6 @@ def _matrix(readings: Readings, values: Array) -> tuple[NDArray[np.int64], list[
     matrix[np.searchsorted(cycles, readings.cycle), np.searchsorted(present, index)] = values
     sites = [(int(readings.targets[k // 2]), "negative" if k % 2 else "positive") for k in present]
     return cycles, sites, matrix
-
-
-def _permuted(matrix: Array, rng: np.random.Generator) -> Array:
-    """Cycles shuffled within each site; missing readings move along."""
-    return rng.permuted(matrix, axis=0)
 
 
 def _statistics(matrix: Array, signs: Array, place: Array) -> Array:

@@ -24,9 +24,18 @@ def _step_event(readings: Readings, _: Mapping[str, float], near: Candidate | No
 
 
 def periods_min(readings: Readings) -> Array:
-    """Periods that are tried: evenly spaced in frequency at half the resolution of the record, 3 min to a third of it.
+    """Periods that are tried: evenly spaced in frequency at half the resolution of the recording, from 3 min to a third of it.
 
-    Periods that the cycle or its halves would imitate are left out: every slow change of the profile has lines there.
+    Periods that the cycle or its parts would imitate are left out: every slow change of the profile has lines there.
+
+    Parameters
+    ----------
+    readings : n readings
+
+    Returns
+    -------
+    (k,) ndarray, min
+        Longest first.
     """
     span = _span_min(readings)
     return np.asarray(1.0 / off_the_cycle(readings, np.arange(3.0 / span, 1.0 / 3.0, 0.5 / span, dtype=np.float64)))
@@ -37,7 +46,18 @@ def _span_min(readings: Readings) -> float:
 
 
 def off_the_cycle(readings: Readings, frequencies: Array) -> Array:
-    """Those frequencies (1/min) that are not within four lines of the cycle or its parts."""
+    """Leave out frequencies within four lines of the cycle's own frequency or a multiple of it.
+
+    Parameters
+    ----------
+    readings : n readings
+    frequencies : (k,) ndarray, 1/min
+
+    Returns
+    -------
+    ndarray, 1/min
+        Those that are kept; one line is the inverse of the duration.
+    """
     cycle = 60.0 / float(np.median(np.diff(cycle_starts(readings))))
     order = np.maximum(1.0, np.round(frequencies / cycle))
     return np.asarray(frequencies[np.abs(frequencies - order * cycle) > 4.0 / _span_min(readings)])
@@ -59,10 +79,10 @@ def _periodic_disturbance(readings: Readings, _: Mapping[str, float], near: Cand
         yield Candidate(linear, {"period_min": float(period), "shape": "linear"}, ("um", "um"))
 
 
-def _close_periods(readings: Readings, found_min: float) -> Array:
-    """Periods around one that was found, as close as the record can tell apart; none that the search would not have tried."""
+def _close_periods(readings: Readings, chosen_min: float) -> Array:
+    """Periods about a chosen one, as close as the recording can separate; none beyond those of the search."""
     span = _span_min(readings)
-    near = 1.0 / found_min + np.linspace(-0.5, 0.5, 21) / span
+    near = 1.0 / chosen_min + np.linspace(-0.5, 0.5, 21) / span
     near = near[(near > 2.999 / span) & (near < 1.001 / 3.0)]
     return np.asarray(1.0 / off_the_cycle(readings, near))
 

@@ -61,7 +61,17 @@ def _aliased_lead_mm(readings: Readings, frequency: float) -> str:
 
 
 def hidden_leads_mm(readings: Readings) -> str:
-    """Leads between 2 and 50 mm of which evenly spaced targets see one phase only; empty where the spacing is uneven."""
+    """Leads between 2 and 50 mm of which evenly spaced targets see one phase only.
+
+    Parameters
+    ----------
+    readings : with the positions of the targets
+
+    Returns
+    -------
+    str
+        In mm, longest first; empty where the spacing is uneven.
+    """
     if not _evenly_spaced(readings):
         return ""
     spacing = float(np.ptp(readings.positions_mm)) / (readings.positions_mm.size - 1)

@@ -18,14 +18,33 @@ _JUMP_SIGMAS = 8.0
 
 
 def cycle_starts(readings: Readings) -> Array:
-    """Time of the first reading of every cycle, s."""
+    """Time of the first reading of every cycle.
+
+    Parameters
+    ----------
+    readings : n readings, sorted by time
+
+    Returns
+    -------
+    (cycles,) ndarray, s
+    """
     # Readings are sorted by time, so the first of a cycle is its earliest.
     _, first = np.unique(readings.cycle, return_index=True)
     return np.asarray(readings.seconds[first])
 
 
 def event_instants(readings: Readings) -> Array:
-    """Instants at which an event is tried: quarters of every cycle that has enough cycles on both sides, fewer in a long campaign."""
+    """Instants at which an event is tried: quarters of every cycle that has enough cycles on both sides, fewer in a long campaign.
+
+    Parameters
+    ----------
+    readings : n readings
+
+    Returns
+    -------
+    (k,) ndarray, s
+        Empty where there are fewer than six cycles.
+    """
     starts = cycle_starts(readings)
     margin = _EVENT_MARGIN_CYCLES
     if starts.size <= 2 * margin + 1:
@@ -41,16 +60,35 @@ def _stride(cycles: int) -> int:
 
 
 def instants_near(readings: Readings, instant: float) -> Array:
-    """The gaps between readings up to the next instants that were tried: an event can be dated no better than by its neighbours."""
+    """Instants of a closer look: the readings up to the next instants that were tried.
+
+    Parameters
+    ----------
+    readings : n readings
+    instant : s since the first reading
+
+    Returns
+    -------
+    (k,) ndarray, s
+        An event cannot be dated more closely than by its neighbouring readings.
+    """
     starts = cycle_starts(readings)
     reach = float(np.median(np.diff(starts))) / _EVENTS_PER_CYCLE * _stride(starts.size)
     return np.unique(readings.seconds[np.abs(readings.seconds - instant) <= reach])
 
 
 def jumps(series: Series) -> list[tuple[float, float, float]]:
-    """Isolated jumps of a series: time before and after (s) and size, where one change stands far out of its neighbours.
+    """Detect isolated jumps of a series.
 
-    A change is compared with the median of the six around it, in units of the series' own robust scatter of that difference.
+    Parameters
+    ----------
+    series : sampled values; of several columns their mean is taken
+
+    Returns
+    -------
+    list of (before_s, after_s, size)
+        Times of the samples beside the jump, and its size in the unit of the series. A change is compared with the median of the six
+        changes around it, in units of the robust scatter of that difference.
     """
     values = series.values if series.values.ndim == 1 else series.values.mean(axis=1)
     changes = np.diff(values)
@@ -64,19 +102,39 @@ def jumps(series: Series) -> list[tuple[float, float, float]]:
     # A log in steps of its resolution has no finer scatter than one step.
     steps = np.abs(changes[changes != 0.0])
     resolution = float(steps.min()) if steps.size and np.unique(np.round(steps, 9)).size < steps.size / 2 else 0.0
-    found = np.flatnonzero(np.abs(excess) > _JUMP_SIGMAS * max(scatter, resolution, 1e-9))
-    return [(float(series.seconds[k]), float(series.seconds[k + 1]), float(excess[k])) for k in found]
+    far = np.flatnonzero(np.abs(excess) > _JUMP_SIGMAS * max(scatter, resolution, 1e-9))
+    return [(float(series.seconds[k]), float(series.seconds[k + 1]), float(excess[k])) for k in far]
 
 
 def sensor_jumps(readings: Readings) -> list[tuple[str, float, float, float]]:
-    """Isolated jumps in the environment log: sensor, time before and after (s), size in the sensor's unit."""
+    """Detect isolated jumps in the environment log.
+
+    Parameters
+    ----------
+    readings : with the logged series
+
+    Returns
+    -------
+    list of (sensor, before_s, after_s, size)
+        Size in the sensor's unit.
+    """
     present = [name for name in ENVIRONMENT if name in readings.series]
     return [(name, *jump) for name in present for jump in jumps(readings.series[name])]
 
 
 def stuck_sensors(readings: Readings) -> list[tuple[str, float]]:
-    """Sensors that stop to move until the end of the log, and since when (s): a run of equal values ten times the usual one."""
-    found = []
+    """Detect sensors whose reading stays constant to the end of the log.
+
+    Parameters
+    ----------
+    readings : with the logged series
+
+    Returns
+    -------
+    list of (sensor, start_s)
+        Sensors with a final run of equal values that is ten times as long as 95 % of their runs, and when that run begins.
+    """
+    stuck = []
     for name in ("air_temperature", "air_pressure", "material_temperature"):
         if name not in readings.series:
             continue
@@ -87,5 +145,5 @@ def stuck_sensors(readings: Readings) -> list[tuple[str, float]]:
         last = int(moved[-1]) + 1
         usual = float(np.quantile(np.diff(moved), 0.95))
         if series.values.size - last > 10 * usual:
-            found.append((name, float(series.seconds[last])))
-    return found
+            stuck.append((name, float(series.seconds[last])))
+    return stuck

@@ -354,6 +354,11 @@ def look_again(problem: AxisProblem, state: AxisState) -> AxisState:
     """Search once more with the hold-out cycles in view: what acted only there could not be found before.
 
     Coefficients behind the error after still come from the training cycles, but the name does not; the step says so.
+
+    Parameters
+    ----------
+    problem : the campaign
+    state : with a model fitted to all readings and the hold-out errors of its steps
     """
     while len(state.steps) < MOST_EFFECTS:
         state, score = choose(problem, state.scored(problem.score(state)), level=SECOND_LEVEL)
@@ -377,6 +382,11 @@ def keep_right_patterns(problem: AxisProblem, state: AxisState) -> AxisState:
     """Withdraw the name of an effect whose pattern along the axis is not what the readings show; it was the nearest, not the cause.
 
     What was found after it goes with it: it was judged beside a pattern that was not there.
+
+    Parameters
+    ----------
+    problem : the campaign
+    state : with a model fitted to all readings and the hold-out errors of its steps
     """
     wrong = wrong_patterns(state.model, state.added)
     if not wrong:

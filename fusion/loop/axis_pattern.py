@@ -27,10 +27,20 @@ _PATTERNED = frozenset({"angular_growth", "pitch_error", "reversal_drift"})
 
 
 def wrong_patterns(model: ModelFit, terms: Sequence[Term]) -> dict[int, Decision]:
-    """Places of the terms that do not deserve their names, each with the decision against it.
+    """Decide which terms do not act along the axis as their physics says.
 
     An effect is wrong where a free pattern fits its course in time better; and two patterns of which one course would do are more likely
     one pattern that the library does not have.
+
+    Parameters
+    ----------
+    model : fitted to the readings
+    terms : the added terms of the model
+
+    Returns
+    -------
+    dict
+        Place among ``terms`` and the decision against that effect; events have no pattern to be tested.
     """
     wrong = {}
     courses = {k: _course(model, term) for k, term in enumerate(terms) if term.candidate.event_s is None}
@@ -78,9 +88,18 @@ def _free_pattern(model: ModelFit, course: Array) -> Array:
 
 
 def pattern_p_value(model: ModelFit, term: Term) -> float:
-    """Chance that sites deviate so much from the term's own pattern along the axis where that pattern is right.
+    """Lack-of-fit test of a term's pattern along the axis against a free pattern with the same course in time.
 
-    The one target that deviates most is left out: a single position may have an anomaly of its own.
+    Parameters
+    ----------
+    model : fitted to the readings
+    term : one of its terms
+
+    Returns
+    -------
+    float
+        p-value (chi-squared) under the hypothesis that the term's pattern is right. The one target that deviates most is left out: a single
+        position may have an anomaly of its own.
     """
     readings = model.readings.subset(model.used)
     site = readings.site

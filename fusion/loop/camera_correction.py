@@ -53,12 +53,12 @@ class FieldError:
         }
 
 
-def find_field_errors(found: LoopResult, fields: xr.Dataset, fused: xr.Dataset) -> list[FieldError]:
+def find_field_errors(result: LoopResult, fields: xr.Dataset, fused: xr.Dataset) -> list[FieldError]:
     """Return every error of the camera that entered the model, with the correction of the frames.
 
     Parameters
     ----------
-    found : what the loop found on these fields
+    result : of the loop on these fields
     fields : keeps ``thermography.contract.FIELDS``
     fused : both recordings on one clock, from these fields
     """
@@ -66,7 +66,7 @@ def find_field_errors(found: LoopResult, fields: xr.Dataset, fused: xr.Dataset) 
     time = fields["time"].values.astype("datetime64[ns]")
     start = _start(fused)
     frame_cycle = _cycle_of(time, fused)
-    for step in found.steps:
+    for step in result.steps:
         if step.effect not in CAMERA_ERRORS:
             continue
         size, u = float(step.coefficients[0]["value"]), float(step.coefficients[0]["u"])
@@ -102,16 +102,36 @@ def _agreed(fitted: float, u: float, seen: float) -> float:
 
 
 def correct_fields(fields: xr.Dataset, errors: list[FieldError]) -> xr.Dataset:
-    """Return the fields with the frames put right; everything per cycle stays, see :func:`corrected_variables`."""
+    """Take the camera's errors out of every frame.
+
+    Parameters
+    ----------
+    fields : keeps ``thermography.contract.FIELDS``
+    errors : of :func:`find_field_errors`
+
+    Returns
+    -------
+    Dataset
+        The same fields with ``frame_temperature`` corrected, degC; the input is unchanged.
+    """
     total = np.sum([one.correction for one in errors], axis=0)
     frames = fields["frame_temperature"]
     return fields.assign(frame_temperature=frames.copy(data=frames.values + total))
 
 
 def corrected_variables(fields: xr.Dataset, fused: xr.Dataset, errors: list[FieldError]) -> dict[str, xr.Variable]:
-    """Return what was added to every frame, and temperature and rise per cycle with it, for fusion.nc.
+    """Corrected fields per cycle and the correction of every frame, for fusion.nc.
 
-    A cycle's field is a mean of its frames, so its correction is the mean of theirs; one without frames takes that of the frame before.
+    Parameters
+    ----------
+    fields : keeps ``thermography.contract.FIELDS``
+    fused : both recordings on one clock
+    errors : of :func:`find_field_errors`
+
+    Returns
+    -------
+    dict of Variable
+        The correction of every frame in K (time, y, x), temperature in degC and its rise in K per cycle (cycle, y, x).
     """
     total = np.sum([one.correction for one in errors], axis=0)
     frame_cycle = _cycle_of(fields["time"].values.astype("datetime64[ns]"), fused)

@@ -31,7 +31,13 @@ Progress = Callable[[int, int, str], None]
 
 
 def no_progress(done: int, total: int, what: str) -> None:
-    """Report nothing."""
+    """Report nothing.
+
+    Parameters
+    ----------
+    done, total : steps done and steps in total
+    what : what is done
+    """
 
 
 M = TypeVar("M", bound=Model)
@@ -137,14 +143,27 @@ def choose(
 
 
 def enter(problem: Problem[M], state: LoopState[M], score: Score) -> LoopState[M]:
-    """Add a confirmed effect to the model and fit it again."""
+    """Add a confirmed effect to the model and fit it again.
+
+    Parameters
+    ----------
+    problem : the data
+    state : before
+    score : of the effect, with its confirmation
+    """
     assert score.confirmation is not None
     model = problem.refit(state.model, [*state.model.terms, Term(score.name, score.best)])
     return state.entered(model, score, score.confirmation.way)
 
 
 def drop_superfluous(problem: Problem[M], state: LoopState[M]) -> LoopState[M]:
-    """Take out effects that the newest one has made superfluous, one after the other."""
+    """Take out effects that the newest one has made superfluous, one after the other.
+
+    Parameters
+    ----------
+    problem : the data
+    state : after an effect was added
+    """
     for place, term in enumerate(state.added[:-1]):
         loss = problem.loss_without(state.model, term)
         if loss < SUPERFLUOUS_GAIN:
@@ -159,6 +178,13 @@ def withdraw(
     """Take steps out of the model again and fit what is kept.
 
     Once the hold-out set is open, the errors are those of the chain of effects that remain.
+
+    Parameters
+    ----------
+    problem : the data
+    state : before
+    places : of the steps that are taken out, from 0
+    decisions : the reasons
     """
     model = problem.refit(state.model, state.kept(places))
     state = state.without(places, model, decisions)
@@ -166,7 +192,13 @@ def withdraw(
 
 
 def with_hold_out_errors(problem: Problem[M], state: LoopState[M]) -> LoopState[M]:
-    """Compute the hold-out error of the declared model and after each step."""
+    """Compute the hold-out error of the declared model and after each step.
+
+    Parameters
+    ----------
+    problem : the data
+    state : any
+    """
     chain = [[*state.declared, *state.added[:count]] for count in range(len(state.steps) + 1)]
     return replace(state, errors_um=tuple(problem.hold_out_error(terms) for terms in chain))
 
@@ -175,6 +207,16 @@ def open_hold_out(problem: Problem[M], state: LoopState[M]) -> LoopState[M]:
     """Predict the hold-out set with every model in turn, and withdraw effects beside which the others do better without it.
 
     Every effect is judged beside all others: alone it may make the error larger, as long as what else is missing bends the drift.
+
+    Parameters
+    ----------
+    problem : the data
+    state : after the search
+
+    Returns
+    -------
+    LoopState
+        With the hold-out errors of the effects that remain.
     """
     state = with_hold_out_errors(problem, state)
     without = {

@@ -58,11 +58,11 @@ def detection_limits(
     share = left / np.maximum(own, 1e-300)
     typical = {name: _typical(sizes, names == name) for name in families}
     alike = _alike(scorer, first, [candidate for _, candidate in named], names, list(typical.values()))
-    found = []
+    limits = []
     for row, name in enumerate(families):
         here = sizes[names == name]
         seen = here[np.isfinite(here)]
-        found.append(
+        limits.append(
             DetectionLimit(
                 effect=name,
                 detectable_um=float(np.median(seen)) if seen.size else None,
@@ -75,7 +75,7 @@ def detection_limits(
                 ),
             )
         )
-    return found
+    return limits
 
 
 def _typical(sizes: Array, of_effect: NDArray[np.bool_]) -> int:

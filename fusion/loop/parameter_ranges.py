@@ -39,7 +39,7 @@ def parameter_ranges(near: Sequence[Candidate], gains: Array, best: Candidate, b
         a word beside which no other fits as well, are left out.
     """
     alike = [candidate for candidate, gain in zip(near, gains, strict=True) if gain >= best_gain - _WITHIN]
-    found: dict[str, Range] = {}
+    ranges: dict[str, Range] = {}
     for name, value in best.parameters.items():
         if name in DERIVED_WORDS:
             continue
@@ -48,13 +48,13 @@ def parameter_ranges(near: Sequence[Candidate], gains: Array, best: Candidate, b
                 {str(candidate.parameters[name]) for candidate in alike if name in candidate.parameters} - {value}
             )
             if words:
-                found[name] = words
+                ranges[name] = words
             continue
         tried = [_number(candidate, name) for candidate in near if _same_words(candidate, best)]
         fitting = [float(value), *(_number(candidate, name) for candidate in alike if _same_words(candidate, best))]
         if len(set(tried)) > 1:
-            found[name] = _enclosed(np.array(tried), min(fitting), max(fitting))
-    return found
+            ranges[name] = _enclosed(np.array(tried), min(fitting), max(fitting))
+    return ranges
 
 
 def _enclosed(tried: Array, low: float, high: float) -> list[float | None]:

@@ -35,7 +35,19 @@ class Term:
 
 
 def place_of(terms: Sequence[Term], term: Term, start: int = 0) -> slice:
-    """Where the columns of a term stand among those of all terms, the first of which begins at `start`."""
+    """Where the columns of a term stand among those of all terms.
+
+    Parameters
+    ----------
+    terms : of a model, in order
+    term : one of them
+    start : place of the first column of the first term
+
+    Raises
+    ------
+    KeyError
+        if the term is not among them.
+    """
     for other in terms:
         if other is term:
             return slice(start, start + term.width)
@@ -73,10 +85,10 @@ class ModelFit:
 
     def coefficients(self) -> dict[str, float]:
         """First coefficient of every term by effect name; the first term counts where an effect enters twice."""
-        found: dict[str, float] = {}
+        first: dict[str, float] = {}
         for term in self.terms:
-            found.setdefault(term.effect, float(self.fit.coefficients[self.place(term)][0]))
-        return found
+            first.setdefault(term.effect, float(self.fit.coefficients[self.place(term)][0]))
+        return first
 
     def series(self, term: Term) -> tuple[Array, Array]:
         """Predicted contribution of a term to every reading, um, and its standard uncertainty (n,), (n,)."""
@@ -133,7 +145,20 @@ def fit_model(
     *,
     used: NDArray[np.bool_] | None = None,
 ) -> ModelFit:
-    """Fit profile, terms and drift to the used readings; outliers and noisy sites count less."""
+    """Fit static profile, terms and drift by restricted maximum likelihood and generalised least squares.
+
+    Parameters
+    ----------
+    readings : n readings
+    terms : effects with columns for all readings
+    used : (n,) True for the readings of the fit; all by default
+
+    Returns
+    -------
+    ModelFit
+        Readings far from the others are down-weighted, and each site is weighted by its own scatter. A prior enters as one more observation
+        of its coefficient. Equations: docs/method/drift-estimation.md.
+    """
     used = np.ones(readings.seconds.size, bool) if used is None else used
     profile = readings.profile
     profile = profile[:, _determined(profile[used])]
@@ -151,12 +176,21 @@ def fit_model(
 
 
 def unexplained_drift(fit: DriftFit) -> tuple[Array, Array]:
-    """Drift of each component at every reading, um, that no static profile and no effect of the model could make (n, components).
-
-    Beside it an orthonormal basis (n, k) of profile and effects.
+    """Drift that no static profile and no effect of the model could make.
 
     A drift that wanders smoothly, its start rate and a slowly growing effect can stand in for one another, so their single sizes are
     badly determined; what is left of the drift beside profile and effects is not.
+
+    Parameters
+    ----------
+    fit : of n readings
+
+    Returns
+    -------
+    drift : (n, components) ndarray, um
+        Of each component at every reading.
+    basis : (n, k) ndarray
+        Orthonormal basis of profile and effects.
     """
     levels, _ = fit.drift()
     loadings = fit.system.loadings
@@ -171,7 +205,14 @@ def unexplained_drift(fit: DriftFit) -> tuple[Array, Array]:
 
 
 def condition(fit: DriftFit, place: int, prior: Prior) -> DriftFit:
-    """The fit with one coefficient observed once more, as its prior says; the variances are kept."""
+    """Observe one coefficient once more, as its prior says; the variances are kept.
+
+    Parameters
+    ----------
+    fit : before
+    place : of the coefficient
+    prior : its mean and standard uncertainty
+    """
     gain = fit.covariance[:, place] / (fit.covariance[place, place] + prior.u**2)
     return replace(
         fit,
@@ -181,7 +222,13 @@ def condition(fit: DriftFit, place: int, prior: Prior) -> DriftFit:
 
 
 def refit_fixed(model: ModelFit, terms: Sequence[Term]) -> DriftFit:
-    """Fit another set of terms with the drift's variances kept (for comparing likelihoods of nested models)."""
+    """Fit another set of terms with the drift's variances kept, for comparing likelihoods of nested models.
+
+    Parameters
+    ----------
+    model : whose drift is kept
+    terms : with columns for all readings
+    """
     design = np.column_stack([model.profile, *(term.candidate.columns for term in terms)])[model.used]
     if model.fit.system.order == 2:
         hours = (model.readings.seconds[model.used] / 3600.0)[:, None]
@@ -221,9 +268,19 @@ _SETTLING_ROUNDS = 2
 
 
 def settled(model: ModelFit, effects: Mapping[str, Effect]) -> ModelFit:
-    """The model with errors of the camera sized by the coefficients that hold beside them.
+    """Size errors of the camera by the coefficients that hold beside them.
 
     While such an error was unknown it bent the declared coefficients, by which it is weighed.
+
+    Parameters
+    ----------
+    model : as found
+    effects : the library by name
+
+    Returns
+    -------
+    ModelFit
+        The same model where no term is an error of the camera.
     """
     if not any(term.effect in CAMERA_ERRORS for term in model.terms):
         return model
@@ -238,7 +295,20 @@ def settled(model: ModelFit, effects: Mapping[str, Effect]) -> ModelFit:
 
 
 def again(term: Term, readings: Readings, coefficients: Mapping[str, float], effects: Mapping[str, Effect]) -> Term:
-    """A term with the columns that the same parameters give now; one that does not offer them again stays."""
+    """Compute a term's columns anew for the same parameters.
+
+    Parameters
+    ----------
+    term : with the parameters
+    readings : perhaps beside corrected fields
+    coefficients : of the current model by effect
+    effects : the library by name
+
+    Returns
+    -------
+    Term
+        The term itself where the effect does not offer these parameters any more.
+    """
     near = term.candidate if term.candidate.parameters else None
     offered = effects[term.effect].candidates(readings, coefficients, near)
     same = (candidate for candidate in offered if _same_parameters(candidate.parameters, term.candidate.parameters))

@@ -23,9 +23,18 @@ _INDEPENDENT = 1e-3
 
 
 def gain_across(y: Array, c: Array, half: NDArray[np.bool_]) -> Array:
-    """An event cannot be confirmed in time: its instant and size from one half of the targets, its error on the other, and back.
+    """Gain of an event whose instant and size come from one half of the targets, on the other half, and back.
 
-    ``y`` (n, r) responses, each of which chooses its own of the events ``c`` (n, events); reduction of the squared error, (r,).
+    Parameters
+    ----------
+    y : (n, r) whitened responses, each of which chooses its own event
+    c : (n, events) whitened columns
+    half : (n,) True for one half of the targets
+
+    Returns
+    -------
+    (r,) ndarray
+        Reduction of the squared error.
     """
     gain = np.zeros(y.shape[1])
     for train, test in ((half, ~half), (~half, half)):
@@ -39,7 +48,13 @@ def gain_across(y: Array, c: Array, half: NDArray[np.bool_]) -> Array:
 
 
 def residual_squares(y: Array, x: Array) -> float:
-    """Residual sum of squares of y (n,) beside columns x (n, p), which may depend on each other."""
+    """Residual sum of squares beside columns that may depend on each other.
+
+    Parameters
+    ----------
+    y : (n,) whitened response
+    x : (n, p) whitened columns
+    """
     scale = np.maximum(np.linalg.norm(x, axis=0), 1e-12)
     u, s, _ = np.linalg.svd(x / scale, full_matrices=False)
     u = u[:, s > _INDEPENDENT * s[0]]
@@ -48,12 +63,33 @@ def residual_squares(y: Array, x: Array) -> float:
 
 
 def without(x: Array, y: Array) -> Array:
-    """What the columns of x do not explain of y, by least squares."""
+    """Residual of least squares.
+
+    Parameters
+    ----------
+    x : (n, p) columns
+    y : (n, r) responses
+
+    Returns
+    -------
+    (n, r) ndarray
+    """
     return y - x @ solve(x.T @ x, x.T @ y)
 
 
 def solve(normal: Array, moment: Array) -> Array:
-    """Normal equations of several responses; a small ridge keeps columns that a part of the readings lacks at zero."""
+    """Solve normal equations for several responses; a small ridge keeps columns that a part of the readings lacks at zero.
+
+    Parameters
+    ----------
+    normal : (p, p) products of the columns
+    moment : (p, r) products with the responses
+
+    Returns
+    -------
+    (p, r) ndarray
+        Coefficients.
+    """
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-24))
     scaled = normal / np.outer(scale, scale) + _RIDGE * np.eye(scale.size)
     return np.asarray(np.linalg.solve(scaled, moment / scale[:, None]) / scale[:, None])
@@ -65,8 +101,9 @@ class PriorRows:
 
     Attributes
     ----------
-    design : (k, p)
-    response, draws : (k,) and (k, draws)
+    design : (k, p) rows of the design
+    response : (k,) prior means in units of the noise
+    draws : (k, draws) the same for simulated responses
     """
 
     design: Array
@@ -83,7 +120,16 @@ class PriorRows:
 
 @dataclass(frozen=True)
 class Moments:
-    """Products of whitened columns over some readings: of the design (p, p), with the responses (p, r), of the responses (r,)."""
+    """Products of whitened columns over some readings.
+
+    Attributes
+    ----------
+    design : (p, p) of the design with itself
+    cross : (p, r) of the design with the responses
+    squares : (r,) of each response with itself
+    readings : number of readings
+    log_spread : sum of the logarithms of the innovation variances
+    """
 
     design: Array
     cross: Array
@@ -98,23 +144,54 @@ class Moments:
 
 
 def moments_of(y: Array, x: Array, spread: Array) -> Moments:
-    """Sum the products of responses y (n, r) and design x (n, p), so that no model has to do it again."""
+    """Sum products of responses and design, so that models of some of the columns need not do it again.
+
+    Parameters
+    ----------
+    y : (n, r) whitened responses
+    x : (n, p) whitened design
+    spread : (n,) innovation variances
+    """
     return Moments(x.T @ x, x.T @ y, (y**2).sum(axis=0), y.shape[0], float(np.log(spread).sum()))
 
 
 def profile_likelihood(all_of: Moments) -> Array:
-    """Log-likelihood of the readings under the coefficients and the noise that suit them best (r,)."""
+    """Log-likelihood under the coefficients and the noise that suit the readings best.
+
+    Parameters
+    ----------
+    all_of : products over the readings
+
+    Returns
+    -------
+    (r,) ndarray
+        For every response, up to a constant.
+    """
     left = all_of.squares - (all_of.cross * solve(all_of.design, all_of.cross)).sum(axis=0)
     return np.asarray(-0.5 * (all_of.readings * np.log(left / all_of.readings) + all_of.log_spread))
 
 
 def density_ahead(early: Moments, all_of: Moments, flat: int) -> Array:
-    """Log-density of the readings that are not early, predicted from the early ones (r,).
+    """Log-density of later readings, predicted from the early ones.
 
     Coefficients enter with the uncertainty that the early readings leave them (a few switchings of a load determine them badly, and
-    must not be held against an effect), the noise likewise. The first ``flat`` coefficients have no prior; those after them one that
-    is worth a single reading (Kass and Wasserman 1995, J. Am. Stat. Assoc. 90, 928). Forward chaining one reading at a time gives
-    the same, because the densities multiply.
+    must not be held against an effect), the noise likewise. Forward chaining one reading at a time gives the same, because the densities
+    multiply.
+
+    Parameters
+    ----------
+    early : products over the early readings
+    all_of : products over all readings
+    flat : so many coefficients have no prior; those after them one that is worth a single reading
+
+    Returns
+    -------
+    (r,) ndarray
+        For every response.
+
+    References
+    ----------
+    Kass and Wasserman 1995, J. Am. Stat. Assoc. 90, 928 (unit information prior).
     """
     prior = np.zeros_like(all_of.design)
     if flat < all_of.design.shape[0]:
@@ -139,9 +216,13 @@ def _evidence(moments: Moments, prior: Array, flat: int) -> Array:
 
 @dataclass(frozen=True)
 class Group:
-    """Candidates with as many columns: their places, and the first column of each, then the second of each (n, width * size).
+    """Candidates with as many columns.
 
-    The columns that are no evidence for a candidate stand before its others.
+    Attributes
+    ----------
+    places : (size,) their places among all candidates
+    width, beside : number of columns of each, and of those that are no evidence for it
+    columns : (n, width * size) the first column of each, then the second of each; those that are no evidence stand before the others
     """
 
     places: NDArray[np.int64]
@@ -151,7 +232,17 @@ class Group:
 
 
 def by_width(candidates: Sequence[Candidate], used: NDArray[np.bool_]) -> list[Group]:
-    """Group candidates of equal width at the used readings, so that products of their columns are products of whole matrices."""
+    """Group candidates of equal width, so that products of their columns are products of whole matrices.
+
+    Parameters
+    ----------
+    candidates : with columns for all readings
+    used : (all readings,) True for those of the fit
+
+    Returns
+    -------
+    list of Group
+    """
     kinds = np.array([(candidate.columns.shape[1], candidate.beside) for candidate in candidates]).reshape(-1, 2)
     groups = []
     for width, beside in np.unique(kinds, axis=0):
@@ -162,10 +253,25 @@ def by_width(candidates: Sequence[Candidate], used: NDArray[np.bool_]) -> list[G
 
 
 def reductions(c: Array, y: Array, q: Array, groups: Sequence[Group]) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Reduction of the residual sum of squares by every candidate (responses, candidates), and which candidates are separable.
+    """Reduction of the residual sum of squares by every candidate.
 
-    Between them, the reduction by what is no evidence for a candidate. All whitened: c the candidates' columns by group, y the
-    responses freed of the model, q an orthonormal basis of the model.
+    Parameters
+    ----------
+    c : (n, columns) whitened columns of the candidates, by group
+    y : (n, r) whitened responses, freed of the model
+    q : (n, p) orthonormal basis of the model
+    groups : the candidates
+
+    Returns
+    -------
+    reduced : (r, candidates) by all columns of a candidate
+    given : (r, candidates) by those columns that are no evidence for it
+    separable : (candidates,) whether a candidate is independent of the model
+
+    Notes
+    -----
+    For two candidates of width 1 and one of width 2 whose second column may be present without the effect, ``c`` holds
+    ``[a1, a2, b_second, b_first]``: the columns that are no evidence stand first, so that forward substitution gives ``given`` on the way.
     """
     total = sum(group.places.size for group in groups)
     count = y.shape[1]

@@ -150,7 +150,12 @@ def correction_variables(
 
 
 def gap_notices(readings: Readings) -> list[Notice]:
-    """Return a notice for every logged series that has gaps: what follows it is a straight line there."""
+    """Notices of gaps in the logged series.
+
+    Parameters
+    ----------
+    readings : with the series, which are interpolated linearly across gaps
+    """
     notices = []
     gaps = readings.gaps()
     for name in dict.fromkeys(gap.series for gap in gaps):
@@ -169,7 +174,12 @@ def gap_notices(readings: Readings) -> list[Notice]:
 
 
 def library_for(source: Source) -> dict[str, Effect]:
-    """Return the library with what the campaign file says of the machine: the expansion coefficient that is expected."""
+    """The library with what the campaign file says of the machine: the expansion coefficient that is expected.
+
+    Parameters
+    ----------
+    source : the campaign as read
+    """
     effects, table = library(), source.campaign.interferometry
     if table is None:
         return effects
@@ -178,7 +188,12 @@ def library_for(source: Source) -> dict[str, Effect]:
 
 
 def field_notices(errors: Sequence[FieldError]) -> list[Notice]:
-    """Return a notice for every error of the camera that was taken out of the fields."""
+    """Notices of camera errors that were taken out of the fields.
+
+    Parameters
+    ----------
+    errors : of :func:`fusion.loop.camera_correction.find_field_errors`
+    """
     return [
         Notice(
             f"field_corrected_{one.effect}",
@@ -191,7 +206,14 @@ def field_notices(errors: Sequence[FieldError]) -> list[Notice]:
 
 
 def join_fusion(fused: xr.Dataset, maps: xr.Dataset, loop: xr.Dataset) -> xr.Dataset:
-    """Return everything that joins both recordings in one Dataset, for fusion.nc."""
+    """Everything that joins both recordings, for fusion.nc.
+
+    Parameters
+    ----------
+    fused : both recordings on one clock
+    maps : of the attribution
+    loop : of the closed loop
+    """
     dataset = joined(fused, correlation=maps, loop=loop)
     own = {name: value for name, value in maps.attrs.items() if name not in store.GLOBAL_ATTRIBUTES}
     return dataset.assign_attrs({f"correlation_{name}": value for name, value in own.items()})

@@ -33,6 +33,10 @@ class RecordSource:
 def read_source(campaign: Campaign) -> RecordSource:
     """Read a record and refuse what cannot be modelled.
 
+    Parameters
+    ----------
+    campaign : with a ``[record]``
+
     Raises
     ------
     TableError, RecordError
@@ -48,15 +52,26 @@ def read_source(campaign: Campaign) -> RecordSource:
 
 
 def model_record(source: RecordSource, *, report: Report) -> Outcome:
-    """Close the loop on a record."""
-    found = close_record(
+    """Close the loop on a record.
+
+    Parameters
+    ----------
+    source : the record as read
+    report : called with the stage, steps done and steps in total
+    """
+    result = close_record(
         source.record, source.declared, progress=lambda done, total, what: report("closed loop", done, total)
     )
-    return Outcome(record_variables(source.record, found), {"loop": found.as_json()}, tuple(source.notices))
+    return Outcome(record_variables(source.record, result), {"loop": result.as_json()}, tuple(source.notices))
 
 
 def declared_effects(campaign: Campaign) -> tuple[list[str], list[Notice]]:
-    """Return what a record is declared with: `quasi_static`, and what of the campaign's declaration means nothing without positions."""
+    """What a record is declared with: `quasi_static`, and a notice of what in the campaign's declaration needs positions along an axis.
+
+    Parameters
+    ----------
+    campaign : with a ``[record]``
+    """
     if "model" not in campaign.model_fields_set:
         return [QUASI_STATIC], []
     declared = campaign.model.declared
@@ -75,7 +90,12 @@ def declared_effects(campaign: Campaign) -> tuple[list[str], list[Notice]]:
 
 
 def record_notices(record: Record) -> list[Notice]:
-    """Return notices for gaps, sensors that tell nothing of their own, and drivers that were not logged."""
+    """Notices of gaps and pauses, of sensors that depend on the others, and of drivers that were not logged.
+
+    Parameters
+    ----------
+    record : on its blocks
+    """
     notices = []
     if record.gaps:
         named = [f"{name} ({number} blocks)" for name, number in record.gaps.items()]
@@ -93,7 +113,7 @@ def record_notices(record: Record) -> list[Notice]:
             Notice(
                 "record_pauses",
                 f"Nothing was logged in {counted(pauses.size, 'pause')}, the longest {duration(float(pauses.max()))}.",
-                "Nothing has to be done: pauses are left out; what a heat source did meanwhile is taken as a straight line.",
+                "Nothing has to be done: pauses are left out; drivers are interpolated linearly across the pause.",
             )
         )
     missing = int(np.isnan(record.displacement).sum())
@@ -124,18 +144,29 @@ def record_notices(record: Record) -> list[Notice]:
     return notices
 
 
-def record_variables(record: Record, found: RecordResult) -> xr.Dataset:
-    """Return the record on its blocks with predictions, contributions and the sealed part."""
-    terms = found.state.model.terms
+def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
+    """The record on its blocks with predictions, contributions and the hold-out set, for fusion.nc.
+
+    Parameters
+    ----------
+    record : on its blocks
+    result :  of the closed loop
+
+    Returns
+    -------
+    Dataset
+        Dims time, channel, sensor, driver_name, effect; displacements in um, temperatures in degC.
+    """
+    terms = result.state.model.terms
     names = [term.effect for term in terms]
     unique = [name if names.count(name) == 1 else f"{name} {at + 1}" for at, name in enumerate(names)]
     drivers = np.array([powers[1] for powers in record.drivers.values()]).reshape(-1, record.seconds.size).T
     um: dict[str, Any] = {"units": "um"}
     dims = ("time", "channel")
-    final = found.predictions[-1]
-    # What forward chaining has shown the model to miss by, where it can be known: not smaller than on the sealed part.
-    chained = np.array([one.rmse_final_um for one in found.chained]).reshape(-1, len(record.channels))
-    spread = np.fmax(found.errors[-1], np.sqrt(np.nanmean(chained**2, axis=0)) if len(chained) else 0.0)
+    final = result.predictions[-1]
+    # What forward chaining has shown the model to miss by, where it can be known: not smaller than on the hold-out set.
+    chained = np.array([one.rmse_final_um for one in result.chained]).reshape(-1, len(record.channels))
+    spread = np.fmax(result.errors[-1], np.sqrt(np.nanmean(chained**2, axis=0)) if len(chained) else 0.0)
     return xr.Dataset(
         {
             "displacement": (dims, record.displacement, {**um, "long_name": "mean displacement over the block"}),
@@ -145,7 +176,7 @@ def record_variables(record: Record, found: RecordResult) -> xr.Dataset:
                 {"units": "degC", "units_metadata": "temperature: on_scale"},
             ),
             "driver": (("time", "driver_name"), drivers, {"units": "1", "long_name": "driver over its largest size"}),
-            "predicted_declared": (dims, found.predictions[0].predicted, um),
+            "predicted_declared": (dims, result.predictions[0].predicted, um),
             "predicted_final": (dims, final.predicted, um),
             "predicted_u": (
                 "channel",
@@ -154,11 +185,11 @@ def record_variables(record: Record, found: RecordResult) -> xr.Dataset:
             ),
             "contribution": (
                 ("effect", *dims),
-                np.array([found.contribution(term) for term in terms]).reshape(len(terms), *record.displacement.shape),
+                np.array([result.contribution(term) for term in terms]).reshape(len(terms), *record.displacement.shape),
                 um,
             ),
-            "noise": ("channel", found.whole.sigma, {**um, "long_name": "noise of a block mean"}),
-            "sealed": ("time", found.hold_out, {"long_name": "block that took no part in any choice"}),
+            "noise": ("channel", result.whole.sigma, {**um, "long_name": "noise of a block mean"}),
+            "sealed": ("time", result.hold_out, {"long_name": "block that took no part in any choice"}),
             "part": ("time", record.chained + 1, {"long_name": "part of the record for forward chaining"}),
         },
         coords={

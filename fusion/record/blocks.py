@@ -213,7 +213,18 @@ def _drivers(table: xr.Dataset, blocks: _Blocks) -> dict[str, dict[int, Array]]:
 
 
 def independent(columns: Array, *, tolerance: float = 1e-8) -> list[int]:
-    """Columns, in their order, of which more than a share of the variance is not a linear combination of those before."""
+    """Columns of which a part is not a linear combination of those before.
+
+    Parameters
+    ----------
+    columns : (n, k) in any unit
+    tolerance : smallest share of a column's variance that must be independent
+
+    Returns
+    -------
+    list of int
+        Their places, in order.
+    """
     kept: list[int] = []
     centred = columns - columns.mean(axis=0)
     basis = np.empty((columns.shape[0], 0))
@@ -229,9 +240,19 @@ def independent(columns: Array, *, tolerance: float = 1e-8) -> list[int]:
 
 
 def chained_blocks(seconds: Array, drivers: list[Array]) -> NDArray[np.int64]:
-    """Number of the chronological block of each row: load cycles where a driver starts from rest often enough, else equal parts.
+    """Divide a record into parts for forward chaining: load cycles where a driver starts from rest often enough, else equal parts.
 
-    A block begins where a driver leaves its rest, so that a model is always asked to predict a whole load cycle.
+    A part begins where a driver leaves its rest, so that a model is always asked to predict a whole load cycle.
+
+    Parameters
+    ----------
+    seconds : (blocks,) s
+    drivers : (blocks,) each
+
+    Returns
+    -------
+    (blocks,) ndarray of int
+        Number of the part of every block, from 0.
     """
     least = (seconds[-1] - seconds[0]) / _MOST_CHAINED
     starts: list[float] = []

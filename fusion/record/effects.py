@@ -55,7 +55,7 @@ class RecordEffect:
     excited_by: str = ""
 
 
-def thermal_lag_candidates(record: Record, near: Candidate | None) -> Iterator[Candidate]:
+def _thermal_lag(record: Record, near: Candidate | None) -> Iterator[Candidate]:
     """Lagged copies of one sensor, or of the mean of all."""
     block_min = record.block_s / 60.0
     named = {name: record.rise[:, k] for k, name in enumerate(record.sensors)}
@@ -69,7 +69,7 @@ def thermal_lag_candidates(record: Record, near: Candidate | None) -> Iterator[C
                 yield Candidate(lagged[:, None], {"sensor": name, "time_constant_min": minutes}, ("um/K",))
 
 
-def unseen_heat_source_candidates(record: Record, near: Candidate | None) -> Iterator[Candidate]:
+def _unseen_heat_source(record: Record, near: Candidate | None) -> Iterator[Candidate]:
     """States of a chain of parts that a driver heats, in proportion to the driver and to its square."""
     for name, powers in record.drivers.items():
         if near is not None and near.parameters["follows"] != name:
@@ -88,7 +88,7 @@ def unseen_heat_source_candidates(record: Record, near: Candidate | None) -> Ite
             yield Candidate(np.column_stack(states), parameters, ("um",) * len(states))
 
 
-def step_event_candidates(record: Record, near: Candidate | None) -> Iterator[Candidate]:
+def _step_event(record: Record, near: Candidate | None) -> Iterator[Candidate]:
     """A level shift at one instant, in every channel by its own amount."""
     first, last = record.seconds[0], record.seconds[-1]
     margin = _EVENT_MARGIN * (last - first)
@@ -103,7 +103,7 @@ def step_event_candidates(record: Record, near: Candidate | None) -> Iterator[Ca
             yield Candidate(late[:, None], {"time_s": float(instant)}, ("um",), float(instant))
 
 
-def periodic_disturbance_candidates(record: Record, near: Candidate | None) -> Iterator[Candidate]:
+def _periodic_disturbance(record: Record, near: Candidate | None) -> Iterator[Candidate]:
     """Waves in time."""
     shortest = 4.0 * record.block_s / 60.0
     if near is None:
@@ -118,11 +118,20 @@ def periodic_disturbance_candidates(record: Record, near: Candidate | None) -> I
 
 
 def sensor_faults(record: Record) -> list[tuple[int, float, float]]:
-    """Sensors that jump alone: place, time in s and size in K.
+    """Detect sensors that jump alone.
 
     A jump that the other sensors share is no fault, nor is one at which a driver was switched.
+
+    Parameters
+    ----------
+    record : on its blocks
+
+    Returns
+    -------
+    list of (place, time_s, size_K)
+        Place among the sensors.
     """
-    found = []
+    faults = []
     switched = record.switched()
     for k in range(len(record.sensors)):
         others = np.delete(record.rise, k, axis=1)
@@ -134,11 +143,11 @@ def sensor_faults(record: Record) -> list[tuple[int, float, float]]:
             if alone and not switched[at[0] : at[1] + 1].any():
                 own.append((k, after, size))
         if len(own) <= _MOST_FAULTS:
-            found += own
-    return found
+            faults += own
+    return faults
 
 
-def sensor_fault_candidates(record: Record, near: Candidate | None) -> Iterator[Candidate]:
+def _sensor_fault(record: Record, near: Candidate | None) -> Iterator[Candidate]:
     """What the jump of a sensor does to the prediction: a step, since the displacement does not follow it."""
     for k, instant, size in sensor_faults(record):
         if near is None or near.event_s == instant:
@@ -150,16 +159,16 @@ def sensor_fault_candidates(record: Record, near: Candidate | None) -> Iterator[
 def _around(near: Candidate | None, grid: tuple[float, ...]) -> tuple[float, ...]:
     if near is None:
         return grid
-    found = float(near.parameters["time_constant_min"])
-    return tuple(float(found * factor) for factor in np.geomspace(0.6, 1.6, 7))
+    chosen = float(near.parameters["time_constant_min"])
+    return tuple(float(chosen * factor) for factor in np.geomspace(0.6, 1.6, 7))
 
 
 _CANDIDATES = {
-    "thermal_lag": thermal_lag_candidates,
-    "unseen_heat_source": unseen_heat_source_candidates,
-    "step_event": step_event_candidates,
-    "periodic_disturbance": periodic_disturbance_candidates,
-    "sensor_fault": sensor_fault_candidates,
+    "thermal_lag": _thermal_lag,
+    "unseen_heat_source": _unseen_heat_source,
+    "step_event": _step_event,
+    "periodic_disturbance": _periodic_disturbance,
+    "sensor_fault": _sensor_fault,
 }
 
 
@@ -177,20 +186,28 @@ def _needs(name: str) -> Callable[[Record], str | None]:
 
 
 def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[str, RecordEffect], dict[str, str]]:
-    """Effects that can act in a record by name, and why the others of the library are not tried.
+    """Effects that can act in a record, and why the others of the library are not tried.
 
-    A user's own effect takes part as it is, with the record laid out as readings of one place.
+    Parameters
+    ----------
+    effects : the library by name; the built-in one with the user's own by default. A user's own effect takes part as it is, with the record
+        laid out as readings of one place
+
+    Returns
+    -------
+    effects : by name
+    not_tried : reasons by name
     """
     built_in = {effect.name for effect in LIBRARY}
-    found, not_tried = {}, {}
+    adapted, not_tried = {}, {}
     for name, effect in (library() if effects is None else effects).items():
         if name in _CANDIDATES:
-            found[name] = RecordEffect(name, _CANDIDATES[name], _needs(name), effect.excited_by)
+            adapted[name] = RecordEffect(name, _CANDIDATES[name], _needs(name), effect.excited_by)
         elif name in built_in:
             not_tried[name] = _ALONG_AN_AXIS
         else:
-            found[name] = RecordEffect(name, _as_it_is(effect), _own_needs(effect), effect.excited_by)
-    return found, not_tried
+            adapted[name] = RecordEffect(name, _as_it_is(effect), _own_needs(effect), effect.excited_by)
+    return adapted, not_tried
 
 
 def _as_it_is(effect: Effect) -> Callable[[Record, Candidate | None], Iterator[Candidate]]:

@@ -56,12 +56,28 @@ class RecordFit:
 
 
 def columns_of(record: Record, terms: Sequence[Term]) -> Array:
-    """Columns of all terms side by side, (blocks, p)."""
+    """Columns of all terms side by side.
+
+    Parameters
+    ----------
+    record : on its blocks
+    terms : of a model
+
+    Returns
+    -------
+    (blocks, p) ndarray
+    """
     return np.concatenate([np.empty((record.seconds.size, 0)), *(term.candidate.columns for term in terms)], axis=1)
 
 
 def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -> RecordFit:
-    """Fit every channel by itself: constant, terms, and a drift whose kind and size come from restricted likelihood.
+    """Fit every channel by itself: constant, terms, and a drift whose order and size come from restricted likelihood.
+
+    Parameters
+    ----------
+    record : on its blocks
+    terms : with columns for all blocks, shared by the channels
+    used : (blocks,) True for those of the fit
 
     Raises
     ------
@@ -103,9 +119,20 @@ def _leading(columns: Array, used: NDArray[np.bool_], most: int) -> Array:
 
 
 def simulate_channels(model: RecordFit, rng: np.random.Generator, *, draws: int) -> list[Array]:
-    """Displacements of every channel (n, draws) in which only the model's drifts and noise act.
+    """Simulate displacements in which only the model's drifts and noise act.
 
     Channels often watch the same part, so their drifts and noises are drawn with the correlation that the fit leaves among them.
+
+    Parameters
+    ----------
+    model : complete under the null hypothesis
+    rng : source of random numbers
+    draws : number of simulated records
+
+    Returns
+    -------
+    list of (n, draws) ndarray, um
+        One for each channel, at the blocks of its fit.
     """
     noises, shocks = [], []
     for fit in model.channels:

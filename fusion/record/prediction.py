@@ -62,7 +62,18 @@ def predict(record: Record, columns: Array, train: NDArray[np.bool_]) -> Predict
 
 
 def persistence_rmse(record: Record, train: NDArray[np.bool_], where: NDArray[np.bool_]) -> Array:
-    """Error of repeating the last training value of every channel over some blocks, um (channels,)."""
+    """Error of repeating the last training value of every channel.
+
+    Parameters
+    ----------
+    record : on its blocks
+    train : (blocks,) True for the training part
+    where : (blocks,) True for the blocks that are predicted
+
+    Returns
+    -------
+    (channels,) ndarray, um
+    """
     last = np.array([column[train & np.isfinite(column)][-1] for column in record.displacement.T])
     return channel_rmse(record, np.broadcast_to(last, record.displacement.shape), where)
 
@@ -71,6 +82,16 @@ def chained_parts(record: Record, train: NDArray[np.bool_]) -> list[int]:
     """Parts of the training blocks that are predicted from those before them: those of the later half.
 
     Before that, a load that has been switched only a few times leaves the coefficients undetermined.
+
+    Parameters
+    ----------
+    record : on its blocks
+    train : (blocks,) True for the training part
+
+    Returns
+    -------
+    list of int
+        Numbers as in ``record.chained``.
     """
     numbers, counts = np.unique(record.chained[train], return_counts=True)
     before = np.cumsum(counts) - counts
@@ -78,12 +99,36 @@ def chained_parts(record: Record, train: NDArray[np.bool_]) -> list[int]:
 
 
 def rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> float:
-    """Root mean square error over some blocks, mean over the channels that were measured there, um."""
+    """Root mean square error over some blocks, mean over the channels that were measured there.
+
+    Parameters
+    ----------
+    record : on its blocks
+    predicted : (blocks, channels) um
+    where : (blocks,) True for the blocks that count
+
+    Returns
+    -------
+    float
+        um
+    """
     return float(np.nanmean(channel_rmse(record, predicted, where)))
 
 
 def channel_rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> Array:
-    """Root mean square error of every channel over some blocks, um (channels,); NaN for one that was not measured there."""
+    """Root mean square error of every channel over some blocks.
+
+    Parameters
+    ----------
+    record : on its blocks
+    predicted : (blocks, channels) um
+    where : (blocks,) True for the blocks that count
+
+    Returns
+    -------
+    (channels,) ndarray, um
+        NaN for a channel that was not measured there.
+    """
     squares = (record.displacement - predicted)[where] ** 2
     number = np.isfinite(squares).sum(axis=0)
     return np.asarray(np.sqrt(np.where(number > 0, np.nansum(squares, axis=0) / np.maximum(number, 1), np.nan)))

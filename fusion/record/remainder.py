@@ -1,4 +1,4 @@
-"""What a model of a record leaves: tests of its structure, and a description of it in words.
+"""Structure in the residual of a record: permutation tests, and a description in words.
 
 Two things can be left. A shape in the innovations of the fit: where only drift and noise act they are exchangeable in time, so that
 permuting them gives every statistic its null. And a drift that the fit lets wander freely and that no test of the innovations can see:
@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.diagnosis.remainder import LEVEL
-from fusion.model.null_simulation import family_wise
+from fusion.diagnosis.remainder import LEVEL, permutation_test
 from fusion.record.blocks import Record
 from fusion.record.model import RecordFit
 
-_PERMUTATIONS = 400
 #: Largest share of the displacements' variance that may be left without being called unexplained.
 _VARIANCE_SHARE = 0.1
 _LAGS = 12
@@ -62,28 +60,32 @@ def examine(model: RecordFit, hold_out_rmse: Array, rng: np.random.Generator) ->
         innovations[rows, k] = np.clip(whitened[:, 0] / scale, -_CLIP, _CLIP)
     innovations -= innovations.mean(axis=0)
     switched = record.switched()
-    observed, line = _statistics(innovations, switched)
-    null = np.array([_statistics(rng.permutation(innovations), switched)[0] for _ in range(_PERMUTATIONS)])
-    names = ("course in time", "rhythm", "switching")
-    each, p_value, strongest = family_wise(observed, null)
-    p_values = dict(zip(names, each.tolist(), strict=True))
+    _, line = _statistics(innovations, switched)
+    test = permutation_test(
+        innovations,
+        lambda matrix: _statistics(matrix, switched)[0],
+        rng.permutation,
+        names=("course in time", "rhythm", "switching"),
+    )
     share = hold_out_rmse**2 / np.nanvar(record.displacement, axis=0)
     words = []
-    if p_value < LEVEL:
+    if test.p_value < LEVEL:
         period_min = record.seconds.size * record.block_s / 60.0 / line
         words.append(
             {
                 "course in time": "changes that come and go within a few blocks, too quick for the drift",
                 "rhythm": f"a rhythm of about {period_min:.0f} min",
                 "switching": "quick responses where a driver is switched",
-            }[names[strongest]]
+            }[test.strongest]
         )
     if np.nanmean(hold_out_rmse**2) > _VARIANCE_SHARE * np.mean(np.nanvar(record.displacement, axis=0)):
         words.append(
             f"a slow drift that neither temperatures nor drivers follow, largest in {_largest(record, hold_out_rmse)}"
         )
     shape = " and ".join(words)
-    return RecordRemainder(p_value, p_values, shape, float(np.nanmean(hold_out_rmse)) if words else 0.0, share)
+    return RecordRemainder(
+        test.p_value, test.p_values, shape, float(np.nanmean(hold_out_rmse)) if words else 0.0, share
+    )
 
 
 def _statistics(innovations: Array, switched: NDArray[np.bool_]) -> tuple[Array, int]:

@@ -17,7 +17,7 @@ from fusion.loop.admissibility import refuse
 from fusion.loop.closed_loop import open_hold_out
 from fusion.loop.decisions import Reason
 from fusion.record.blocks import RecordError, reduce_record
-from fusion.record.effects import sensor_faults, thermal_lag_candidates, unseen_heat_source_candidates
+from fusion.record.effects import record_library, sensor_faults
 from fusion.record.grounds import RecordGrounds, one_switching_share
 from fusion.record.hold_out import declare, hold_out
 from fusion.record.loop import close_record, without_unrepeated
@@ -70,7 +70,9 @@ def test_a_load_that_was_switched_once_names_no_source(rng):
     record = reduce_record(table_of(displacement, temperature, speed))
     used = np.ones(record.seconds.size, bool)
     candidate = next(
-        m for m in unseen_heat_source_candidates(record, None) if m.parameters["time_constant_min"] == 40.0
+        m
+        for m in record_library()[0]["unseen_heat_source"].candidates(record, None)
+        if m.parameters["time_constant_min"] == 40.0
     )
     assert one_switching_share(record.drivers["speed"][1]) > 0.99
     assert one_switching_share(np.tile([0.0, 0.0, 1.0, 1.0], 50)) < 0.1
@@ -87,7 +89,9 @@ def test_a_noisy_sensor_names_no_lag(rng):
     displacement = truth[:, None] * [1.0, -2.0] + rng.normal(0.0, 0.1, (1440, 2))
     record = reduce_record(table_of(displacement, temperature))
     model = fit_record(record, declare(["quasi_static"], record), np.ones(record.seconds.size, bool))
-    candidate = next(m for m in thermal_lag_candidates(record, None) if m.parameters["sensor"] == "t1")
+    candidate = next(
+        m for m in record_library()[0]["thermal_lag"].candidates(record, None) if m.parameters["sensor"] == "t1"
+    )
     refusal = refuse("thermal_lag", "field", candidate, RecordGrounds(model))
     assert refusal is not None and refusal.reason is Reason.TEMPERATURE_NOISE
     assert "fits better by its smoothness alone" in refusal.sentence
