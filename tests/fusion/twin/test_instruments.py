@@ -11,10 +11,10 @@ import pytest
 import xarray as xr
 
 from fusion.twin import simulate
-from fusion.twin.datasets import deviations_of, fields_of
 from fusion.twin.instruments import simulate_campaign, truth_folder, write_campaign
 from fusion.twin.machine.recipe import EffectRecipe, Recipe, RecipeError
 from fusion.twin.recipe_file import read_recipe
+from fusion.twin.truth import deviations_of, fields_of
 from interferometry.contract import DEVIATIONS
 from interferometry.io.readers import read_deviations, read_environment
 from thermography.contract import FIELDS
