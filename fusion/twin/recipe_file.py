@@ -28,6 +28,7 @@ _REMEDIES = {
     "string_type": "write text in quotes",
     "tuple_type": "write a list",
 }
+_KINDS = {float: "a number", int: "a whole number", str: "text"}
 #: Effects that act on one instrument only and cannot be superposed.
 _ONCE = ("reflected_source", "sensor_fault")
 
@@ -189,7 +190,7 @@ def _faults_of_parameters(effect: EffectRecipe) -> Iterator[str]:
         default, choices = entry.parameters[key], entry.choices.get(key)
         kind = type(default)
         if not isinstance(value, kind) and not (kind is float and isinstance(value, int)):
-            yield f"{key} = {value!r}; write a {kind.__name__} such as {default!r}"
+            yield f"{key} = {value!r}; write {_KINDS[kind]} such as {default!r}"
         elif choices is not None and value not in choices:
             yield f"{key} = {value!r}; write one of {', '.join(choices)}"
 

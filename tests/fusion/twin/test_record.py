@@ -83,7 +83,7 @@ def test_record_is_read_back(tmp_path):
     ("tables", "message"),
     [
         ({"record": {"hours": 0.0}}, r"record\.hours = 0\.0; write a number above 0"),
-        ({"record": {"channels": 7}}, r"record\.channels = 7; there are at most 6"),
+        ({"record": {"channels": 7}}, r"record\.channels = 7; write a number up to 6"),
         ({"anomaly": (AnomalyRecipe(3),)}, r"anomaly: a record has no targets; remove the \[\[anomaly\]\] tables"),
         (
             {"effect": (EffectRecipe("dead_path"),)},
