@@ -154,7 +154,7 @@ def make_view(camera: Camera) -> View:
 
     Notes
     -----
-    Homography of a plane: Hartley and Zisserman, Multiple View Geometry, 2nd ed. (2003), equation 8.1.
+    Homography of a plane: Hartley and Zisserman, Multiple View Geometry, 2nd ed. (2003), section 8.1.
     """
     tilt, pan, roll = np.deg2rad([camera.tilt_deg, camera.pan_deg, camera.roll_deg])
     about_x = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
