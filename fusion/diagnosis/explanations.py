@@ -122,6 +122,7 @@ class Residual:
         return DirectionParts(rows, self.values[side, rows], None, None, 1.0, self._grid(rows))
 
     def _grid(self, rows: NDArray[np.int64]) -> Grid:
+        """Return the whitenings for the times of the given cycles, with the mean as the only nuisance column."""
         ones = np.ones(rows.size)
         return whitening_grid(self.seconds[rows], ones, ones[:, None], integrated=False)
 

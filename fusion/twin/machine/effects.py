@@ -77,17 +77,22 @@ def _index_change(session: Session) -> Array:
 def thermal_lag(
     session: Session, *, um_per_K: float = 1.5, time_constant_min: float = 45.0, shape: str = "flat"
 ) -> Array:
-    """Return the error of a remote part that follows the table's mean rise through a first-order lag, (n,), um.
+    """Return the error of a remote part that follows the table's mean rise through a first-order lag.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     um_per_K : float, um/K
         Sensitivity to the lagged rise.
     time_constant_min : float, min
         Time constant of the part.
     shape : str
         "flat": equal at all positions; "linear": proportional to position.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     lagged = first_order(session.table_rise_K, session.grid_step_s, 60.0 * time_constant_min)
     return um_per_K * session.at_readings(lagged) * _pattern(session, shape)
@@ -97,11 +102,12 @@ def thermal_lag(
 def unseen_heat_source(
     session: Session, *, um: float = 3.0, time_constant_min: float = 14.0, follows: str = "duty", shape: str = "flat"
 ) -> Array:
-    """Return the error of a part outside the camera's view (spindle, column) that warms with a load, (n,), um.
+    """Return the error of a part outside the camera's view (spindle, column) that warms with a load.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     um : float, um
         Error at full load in the steady state.
     time_constant_min : float, min
@@ -110,6 +116,10 @@ def unseen_heat_source(
         Drive of the part, one of :data:`fusion.twin.machine.session.DRIVES`.
     shape : str
         "flat" or "linear" along the axis.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     state = session.state(follows, time_constant_min, "unseen_heat_source")
     return um * session.at_readings(state) * _pattern(session, shape)
@@ -117,39 +127,54 @@ def unseen_heat_source(
 
 @_effect()
 def dead_path(session: Session, *, mm: float = 300.0) -> Array:
-    """Return the error of an uncompensated dead path, L dn, (n,), um.
+    """Return the error of an uncompensated dead path, L dn.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     mm : float, mm
         Length L of the air path between the interferometer and its zero.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     return mm * 1e3 * _index_change(session)
 
 
 @_effect()
 def air_index(session: Session, *, gain: float = 1.0) -> Array:
-    """Return the error where the refractive index of air is not compensated along the measured length, (n,), um.
+    """Return the error where the refractive index of air is not compensated along the measured length.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     gain : float
         Uncompensated share of the index's change: 1 for all of it.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     return gain * session.position_mm * 1e3 * _index_change(session)
 
 
 @_effect()
 def material_compensation(session: Session, *, ppm_per_K: float = 2.0) -> Array:
-    """Return the error of a material compensation with a wrong expansion coefficient, (n,), um.
+    """Return the error of a material compensation with a wrong expansion coefficient.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     ppm_per_K : float, ppm/K
         Error of the coefficient; it acts on the change of the material sensor's reading since the start of the test.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     probe = session.at_readings(session.probe_degC) - session.at_start(session.probe_degC)
     return ppm_per_K * 1e-3 * session.position_mm * probe
@@ -164,11 +189,12 @@ def angular_growth(
     time_constant_min: float = 60.0,
     follows: str = "constant",
 ) -> Array:
-    """Return the Abbe error of a guide that bends as it warms, quadratic in position, (n,), um.
+    """Return the Abbe error of a guide that bends as it warms, quadratic in position.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     arcsec : float, arcsec
         Pitch at the far end of the travel at full load in the steady state.
     abbe_mm : float, mm
@@ -177,6 +203,10 @@ def angular_growth(
         Time constant of the guide.
     follows : str
         Drive of the guide, one of :data:`fusion.twin.machine.session.DRIVES`.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     angle = np.deg2rad(arcsec / 3600.0) * session.state(follows, time_constant_min, "angular_growth")
     return abbe_mm * 1e3 * session.at_readings(angle) * session.share**2
@@ -186,17 +216,22 @@ def angular_growth(
 def reversal_drift(
     session: Session, *, um: float = 1.5, time_constant_min: float = 35.0, follows: str = "duty"
 ) -> Array:
-    """Return the error of a reversal error that changes with the temperature of the screw, (n,), um.
+    """Return the error of a reversal error that changes with the temperature of the screw.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     um : float, um
         Change of the reversal error at full load in the steady state; half of it acts in each direction.
     time_constant_min : float, min
         Time constant of the screw.
     follows : str
         Drive of the screw, one of :data:`fusion.twin.machine.session.DRIVES`.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     state = session.state(follows, time_constant_min, "reversal_drift")
     return 0.5 * um * session.sign * session.at_readings(state)
@@ -204,17 +239,22 @@ def reversal_drift(
 
 @_effect()
 def step_event(session: Session, *, um: float = 1.5, at_cycle: int = 30, at_part: float = 0.35) -> Array:
-    """Return the error of a mount or clamp that slips once, (n,), um.
+    """Return the error of a mount or clamp that slips once.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     um : float, um
         Height of the step.
     at_cycle : int
         Cycle in which it happens, from 1.
     at_part : float
         Fraction of that cycle which has passed, 0..1.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     instant = session.start_of(at_cycle) + at_part * session.period_s
     return um * (session.time_s >= instant).astype(float)
@@ -222,17 +262,22 @@ def step_event(session: Session, *, um: float = 1.5, at_cycle: int = 30, at_part
 
 @_effect(shape=SHAPES)
 def periodic_disturbance(session: Session, *, um: float = 0.6, period_min: float = 23.0, shape: str = "flat") -> Array:
-    """Return the error of a cooling or air conditioning that switches periodically, a sine of random phase, (n,), um.
+    """Return the error of a cooling or air conditioning that switches periodically, a sine of random phase.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     um : float, um
         Amplitude.
     period_min : float, min
         Period.
     shape : str
         "flat" or "linear" along the axis.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     phase = stream(session.seed, "periodic_disturbance").uniform(0.0, 2.0 * np.pi)
     return um * np.sin(2 * np.pi * session.time_s / (60.0 * period_min) + phase) * _pattern(session, shape)
@@ -242,11 +287,12 @@ def periodic_disturbance(session: Session, *, um: float = 0.6, period_min: float
 def pitch_error(
     session: Session, *, um: float = 1.5, lead_mm: float = 7.0, time_constant_min: float = 30.0, follows: str = "duty"
 ) -> Array:
-    """Return the error of a screw whose cyclic error grows with its temperature, (n,), um.
+    """Return the error of a screw whose cyclic error grows with its temperature.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     um : float, um
         Growth of the amplitude at full load in the steady state.
     lead_mm : float, mm
@@ -255,6 +301,10 @@ def pitch_error(
         Time constant of the screw.
     follows : str
         Drive of the screw, one of :data:`fusion.twin.machine.session.DRIVES`.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     phase = stream(session.seed, "pitch_error").uniform(0.0, 2.0 * np.pi)
     amplitude = um * session.at_readings(session.state(follows, time_constant_min, "pitch_error"))
@@ -263,17 +313,22 @@ def pitch_error(
 
 @_effect("K", kind=("step", "ramp"))
 def camera_offset(session: Session, *, K: float = 0.5, at_cycle: int = 30, kind: str = "step") -> Array:
-    """Return the offset of all pixels of a camera whose zero changes while the machine does not move, (frames,), K.
+    """Return the offset of all pixels of a camera whose zero changes while the machine does not move.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     K : float, K
         Offset after the step, or at the end of the ramp.
     at_cycle : int
         Cycle at whose start the offset appears or begins to grow, from 1.
     kind : str
         "step" or "ramp".
+
+    Returns
+    -------
+    (frames,) ndarray, K
     """
     start = session.start_of(at_cycle)
     since = session.frame_s - start
@@ -291,17 +346,22 @@ def reflected_source(
     spread_mm: float = 45.0,
     follows: str = "switched",
 ) -> Array:
-    """Return how much warmer than the surroundings a body is that the paint of the table reflects, (frames,), K.
+    """Return how much warmer than the surroundings a body is that the paint of the table reflects.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     K : float, K
         Radiance temperature of the body over the reflected apparent temperature, when it is on.
     x_mm, y_mm, spread_mm : float, mm
         Centre and standard deviation of the spot on the plan, used by the camera (:mod:`fusion.twin.camera`).
     follows : str
         "switched": on and off at random; else a drive of :data:`fusion.twin.machine.session.DRIVES`.
+
+    Returns
+    -------
+    (frames,) ndarray, K
     """
     if follows == "switched":
         rng = stream(session.seed, "reflected_source")
@@ -313,17 +373,22 @@ def reflected_source(
 def laser_warm_up(
     session: Session, *, ppm: float = 3.0, time_constant_min: float = 12.0, dead_path_mm: float = 60.0
 ) -> Array:
-    """Return the error of a laser whose wavelength settles exponentially after it is switched on, (n,), um.
+    """Return the error of a laser whose wavelength settles exponentially after it is switched on.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     ppm : float, ppm
         Relative error of the wavelength at the start of the test.
     time_constant_min : float, min
         Time constant of the laser.
     dead_path_mm : float, mm
         Path that the error acts on in addition to the measured length.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     remaining = np.exp(-session.time_s / (60.0 * time_constant_min))
     return -ppm * 1e-3 * (session.position_mm + dead_path_mm) * remaining
@@ -333,13 +398,18 @@ def laser_warm_up(
 def sensor_fault(
     session: Session, *, at_cycle: int = 20, sensor: str = "air_temperature", kind: str = "jump", size: float = 2.0
 ) -> Array:
-    """Return the error of an index compensation that uses a faulty sensor of the environment unit, (n,), um.
+    """Return the error of an index compensation that uses a faulty sensor of the environment unit.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     at_cycle, sensor, kind, size
         As in :func:`logged_air`.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     temperature, pressure = logged_air(session, at_cycle=at_cycle, sensor=sensor, kind=kind, size=size)
     compensated = refractivity(temperature, pressure, session.air_percent)
@@ -352,6 +422,7 @@ def logged_air(session: Session, *, at_cycle: int, sensor: str, kind: str, size:
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     at_cycle : int
         Cycle at whose start the fault begins, from 1.
     sensor : str
@@ -376,19 +447,24 @@ def logged_air(session: Session, *, at_cycle: int, sensor: str, kind: str, size:
 def telegraph_switching(
     session: Session, *, um: float = 1.0, mean_hold_min: float = 40.0, first_target: int = 9, last_target: int = 12
 ) -> Array:
-    """Return the error of a few targets that alternate between two states in the negative direction, (n,), um.
+    """Return the error of a few targets that alternate between two states in the negative direction.
 
     Outside the library of the analysis.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     um : float, um
         Difference of the two states.
     mean_hold_min : float, min
         Mean time in one state.
     first_target, last_target : int
         First and last affected target, from 1.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     rng = stream(session.seed, "telegraph_switching")
     state = random_levels(session.grid_s, 0.0, 1.0, mean_hold_min, rng, alternate=True)
@@ -400,17 +476,22 @@ def telegraph_switching(
 def travelling_chirp(
     session: Session, *, um: float = 1.0, start_period_min: float = 80.0, end_period_min: float = 20.0
 ) -> Array:
-    """Return the error of a wave along the axis whose frequency rises linearly, in the positive direction only, (n,), um.
+    """Return the error of a wave along the axis whose frequency rises linearly, in the positive direction only.
 
     Outside the library of the analysis.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     um : float, um
         Amplitude.
     start_period_min, end_period_min : float, min
         Period at the start and at the end of the test.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     f0, f1 = 1.0 / (60.0 * start_period_min), 1.0 / (60.0 * end_period_min)
     turns = f0 * session.time_s + 0.5 * (f1 - f0) / (session.cycles * session.period_s) * session.time_s**2
@@ -421,19 +502,24 @@ def travelling_chirp(
 def local_creep(
     session: Session, *, um: float = 1.0, centre_mm: float = 110.0, width_mm: float = 45.0, start_min: float = 20.0
 ) -> Array:
-    """Return the error of one stretch of the guide that creeps with the logarithm of time, (n,), um.
+    """Return the error of one stretch of the guide that creeps with the logarithm of time.
 
     Outside the library of the analysis.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     um : float, um
         Creep per natural logarithm of ``1 + t / start_min`` at the centre.
     centre_mm, width_mm : float, mm
         Centre and standard deviation of the stretch along the axis.
     start_min : float, min
         Time scale of the logarithm.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     bump = np.exp(-0.5 * ((session.position_mm - centre_mm) / width_mm) ** 2)
     return um * bump * np.log1p(session.time_s / (60.0 * start_min))
@@ -443,19 +529,24 @@ def local_creep(
 def direction_scale(
     session: Session, *, um: float = 2.0, time_constant_min: float = 90.0, follows: str = "constant"
 ) -> Array:
-    """Return the error of a scale that grows differently in the two directions of approach, (n,), um.
+    """Return the error of a scale that grows differently in the two directions of approach.
 
     Outside the library of the analysis.
 
     Parameters
     ----------
     session : Session
+        Readings and states of the test.
     um : float, um
         Difference between the directions at the far end of the travel, at full load in the steady state.
     time_constant_min : float, min
         Time constant of the growth.
     follows : str
         Drive, one of :data:`fusion.twin.machine.session.DRIVES`.
+
+    Returns
+    -------
+    (n,) ndarray, um
     """
     state = session.state(follows, time_constant_min, "direction_scale")
     return 0.5 * um * session.sign * session.share * session.at_readings(state)

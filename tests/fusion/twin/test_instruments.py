@@ -1,4 +1,4 @@
-"""The twin writes what a laboratory would leave, and nothing of the truth stands where the analysis looks."""
+"""The twin writes the files of a laboratory, and nothing of the truth is in the folder that the analysis reads."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_campaign_file_names_what_is_there(campaign):
     assert "clock_offset" not in content["thermography"]
 
 
-def test_truth_stands_beside_the_campaign_and_is_not_told_in_it(campaign):
+def test_truth_stands_beside_the_campaign_and_is_not_stated_in_it(campaign):
     beside = truth_folder(campaign.parent)
     assert {path.name for path in beside.iterdir()} == {"truth.nc", "truth.json"}
     assert beside.parent == campaign.parent.resolve().parent
@@ -138,13 +138,13 @@ def test_folder_that_holds_something_is_refused(tmp_path, taken):
     assert [p.name for p in (tmp_path / taken).iterdir()] == ["precious.txt"]
 
 
-def test_empty_folder_is_used_and_progress_is_told(tmp_path):
+def test_empty_folder_is_used_and_progress_is_reported(tmp_path):
     (tmp_path / "out").mkdir()
-    told = []
+    steps: list[tuple] = []
     write_campaign(
-        simulate(Recipe().vary(test={"cycles": 2})), tmp_path / "out", progress=lambda *step: told.append(step)
+        simulate(Recipe().vary(test={"cycles": 2})), tmp_path / "out", progress=lambda *step: steps.append(step)
     )
-    assert told == [(1, 2, "render frames"), (2, 2, "render frames")]
+    assert steps == [(1, 2, "render frames"), (2, 2, "render frames")]
 
 
 def test_moving_table_is_written_as_a_sequence(tmp_path):

@@ -1,4 +1,4 @@
-"""A recipe says what it means or is refused with file, key, value and remedy."""
+"""A recipe is read as it is meant, or refused with file, key, value and remedy."""
 
 from __future__ import annotations
 

@@ -38,10 +38,10 @@ def test_nuisance_has_its_stated_intensity(plain, walk):
 
 
 def test_same_seed_same_campaign_and_another_seed_another():
-    one, two, other = simulate(BASE), simulate(BASE), simulate(BASE.vary(campaign={"seed": 2}))
-    assert one.readings.identical(two.readings)
-    assert one.frames.identical(two.frames)
-    assert not one.readings["deviation"].equals(other.readings["deviation"])
+    first, again, other = simulate(BASE), simulate(BASE), simulate(BASE.vary(campaign={"seed": 2}))
+    assert first.readings.identical(again.readings)
+    assert first.frames.identical(again.frames)
+    assert not first.readings["deviation"].equals(other.readings["deviation"])
 
 
 def test_every_part_of_a_reading_is_accounted_for():

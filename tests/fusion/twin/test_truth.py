@@ -35,12 +35,12 @@ def test_fields_without_files_are_cell_means_with_the_frames_noise():
 
 
 def test_burst_lowers_the_noise_of_a_cycle_and_shows_its_spread():
-    one, many = (simulate(Recipe().vary(test={"cycles": 4}, camera={"frames_per_cycle": n})) for n in (1, 16))
-    quiet = fields_of(many, noise_K=0.0)["temperature"]
-    left = [float((fields_of(truth)["temperature"] - quiet).std()) for truth in (one, many)]
+    single, burst = (simulate(Recipe().vary(test={"cycles": 4}, camera={"frames_per_cycle": n})) for n in (1, 16))
+    quiet = fields_of(burst, noise_K=0.0)["temperature"]
+    noise = [float((fields_of(truth)["temperature"] - quiet).std()) for truth in (single, burst)]
     # 22,680 values of noise; within three seconds the table itself moves by well under 1 mK
-    assert left[0] / left[1] == pytest.approx(4.0, rel=0.05)
-    assert float(fields_of(many)["temperature_spread"].mean()) == pytest.approx(0.0115 * np.sqrt(15 / 16), rel=0.05)
+    assert noise[0] / noise[1] == pytest.approx(4.0, rel=0.05)
+    assert float(fields_of(burst)["temperature_spread"].mean()) == pytest.approx(0.0115 * np.sqrt(15 / 16), rel=0.05)
 
 
 def test_fields_without_files_show_what_the_camera_adds():

@@ -31,21 +31,21 @@ def plain() -> Truth:
 @pytest.mark.parametrize("name", DRIFTING)
 def test_switched_effect_changes_only_its_own_series(plain, name):
     truth = with_effect(name)
-    own = truth.readings[name].values
+    effect = truth.readings[name].values
     for part in plain.parts:
         np.testing.assert_array_equal(truth.readings[part].values, plain.readings[part].values)
     np.testing.assert_array_equal(truth.plate.amplitudes, plain.plate.amplitudes)
-    np.testing.assert_allclose(truth.readings["deviation"] - plain.readings["deviation"], own, atol=1e-12)
-    affected = np.abs(moving(own)).max(axis=0) > 1e-12
-    assert np.sqrt(np.mean(moving(own)[:, affected] ** 2)) == pytest.approx(0.4, rel=1e-9)
+    np.testing.assert_allclose(truth.readings["deviation"] - plain.readings["deviation"], effect, atol=1e-12)
+    affected = np.abs(moving(effect)).max(axis=0) > 1e-12
+    assert np.sqrt(np.mean(moving(effect)[:, affected] ** 2)) == pytest.approx(0.4, rel=1e-9)
 
 
 @pytest.mark.parametrize("name", sorted(set(EFFECTS) - set(DRIFTING)))
 def test_effects_of_the_camera_leave_the_machine_alone(plain, name):
     truth = simulate(BASE.vary(effect=(EffectRecipe(name, amplitude_K=2.0),)))
     np.testing.assert_array_equal(truth.readings["deviation"].values, plain.readings["deviation"].values)
-    seen = truth.frames["reflected_K" if name == "reflected_source" else "camera_offset_K"].values
-    assert set(np.round(seen, 12)) == {0.0, 2.0}
+    added = truth.frames["reflected_K" if name == "reflected_source" else "camera_offset_K"].values
+    assert set(np.round(added, 12)) == {0.0, 2.0}
 
 
 def test_camera_offset_in_um_counts_what_the_declared_model_would_predict_wrongly():
@@ -59,7 +59,7 @@ def test_camera_offset_in_um_counts_what_the_declared_model_would_predict_wrongl
 @pytest.mark.parametrize(
     "name", ["unseen_heat_source", "dead_path", "step_event", "periodic_disturbance", "thermal_lag"]
 )
-def test_flat_effects_do_not_know_position_or_direction(plain, name):
+def test_flat_effects_do_not_depend_on_position_or_direction(plain, name):
     session = plain.session
     elsewhere = replace(session, position_mm=session.position_mm[::-1], sign=-session.sign, target=session.target[::-1])
     np.testing.assert_array_equal(EFFECTS[name].series(elsewhere), EFFECTS[name].series(session))
@@ -97,7 +97,7 @@ def test_dead_path_follows_the_index_of_air():
     np.testing.assert_allclose(truth.in_order("dead_path"), 100e3 * change, atol=1e-9)
 
 
-def test_sensor_fault_is_believed_and_logged():
+def test_sensor_fault_acts_on_the_compensation_and_on_the_log():
     truth = with_effect("sensor_fault", None, at_cycle=20, sensor="air_temperature", kind="jump", size=2.0)
     logged = environment_log(truth)["air_temperature"].values
     jump = round((20 - 1) * 252 / 60)
