@@ -309,7 +309,7 @@ def _support(case: _Case, leading: str) -> list[str]:
             f"scatter that depends on the direction of approach raises the log-likelihood by {case.approach_gain:+.1f} nats"
         )
     elif leading == "structural":
-        sentences.append(f"no serial correlation (p = {case.serial_p:.3f}), equal in both directions")
+        sentences.append(f"no significant serial correlation (p = {case.serial_p:.3f}), equal in both directions")
     return sentences
 
 

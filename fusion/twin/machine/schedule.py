@@ -13,7 +13,7 @@ from fusion.twin.machine.streams import random_levels, stream, switched_levels
 
 
 @dataclass(frozen=True)
-class Readings:
+class ReadingSequence:
     """The readings of a test in the order in which they are taken; times count from the start of the test.
 
     Attributes
@@ -51,7 +51,7 @@ class Readings:
 
 
 @dataclass(frozen=True)
-class Schedule(Readings):
+class Schedule(ReadingSequence):
     """The readings of a positioning test and the motion of its table.
 
     Attributes

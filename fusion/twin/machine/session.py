@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion._typing import Array
-from fusion.twin.machine.schedule import Readings
+from fusion.twin.machine.schedule import ReadingSequence
 from fusion.twin.machine.streams import first_order, random_levels, stream
 
 #: What a body can follow: the logged load, a load that is not logged, a warm-up from the start, or the table's mean rise.
@@ -17,7 +17,7 @@ INNER_PART = 0.15
 
 
 @dataclass(frozen=True)
-class Session(Readings):
+class Session(ReadingSequence):
     """Readings of a test with the states behind them, on an evenly spaced time grid (m,) that begins before the test with a pre-heat.
 
     Attributes
