@@ -1,9 +1,9 @@
-"""The cause of an anomaly, with its probability, the evidence for and against it, and what to check on the machine.
+"""Diagnosis of anomalous targets: the cause with its probability, the evidence for and against it, and what to check on the machine.
 
-Explanations compete by likelihood: scatter (structural), scatter or creep bound to the direction of approach (stick-slip), local
-temperature through a first-order lag, a step, and a slow walk that none of these explains. A cause is named only where its
-probability passes a threshold set on simulated campaigns, its own test rejects chance, and what one direction teaches predicts the
-other; otherwise the answer is "undetermined". A false verdict costs more than none.
+Explanations compete by likelihood: scatter (structural), scatter or a random walk that depends on the direction of approach (stick-slip),
+local temperature through a first-order lag, a step, and a random walk that none of these explains. A cause is named only if its
+probability exceeds a threshold set on simulated campaigns, its own test rejects the null hypothesis, and the fit to one direction predicts
+the other; otherwise the cause is "undetermined", because a false cause costs more than none. Method: docs/method/diagnosis.md.
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ from threadpoolctl import threadpool_limits
 
 from fusion.diagnosis.explanations import (
     LAGS_S,
-    Lasting,
+    ProfileFit,
+    RandomWalkFit,
     Residual,
-    Slow,
-    fit_lasting,
-    fit_slow,
+    fit_profile,
+    fit_random_walk,
     lagged_temperature,
     local_residuals,
-    serial_p,
+    serial_p_value,
     step_columns,
     step_instant,
-    warm_up_like,
+    warm_up_share,
 )
-from fusion.diagnosis.scatter import Memoryless, memoryless_likelihoods
+from fusion.diagnosis.scatter import ScatterFit, fit_scatter
 
 Cause = Literal["structural", "local_temperature", "stick_slip", "step", "undetermined"]
 
-#: Least probability of each cause. tests/fusion/test_diagnosis_thresholds.py sets and checks them on simulated campaigns.
+#: Minimum probability of each cause, set and checked on simulated campaigns by tests/fusion/diagnosis/test_diagnosis_thresholds.py.
 THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "stick_slip": 0.4, "step": 0.6}
-#: What an effect bound to the approach must gain beyond scatter that is alike in both directions before it counts as likely (nats):
-#: amounts that follow the motion, more scatter in one direction, a slow walk in one direction (beside its parameter). Plain scatter
+#: Log-likelihood (nats) that an explanation by the direction of approach must gain over scatter equal in both directions: amounts along
+#: the motion, more scatter in one direction, a random walk in one direction (beside its parameter). Scatter equal in both directions
 #: exceeds one of them by chance in about one case of twenty.
 APPROACH_NATS = {"along": 2.1, "one_direction": 4.0, "slow": 2.0}
-#: A local temperature of which at least this share follows the exponentials of one warm-up explains whatever else is slow as well.
+#: A local temperature that follows one warm-up to at least this share of its variance is collinear with every other slow cause.
 WARM_UP_SHARE = 0.98
-#: Level of the bootstrap test that a lasting cause must pass; local temperature is the name that costs most when it is wrong.
+#: Levels of the bootstrap tests; local temperature is the cause that costs most when it is wrong.
 LEVELS = {"step": 0.05, "local_temperature": 0.02}
 
 CHECKS: dict[str, str] = {
@@ -56,7 +56,7 @@ CHECKS: dict[str, str] = {
 
 
 class Flagged(Protocol):
-    """What a diagnosis needs of an anomaly: :class:`interferometry.anomalies.Anomaly` has it."""
+    """What a diagnosis needs of an anomaly; :class:`interferometry.anomalies.Anomaly` provides it."""
 
     @property
     def target(self) -> int:
@@ -64,20 +64,29 @@ class Flagged(Protocol):
 
     @property
     def direction(self) -> str:
-        """Direction(s) that stand out: ``"positive"``, ``"negative"`` or ``"both"``."""
+        """Affected direction: ``"positive"``, ``"negative"`` or ``"both"``."""
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Verdict on one anomaly.
+    """Cause of one anomaly.
 
     Attributes
     ----------
-    cause : name of the cause, "undetermined" where the data do not decide
-    probability : of that cause among the explanations tried; for "undetermined" that of the best explanation
-    evidence : numbers by name (um, K, s, nats or probabilities, as the name says)
-    for_it, against_it : sentences with numbers
-    check : what to look at on the machine
+    target : int
+        Target number, from 1.
+    direction : str
+        Affected direction: "positive", "negative" or "both".
+    cause : str
+        Name of the cause, "undetermined" where the data do not decide.
+    probability : float
+        Of that cause among the explanations tried; for "undetermined", that of the best explanation.
+    evidence : dict
+        Numbers by name; the name states the unit (um, um_per_K, s, nats), or that it is a probability.
+    for_it, against_it : tuple of str
+        Sentences with numbers for the leading explanation, and against it.
+    check : str
+        What to check on the machine.
     """
 
     target: int
@@ -95,27 +104,43 @@ class _Case:
     """All fits of one target."""
 
     residual: Residual
-    slow: Slow
-    memoryless: Memoryless
-    temperature: Lasting | None
-    step: Lasting
+    random_walk: RandomWalkFit
+    scatter: ScatterFit
+    temperature: ProfileFit | None
+    step: ProfileFit
     serial_p: float
     warm_up_share: float
+
+    @property
+    def tested(self) -> dict[str, ProfileFit]:
+        """The explanations with a bootstrap test of their own, by name."""
+        return {"step": self.step} | ({"local_temperature": self.temperature} if self.temperature is not None else {})
+
+    @property
+    def step_cycle(self) -> int:
+        """Number of the first cycle after the best step."""
+        return int(self.residual.cycle[step_instant(self.step.best)])
+
+    @property
+    def approach_gain(self) -> float:
+        """Log-likelihood gained by scatter that depends on the direction of approach over scatter equal in both directions, nats."""
+        return max(self.scatter.one_direction, self.scatter.along_approach) - self.scatter.both
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def diagnose(anomalies: Sequence[Flagged], fused: xr.Dataset, *, seed: int = 0) -> list[Diagnosis]:
-    """Name the cause of every anomaly.
+    """Diagnose the cause of every anomaly.
 
     Parameters
     ----------
-    anomalies : sequence
-        Flagged targets; all of them are kept out of the drift that is subtracted.
-    fused : Dataset
-        Of :func:`fusion.alignment.align.align`: ``deviation``, ``time``, ``position`` and, where the camera sees the targets,
-        ``local_rise_series`` (frame_time, target) in K.
+    anomalies : sequence of Flagged
+        Anomalous targets with their direction, as from :func:`interferometry.anomalies.detect_anomalies`; all of them are left out of the
+        estimate of the drift.
+    fused : xarray.Dataset
+        From :func:`fusion.alignment.align.align`: `deviation`, um, and `time` (cycle, direction, target); `position` (target,), mm; and,
+        where the camera sees the targets, `local_rise_series` (frame_time, target), K.
     seed : int
-        Seed of the bootstrap.
+        Seed of the bootstrap; each target has its own random numbers.
 
     Returns
     -------
@@ -125,58 +150,83 @@ def diagnose(anomalies: Sequence[Flagged], fused: xr.Dataset, *, seed: int = 0) 
     Raises
     ------
     DiagnosisError
-        if a target is unknown, has fewer than 12 cycles, or fewer than 3 targets are free of anomalies.
+        A target is unknown or was read in fewer than 12 cycles, or fewer than 3 targets are free of anomalies.
+
+    Notes
+    -----
+    Explanations are compared by the Bayesian information criterion with equal prior probabilities (Schwarz 1978, Ann. Stat. 6, 461; Kass
+    and Raftery 1995, J. Am. Stat. Assoc. 90, 773); docs/method/diagnosis.md.
+
+    Examples
+    --------
+    Target 3 shifts by 1 um after 20 of 40 cycles, beside 0.1 um of noise:
+
+    >>> from types import SimpleNamespace
+    >>> rng = np.random.default_rng(1)
+    >>> deviation = 0.1 * rng.standard_normal((40, 2, 6))
+    >>> deviation[20:, :, 2] += 1.0
+    >>> time = np.datetime64("2026-03-09", "ns") + np.arange(480) * np.timedelta64(10, "s")
+    >>> dims = ("cycle", "direction", "target")
+    >>> fused = xr.Dataset(
+    ...     {"deviation": (dims, deviation), "time": (dims, time.reshape(40, 2, 6)), "position": ("target", 20.0 * np.arange(6))},
+    ...     coords={"cycle": np.arange(1, 41), "direction": ["positive", "negative"], "target": np.arange(1, 7)},
+    ... )
+    >>> (diagnosis,) = diagnose([SimpleNamespace(target=3, direction="both")], fused)
+    >>> diagnosis.cause, diagnosis.evidence["step_cycle"]
+    ('step', 21)
     """
-    flagged = {int(one.target) for one in anomalies}
-    cases = {target: _examine(fused, target, flagged, seed) for target in sorted(flagged)}
-    return [_judge(cases[int(one.target)], str(one.direction)) for one in anomalies]
+    flagged = {int(anomaly.target) for anomaly in anomalies}
+    cases = {target: _fit_explanations(fused, target, flagged, seed) for target in sorted(flagged)}
+    return [_judge(cases[int(anomaly.target)], str(anomaly.direction)) for anomaly in anomalies]
 
 
-def _examine(fused: xr.Dataset, target: int, flagged: set[int], seed: int) -> _Case:
+def _fit_explanations(fused: xr.Dataset, target: int, flagged: set[int], seed: int) -> _Case:
+    """Fit every explanation to one target."""
     rng = np.random.default_rng([seed, target])
     residual = local_residuals(fused, target, flagged)
     columns = lagged_temperature(residual)
-    temperature = None if columns is None else fit_lasting(residual, columns, rng)
+    temperature = None if columns is None else fit_profile(residual, columns, rng)
     return _Case(
         residual=residual,
-        slow=fit_slow(residual),
-        memoryless=memoryless_likelihoods(residual),
+        random_walk=fit_random_walk(residual),
+        scatter=fit_scatter(residual),
         temperature=temperature,
-        step=fit_lasting(residual, step_columns(residual.seconds.size), rng),
-        serial_p=serial_p(residual, rng),
-        warm_up_share=0.0 if columns is None else warm_up_like(residual.seconds, columns[:, 0]),
+        step=fit_profile(residual, step_columns(residual.seconds.size), rng),
+        serial_p=serial_p_value(residual, rng),
+        warm_up_share=0.0 if columns is None else warm_up_share(residual.seconds, columns[:, 0]),
     )
 
 
-def weigh(case: _Case) -> dict[str, float]:
-    """Probabilities of the causes and of "slow" (a walk without a name), equal before the data.
+def _probabilities(case: _Case) -> dict[str, float]:
+    """Return the probabilities of the causes and of "slow" (a random walk without a cause), equal before the data.
 
-    Likelihoods are at their maximum; each free parameter costs half the logarithm of the number of cycles (Schwarz 1978, Ann.
-    Stat. 6, 461) and each searched member the logarithm of their number. A lasting cause whose own test does not reject chance has
-    no weight.
+    From maximum likelihoods: each free parameter costs half the logarithm of the number of cycles (Schwarz 1978), and a search over
+    candidates the logarithm of their number. A cause whose own test does not reject the null hypothesis has probability 0.
     """
     cycles = case.residual.seconds.size
-    one = 0.5 * float(np.log(cycles))
-    scatter = case.memoryless
+    parameter = 0.5 * float(np.log(cycles))
+    scatter = case.scatter
     sticking = float(
         np.logaddexp(
             scatter.one_direction - APPROACH_NATS["one_direction"], scatter.along_approach - APPROACH_NATS["along"]
         )
     )
+    # The scatter's own likelihoods, of all readings, divide the probability of white noise between both explanations by scatter.
     share = 1.0 / (1.0 + float(np.exp(np.clip(scatter.both - sticking, -50, 50))))
+    walk = case.random_walk
     score = {
-        "structural": case.slow.white + float(np.log(max(1.0 - share, 1e-30))),
+        "structural": walk.white + float(np.log(max(1.0 - share, 1e-30))),
         "stick_slip": max(
-            case.slow.white + float(np.log(max(share, 1e-30))),
-            case.slow.one_direction - one - APPROACH_NATS["slow"],
+            walk.white + float(np.log(max(share, 1e-30))),
+            walk.one_direction - parameter - APPROACH_NATS["slow"],
         ),
-        "slow": case.slow.shared - one,
-        "step": case.step.log_likelihood - one - float(np.log(step_columns(cycles).shape[1])),
+        "slow": walk.shared - parameter,
+        "step": case.step.log_likelihood - parameter - float(np.log(step_columns(cycles).shape[1])),
     }
     if case.temperature is not None:
-        score["local_temperature"] = case.temperature.log_likelihood - one - float(np.log(len(LAGS_S)))
-    for name, fitted in _lasting(case).items():
-        if fitted.p_value > LEVELS[name]:
+        score["local_temperature"] = case.temperature.log_likelihood - parameter - float(np.log(len(LAGS_S)))
+    for name, fit in case.tested.items():
+        if fit.p_value > LEVELS[name]:
             score[name] = -np.inf
     highest = max(score.values())
     weight = {name: float(np.exp(value - highest)) for name, value in score.items()}
@@ -184,22 +234,18 @@ def weigh(case: _Case) -> dict[str, float]:
     return {name: value / total for name, value in weight.items()}
 
 
-def _lasting(case: _Case) -> dict[str, Lasting]:
-    """The explanations with a bootstrap test of their own."""
-    return {"step": case.step} | ({"local_temperature": case.temperature} if case.temperature is not None else {})
-
-
 def _judge(case: _Case, direction: str) -> Diagnosis:
-    probability = weigh(case)
+    """Name the leading explanation of one target, unless there is an objection to it."""
+    probability = _probabilities(case)
     leading = max(probability, key=lambda name: probability[name])
     against = _objections(case, leading, probability[leading])
     cause: Cause = "undetermined" if against or leading == "slow" else leading  # type: ignore[assignment]
     runner_up = max((name for name in probability if name != leading), key=lambda name: probability[name])
     against.append(f"next best explanation: {runner_up}, probability {probability[runner_up]:.2f}")
     against += [
-        f"{name}: p = {fitted.p_value:.3f}, a slow walk alone looks like this too often"
-        for name, fitted in _lasting(case).items()
-        if fitted.p_value > LEVELS[name]
+        f"{name}: p = {fit.p_value:.3f}, so a random walk alone can explain it"
+        for name, fit in case.tested.items()
+        if fit.p_value > LEVELS[name]
     ]
     return Diagnosis(
         target=case.residual.target,
@@ -214,76 +260,81 @@ def _judge(case: _Case, direction: str) -> Diagnosis:
 
 
 def _objections(case: _Case, leading: str, probability: float) -> list[str]:
-    """Reasons not to name the leading explanation; none left means that it is named."""
+    """Return the reasons against naming the leading explanation as the cause; empty where it is named."""
     reasons = []
     threshold = THRESHOLDS.get(leading, 0.0)
     if probability < threshold:
         reasons.append(f"probability {probability:.2f} of {leading} is below its threshold {threshold:.2f}")
-    lasting = _lasting(case).get(leading)
-    if lasting is not None and lasting.held_out <= 0:
-        reasons.append(f"what one direction teaches does not predict the other ({lasting.held_out:+.1f} nats held out)")
+    fit = case.tested.get(leading)
+    if fit is not None and fit.hold_out_gain <= 0:
+        reasons.append(
+            f"the fit to one direction does not predict the other (hold-out log-likelihood {fit.hold_out_gain:+.1f} nats)"
+        )
     if leading == "local_temperature" and case.temperature is not None:
-        first, second = case.temperature.by_direction
-        if first * second < 0:
-            reasons.append(f"the sign differs between directions ({first:+.3f} and {second:+.3f} um/K)")
+        positive, negative = case.temperature.by_direction
+        if positive * negative < 0:
+            reasons.append(f"the sign differs between directions ({positive:+.3f} and {negative:+.3f} um/K)")
         if case.warm_up_share >= WARM_UP_SHARE:
             reasons.append(
-                f"{case.warm_up_share:.1%} of the local temperature is one warm-up curve: not separable from any other slow cause"
+                f"{case.warm_up_share:.1%} of the local temperature's variance is one warm-up curve: collinear with any other slow cause"
             )
     if leading == "slow":
-        reasons.append(f"slow (serial p = {case.serial_p:.3f}), but neither local temperature nor one step explains it")
+        reasons.append(f"slow (serial p = {case.serial_p:.3f}), but neither local temperature nor a step explains it")
     return reasons
 
 
 def _support(case: _Case, leading: str) -> list[str]:
-    """Sentences for the leading explanation."""
+    """Return the sentences in favour of the leading explanation."""
     residual = case.residual
     scatter = float(np.nanstd(residual.values))
-    sentences = [f"scatter {scatter:.2f} um where the other targets show {residual.typical_um:.2f} um"]
+    sentences = [f"standard deviation {scatter:.2f} um, typical of the other targets {residual.typical_um:.2f} um"]
     if leading == "step":
-        at = int(residual.cycle[step_instant(case.step.place)])
+        fit = case.step
         sentences.append(
-            f"step of {case.step.coefficient:+.2f} +- {case.step.coefficient_u:.2f} um at cycle {at} (p = {case.step.p_value:.3f}), "
-            f"held out {case.step.held_out:+.1f} nats"
+            f"step of {fit.coefficient:+.2f} +- {fit.coefficient_u:.2f} um at cycle {case.step_cycle} (p = {fit.p_value:.3f}), "
+            f"hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
         )
     elif leading == "local_temperature" and case.temperature is not None:
-        found = case.temperature
+        fit = case.temperature
         sentences.append(
-            f"{found.coefficient:+.3f} +- {found.coefficient_u:.3f} um per K of local rise, lag {LAGS_S[found.place]:.0f} s "
-            f"(p = {found.p_value:.3f}), held out {found.held_out:+.1f} nats"
+            f"{fit.coefficient:+.3f} +- {fit.coefficient_u:.3f} um per K of local temperature rise, lag {LAGS_S[fit.best]:.0f} s "
+            f"(p = {fit.p_value:.3f}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
         )
     elif leading == "stick_slip":
-        first, second = residual.scatter_um
-        sentences.append(f"scatter {first:.2f} um from the positive side, {second:.2f} um from the negative side")
-        gain = max(case.memoryless.one_direction, case.memoryless.along_approach) - case.memoryless.both
-        sentences.append(f"an effect bound to the approach explains the readings better by {gain:+.1f} nats")
+        positive, negative = residual.scatter_um
+        sentences.append(
+            f"standard deviation {positive:.2f} um in the positive direction, {negative:.2f} um in the negative direction"
+        )
+        sentences.append(
+            f"scatter that depends on the direction of approach raises the log-likelihood by {case.approach_gain:+.1f} nats"
+        )
     elif leading == "structural":
-        sentences.append(f"no order in time (serial p = {case.serial_p:.3f}), alike in both directions")
+        sentences.append(f"no significant serial correlation (p = {case.serial_p:.3f}), equal in both directions")
     return sentences
 
 
 def _evidence(case: _Case, probability: dict[str, float]) -> dict[str, Any]:
-    """Every number the verdict rests on."""
+    """Return every number that the diagnosis rests on."""
     evidence: dict[str, Any] = {f"probability_{name}": value for name, value in probability.items()}
     evidence |= {
         "scatter_typical_um": case.residual.typical_um,
         "scatter_positive_um": case.residual.scatter_um[0],
         "scatter_negative_um": case.residual.scatter_um[1],
         "serial_p": case.serial_p,
-        "approach_gain_nats": max(case.memoryless.one_direction, case.memoryless.along_approach) - case.memoryless.both,
+        "approach_gain_nats": case.approach_gain,
         "step_p": case.step.p_value,
         "step_um": case.step.coefficient,
         "step_u_um": case.step.coefficient_u,
-        "step_cycle": int(case.residual.cycle[step_instant(case.step.place)]),
-        "step_held_out_nats": case.step.held_out,
+        "step_cycle": case.step_cycle,
+        "step_held_out_nats": case.step.hold_out_gain,
     }
     if case.temperature is not None:
         evidence |= {
             "temperature_p": case.temperature.p_value,
             "temperature_um_per_K": case.temperature.coefficient,
             "temperature_u_um_per_K": case.temperature.coefficient_u,
-            "temperature_lag_s": LAGS_S[case.temperature.place],
-            "temperature_held_out_nats": case.temperature.held_out,
+            "temperature_lag_s": LAGS_S[case.temperature.best],
+            "temperature_held_out_nats": case.temperature.hold_out_gain,
             "temperature_warm_up_share": case.warm_up_share,
         }
     return evidence

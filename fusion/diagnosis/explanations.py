@@ -1,8 +1,9 @@
-"""Competing explanations of one position's residual, each with the size of the slow nuisance estimated anew.
+"""Competing explanations of one target's residual, each fitted with its own estimate of the random walk beside it.
 
-A residual is what one target shows in both directions after its own mean and every pass's level and stretch (from the other targets)
-are taken out. Explanations that last (local temperature, step) are profile likelihood ratios against white noise plus a random walk,
-with parametric-bootstrap p values. Explanations without memory are in :mod:`fusion.diagnosis.scatter`.
+The residual of a target is its deviation in both directions after subtraction of its own mean and of every pass's level and stretch, which
+are estimated from the other targets. Explanations by a regressor (local temperature, step) are profile likelihood ratios against white
+noise plus a random walk, with p-values from a parametric bootstrap. Explanations by scatter alone are in
+:mod:`fusion.diagnosis.scatter`; the method is described in docs/method/diagnosis.md.
 """
 
 from __future__ import annotations
@@ -29,11 +30,12 @@ from fusion.attribution.likelihood_ratio import (
 from fusion.attribution.warm_up import warm_up_columns
 from fusion.errors import FusionError
 
-#: Lags of the local temperature, s.
+#: Candidate time constants of the response to the local temperature, s.
 LAGS_S = (0.0, 600.0, 1800.0, 3600.0)
-#: Steps are tried after every cycle but the first and last of this number.
+#: A step leaves at least this number of cycles on either side.
 _STEP_MARGIN = 5
-_LEVELS = 499
+#: Draws of the parametric bootstrap, and permutations of the serial test.
+_DRAWS = 499
 
 
 class DiagnosisError(FusionError):
@@ -41,15 +43,25 @@ class DiagnosisError(FusionError):
 
 
 @dataclass(frozen=True)
-class Parts:
-    """Orthonormal mean and difference of the directions over complete cycles; the mean alone where one direction was read.
+class DirectionParts:
+    """A residual as mean and difference of the two directions, orthonormal, over the cycles in which both were read.
+
+    Where one direction was read in too few cycles, the mean is the other direction alone.
 
     Attributes
     ----------
-    rows : cycles used
-    mean, difference : (n,) um times `unit`, or None
-    sides : (2, n) both directions, or None
-    grid : whitenings that all of them share
+    rows : (n,) integer ndarray
+        Indices of the cycles used.
+    mean : (n,) ndarray, um times `unit`
+        Sum of the directions over the square root of 2, or the only direction.
+    difference : (n,) ndarray or None, um times `unit`
+        Difference of the directions over the square root of 2.
+    sides : (2, n) ndarray or None, um
+        Positive and negative direction.
+    unit : float
+        Factor between `mean` and the average of the directions: square root of 2, or 1 for a single direction.
+    grid : Grid
+        Whitenings under every random walk considered, for the times of these cycles.
     """
 
     rows: NDArray[np.int64]
@@ -62,14 +74,22 @@ class Parts:
 
 @dataclass(frozen=True)
 class Residual:
-    """What one target does by itself.
+    """What one target shows beyond its mean and the drift of all targets.
 
     Attributes
     ----------
-    seconds : (cycle,) mean time of the target's readings, s since the first reading
-    values : (direction, cycle) um, NaN where missing; first row positive approach
-    typical_um : robust scatter of the other targets' residuals
-    temperature : (frames,), (frames,) s and K, or None
+    target : int
+        Target number, from 1.
+    seconds : (cycles,) ndarray, s
+        Mean time of the target's readings in each cycle since the first reading.
+    values : (2, cycles) ndarray, um
+        Residual in the positive and in the negative direction, NaN where missing.
+    cycle : (cycles,) integer ndarray
+        Cycle numbers.
+    typical_um : float, um
+        Robust standard deviation that this target would have if it scattered like the others.
+    temperature : tuple of two (frames,) ndarray, or None
+        Times, s, and local temperature rise, K; None where the camera does not see the target.
     """
 
     target: int
@@ -81,80 +101,102 @@ class Residual:
 
     @property
     def scatter_um(self) -> tuple[float, float]:
-        """Standard deviation from the positive and from the negative side, NaN where that was not read."""
-        known = [row[np.isfinite(row)] for row in self.values]
-        first, second = (float(row.std()) if row.size else float("nan") for row in known)
-        return first, second
+        """Standard deviation in the positive and in the negative direction, um, NaN for one that was not read."""
+        finite = [row[np.isfinite(row)] for row in self.values]
+        positive, negative = (float(row.std()) if row.size else float("nan") for row in finite)
+        return positive, negative
 
     @cached_property
-    def parts(self) -> Parts:
-        """Its mean and difference, with the whitenings for their instants."""
+    def parts(self) -> DirectionParts:
+        """Mean and difference of the directions, with the whitenings for their times."""
         read = np.isfinite(self.values)
         rows = np.flatnonzero(read.all(axis=0))
         if rows.size >= MIN_CYCLES:
-            first, second = self.values[:, rows]
+            positive, negative = sides = self.values[:, rows]
             root = float(np.sqrt(2.0))
-            return Parts(
-                rows, (first + second) / root, (first - second) / root, self.values[:, rows], root, self._grid(rows)
+            return DirectionParts(
+                rows, (positive + negative) / root, (positive - negative) / root, sides, root, self._grid(rows)
             )
         side = int(read.sum(axis=1).argmax())
         rows = np.flatnonzero(read[side])
-        return Parts(rows, self.values[side, rows], None, None, 1.0, self._grid(rows))
+        return DirectionParts(rows, self.values[side, rows], None, None, 1.0, self._grid(rows))
 
     def _grid(self, rows: NDArray[np.int64]) -> Grid:
+        """Return the whitenings for the times of the given cycles, with the mean as the only nuisance column."""
         ones = np.ones(rows.size)
         return whitening_grid(self.seconds[rows], ones, ones[:, None], integrated=False)
 
 
 @dataclass(frozen=True)
-class Lasting:
-    """One explanation with memory, fitted to the mean of both directions.
+class ProfileFit:
+    """The best of several candidate regressors, fitted to the mean of both directions by profile likelihood.
 
     Attributes
     ----------
-    log_likelihood : nats, of the mean and the difference of the directions together
-    p_value : parametric bootstrap over all its lags or instants, against white noise plus random walk
-    place : index of the best lag or instant
-    coefficient, coefficient_u : um/K or um
-    by_direction : coefficient of the best member in each direction alone, NaN where that was not read
-    held_out : log-likelihood gained in one direction by member and coefficient from the other (nats, both ways), NaN if one direction
+    log_likelihood : float, nats
+        Of the mean and the difference of the directions together.
+    p_value : float
+        Parametric bootstrap over all candidates, against white noise plus random walk.
+    best : int
+        Index of the best candidate (lag or step).
+    coefficient, coefficient_u : float, um/K or um
+        Its coefficient, with standard uncertainty, for the average of the directions.
+    by_direction : tuple of two floats, um/K or um
+        Its coefficient in each direction alone, NaN where one was not read.
+    hold_out_gain : float, nats
+        Log-likelihood gained in each direction by the candidate and the coefficient fitted to the other, sum of both; NaN where only
+        one direction was read.
     """
 
     log_likelihood: float
     p_value: float
-    place: int
+    best: int
     coefficient: float
     coefficient_u: float
     by_direction: tuple[float, float]
-    held_out: float
+    hold_out_gain: float
 
 
 @dataclass(frozen=True)
-class Slow:
-    """Log-likelihoods (nats) of explanations by white noise and a slow walk.
+class RandomWalkFit:
+    """Log-likelihoods (nats) of white noise with and without a random walk.
 
     Attributes
     ----------
-    white : no memory
-    shared : a walk in both directions alike
-    one_direction : a walk in one direction only
-    side : the direction of that walk, 0 positive, 1 negative
+    white : float
+        White noise alone.
+    shared : float
+        A random walk that both directions share.
+    one_direction : float
+        A random walk in one direction only; minus infinity where one was not read.
     """
 
     white: float
     shared: float
     one_direction: float
-    side: int
 
 
 def local_residuals(fused: xr.Dataset, target: int, flagged: set[int]) -> Residual:
-    """Residual of one target with every pass's level and stretch taken from the targets that are not flagged.
+    """Return the residual of one target, with every pass's level and stretch estimated from the targets that are not flagged.
 
     Parameters
     ----------
-    fused : Dataset
-        ``deviation`` (um), ``time`` with dims cycle, direction, target; ``position``; and, where known, ``local_rise_series``
-        (frame_time, target) in K.
+    fused : xarray.Dataset
+        `deviation`, um, and `time` (cycle, direction, target); `position` (target,), mm; and, where the camera sees the targets,
+        `local_rise_series` (frame_time, target), K.
+    target : int
+        Target number.
+    flagged : set of int
+        Numbers of the anomalous targets.
+
+    Returns
+    -------
+    Residual
+
+    Raises
+    ------
+    DiagnosisError
+        The target is unknown or was read in too few cycles, or fewer than 3 other targets are free of anomalies.
     """
     ordered = fused.transpose("cycle", "direction", "target", ...)
     targets = ordered["target"].values.astype(int)
@@ -163,8 +205,8 @@ def local_residuals(fused: xr.Dataset, target: int, flagged: set[int]) -> Residu
     sound = np.array([t not in flagged and t != target for t in targets])
     if sound.sum() < 3:
         raise DiagnosisError(
-            f"target {target}: only {int(sound.sum())} targets are free of anomalies; a residual needs 3 to tell its level and "
-            "stretch: an effect on most targets is drift, not an anomaly"
+            f"target {target}: only {int(sound.sum())} targets are free of anomalies; level and stretch of a pass need 3: an effect on "
+            "most targets is drift, not an anomaly"
         )
     deviation = ordered["deviation"].values.astype(float)
     time = ordered["time"].values.astype("datetime64[ns]")
@@ -172,77 +214,91 @@ def local_residuals(fused: xr.Dataset, target: int, flagged: set[int]) -> Residu
     position = ordered["position"].values.astype(float)
     stretch = (position - position.mean()) / max(float(np.ptp(position)), 1e-9)
     design = np.column_stack([np.ones_like(stretch), stretch])
-    passes = _take_out_passes(deviation, design, sound)
-    place = int(np.flatnonzero(targets == target)[0])
-    names = [str(name) for name in ordered["direction"].values]
-    rows = [passes[:, names.index(name), place] for name in ("positive", "negative") if name in names]
+    residuals = _without_passes(deviation, design, sound)
+    column = int(np.flatnonzero(targets == target)[0])
     values = np.full((2, deviation.shape[0]), np.nan)
-    for k, name in enumerate(name for name in ("positive", "negative") if name in names):
-        values[("positive", "negative").index(name)] = rows[k]
+    for k, name in enumerate(ordered["direction"].values):
+        values[("positive", "negative").index(str(name))] = residuals[:, k, column]
     start = time[~np.isnat(time)].min()
-    stamps = (time[:, :, place] - start) / np.timedelta64(1, "s")
+    seconds = (time[:, :, column] - start) / np.timedelta64(1, "s")
     used = np.isfinite(values).any(axis=0)
     if used.sum() < MIN_CYCLES:
         raise DiagnosisError(
             f"target {target} has readings in {int(used.sum())} cycles; a diagnosis needs {MIN_CYCLES}"
         )
-    typical = _typical_scatter(passes, design, sound, place)
     return Residual(
         target,
-        np.nanmean(stamps[used], axis=1),
+        np.nanmean(seconds[used], axis=1),
         values[:, used],
         ordered["cycle"].values[used].astype(np.int64),
-        typical,
-        _local_temperature(ordered, place, start),
+        _typical_scatter(residuals, design, sound, column),
+        _local_temperature(ordered, column, start),
     )
 
 
-def _take_out_passes(deviation: Array, design: Array, sound: NDArray[np.bool_]) -> Array:
-    """Deviations (cycle, direction, target) less each target's mean and each pass's level and stretch, by backfitting."""
-    seen = np.isfinite(deviation)
-    rest = deviation - _known_mean(deviation)
+def _without_passes(deviation: Array, design: Array, sound: NDArray[np.bool_]) -> Array:
+    """Return deviations (cycle, direction, target) less each target's mean and each pass's level and stretch, by backfitting.
+
+    Backfitting: Hastie and Tibshirani, Generalized Additive Models (1990), chapter 4.
+    """
+    present = np.isfinite(deviation)
+    rest = deviation - _mean_over_cycles(deviation)
     for _ in range(50):
         passes = np.zeros_like(deviation)
         for index in np.ndindex(deviation.shape[:2]):
-            used = seen[index] & sound
+            used = present[index] & sound
             if used.sum() >= 3:
                 passes[index] = design @ np.linalg.lstsq(design[used], rest[index][used], rcond=None)[0]
             else:
                 passes[index] = np.nan
-        profile = _known_mean(rest - passes)
+        profile = _mean_over_cycles(rest - passes)
         rest = rest - profile
         if np.abs(profile).max() < 1e-6:
             break
     return rest - passes
 
 
-def _known_mean(values: Array) -> Array:
-    """Mean over the first dim of what is known, 0 where nothing is."""
-    known = np.isfinite(values)
-    return np.asarray(np.where(known, values, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1), float)
+def _mean_over_cycles(values: Array) -> Array:
+    """Return the mean over the first dimension without NaN, 0 where there is nothing else."""
+    finite = np.isfinite(values)
+    return np.asarray(np.where(finite, values, 0.0).sum(axis=0) / np.maximum(finite.sum(axis=0), 1), float)
 
 
-def _typical_scatter(passes: Array, design: Array, sound: NDArray[np.bool_], place: int) -> float:
-    """Scatter (um) that this target would show if it were like the others; what the passes' own fit takes away is given back."""
+def _typical_scatter(residuals: Array, design: Array, sound: NDArray[np.bool_], column: int) -> float:
+    """Return the standard deviation (um) of one target's residual if it scattered like the sound ones.
+
+    The sound targets' own leverage in the fit of each pass makes their residuals smaller, and is corrected for.
+    """
     normal = np.linalg.inv(design[sound].T @ design[sound])
     kept = 1.0 - np.einsum("ij,jk,ik->i", design[sound], normal, design[sound])
-    columns = passes[:, :, sound] / np.sqrt(kept)
-    read = np.isfinite(columns).any(axis=0)
-    others = 1.4826 * np.nanmedian(np.abs(columns[:, read]), axis=0)
-    return float(np.median(others) * np.sqrt(1.0 + design[place] @ normal @ design[place]))
+    scaled = residuals[:, :, sound] / np.sqrt(kept)
+    read = np.isfinite(scaled).any(axis=0)
+    others = 1.4826 * np.nanmedian(np.abs(scaled[:, read]), axis=0)
+    return float(np.median(others) * np.sqrt(1.0 + design[column] @ normal @ design[column]))
 
 
-def _local_temperature(fused: xr.Dataset, place: int, start: np.datetime64) -> tuple[Array, Array] | None:
+def _local_temperature(fused: xr.Dataset, column: int, start: np.datetime64) -> tuple[Array, Array] | None:
+    """Return times (s) and temperature rise (K) at one target, or None where the camera sees it in too few frames."""
     if "local_rise_series" not in fused:
         return None
-    values = fused["local_rise_series"].transpose("frame_time", "target").values[:, place].astype(float)
+    values = fused["local_rise_series"].transpose("frame_time", "target").values[:, column].astype(float)
     seconds = (fused["frame_time"].values.astype("datetime64[ns]") - start) / np.timedelta64(1, "s")
-    known = np.isfinite(values)
-    return (seconds[known], values[known]) if known.sum() >= MIN_CYCLES else None
+    finite = np.isfinite(values)
+    return (seconds[finite], values[finite]) if finite.sum() >= MIN_CYCLES else None
 
 
 def lagged_temperature(residual: Residual) -> Array | None:
-    """Local temperature at the residual's times under every lag, (cycle, lags), or None where the camera does not see it."""
+    """Return the local temperature at the times of a residual, through a first-order lag of every candidate time constant.
+
+    Parameters
+    ----------
+    residual : Residual
+
+    Returns
+    -------
+    (cycles, lags) ndarray, K, or None
+        One column per time constant of `LAGS_S`; None where the camera does not see the target.
+    """
     if residual.temperature is None:
         return None
     seconds, values = residual.temperature
@@ -251,60 +307,116 @@ def lagged_temperature(residual: Residual) -> Array | None:
 
 
 def step_columns(cycles: int) -> Array:
-    """Unit steps after every cycle but the first and last five, (cycle, instants)."""
+    """Return unit steps at every cycle that leaves five cycles on either side.
+
+    Parameters
+    ----------
+    cycles : int
+        Number of cycles, at least 10.
+
+    Returns
+    -------
+    (cycles, steps) ndarray
+        0 before the step, 1 from it on; :func:`step_instant` gives the cycle of a column.
+    """
     instants = np.arange(_STEP_MARGIN, cycles - _STEP_MARGIN + 1)
     return (np.arange(cycles)[:, None] >= instants).astype(float)
 
 
-def step_instant(place: int) -> int:
-    """Index of the first cycle after the step of a column of :func:`step_columns`."""
-    return place + _STEP_MARGIN
+def step_instant(column: int) -> int:
+    """Return the cycle at which a column of :func:`step_columns` steps.
+
+    Parameters
+    ----------
+    column : int
+        Index of the column.
+
+    Returns
+    -------
+    int
+        Index of the first cycle after the step, from 0.
+    """
+    return column + _STEP_MARGIN
 
 
-def fit_slow(residual: Residual) -> Slow:
-    """Fit white noise alone, a walk that both directions share, and a walk in one direction."""
+def fit_random_walk(residual: Residual) -> RandomWalkFit:
+    """Fit white noise alone, with a random walk that both directions share, and with one in one direction.
+
+    Parameters
+    ----------
+    residual : Residual
+
+    Returns
+    -------
+    RandomWalkFit
+        Restricted log-likelihoods at the best walk of a grid (:func:`fusion.attribution.likelihood_ratio.whitening_grid`).
+    """
     parts = residual.parts
     mean = fit_null(parts.grid, parts.mean).log_likelihood
     if parts.difference is None or parts.sides is None:
-        return Slow(float(mean[0]), float(mean.max()), -np.inf, 0)
+        return RandomWalkFit(float(mean[0]), float(mean.max()), -np.inf)
     difference = fit_null(parts.grid, parts.difference).log_likelihood
     sides = [fit_null(parts.grid, row).log_likelihood for row in parts.sides]
     alone = [float(sides[side].max() + sides[1 - side][0]) for side in (0, 1)]
-    return Slow(float(mean[0] + difference[0]), float(mean.max() + difference[0]), max(alone), int(np.argmax(alone)))
-
-
-def fit_lasting(residual: Residual, columns: Array, rng: np.random.Generator) -> Lasting:
-    """Fit the best of several columns (cycle, members), each with its own nuisance, to both directions."""
-    parts = residual.parts
-    bank = fit_null(parts.grid, parts.mean)
-    regressors = np.ascontiguousarray(columns[parts.rows], np.float32)
-    orders = np.empty((_LEVELS, parts.mean.size), np.int64)
-    stack = np.vstack([parts.mean, resample(bank, orders, rng, gaussian=True)])
-    ratios = likelihood_ratios(bank, whiten_series(bank, stack), regressors)
-    best = ratios.max(axis=1)
-    place = int(ratios[0].argmax())
-    found = estimate_effects(bank, regressors[:, [place]])
-    shared = 0.0 if parts.difference is None else float(fit_null(parts.grid, parts.difference).log_likelihood[0])
-    by_direction, held_out = _cross_directions(parts, columns, place)
-    return Lasting(
-        float(bank.log_likelihood.max() + 0.5 * best[0] + shared),
-        float((np.sum(best[1:] >= best[0]) + 1) / (_LEVELS + 1)),
-        place,
-        float(found.coefficient[0]) / parts.unit,
-        float(found.coefficient_u[0]) / parts.unit,
-        by_direction,
-        held_out,
+    return RandomWalkFit(
+        white=float(mean[0] + difference[0]),
+        shared=float(mean.max() + difference[0]),
+        one_direction=max(alone),
     )
 
 
-def _cross_directions(parts: Parts, columns: Array, place: int) -> tuple[tuple[float, float], float]:
-    """Coefficient of one member in each direction, and what each direction's own best member gains in the other (nats)."""
+def fit_profile(residual: Residual, columns: Array, rng: np.random.Generator) -> ProfileFit:
+    """Fit the best of several candidate regressors to both directions, the random walk estimated anew under each.
+
+    Parameters
+    ----------
+    residual : Residual
+    columns : (cycles, candidates) ndarray, K or 1
+        Candidate regressors at every cycle of the residual.
+    rng : numpy.random.Generator
+        For the bootstrap of 499 draws.
+
+    Returns
+    -------
+    ProfileFit
+
+    Notes
+    -----
+    Profile likelihood ratio: :mod:`fusion.attribution.likelihood_ratio`. The p-value is that of the largest ratio over all candidates
+    (Davison and Hinkley, Bootstrap Methods and their Application, 1997, chapter 4).
+    """
+    parts = residual.parts
+    bank = fit_null(parts.grid, parts.mean)
+    regressors = np.ascontiguousarray(columns[parts.rows], np.float32)
+    # Gaussian draws need no orders of the residuals, but their number.
+    orders = np.empty((_DRAWS, parts.mean.size), np.int64)
+    series = np.vstack([parts.mean, resample(bank, orders, rng, gaussian=True)])
+    ratios = likelihood_ratios(bank, whiten_series(bank, series), regressors)
+    largest = ratios.max(axis=1)
+    best = int(ratios[0].argmax())
+    estimate = estimate_effects(bank, regressors[:, [best]])
+    difference = 0.0 if parts.difference is None else float(fit_null(parts.grid, parts.difference).log_likelihood[0])
+    by_direction, hold_out_gain = _across_directions(parts, regressors, best)
+    return ProfileFit(
+        log_likelihood=float(bank.log_likelihood.max() + 0.5 * largest[0] + difference),
+        p_value=float((np.sum(largest[1:] >= largest[0]) + 1) / (_DRAWS + 1)),
+        best=best,
+        coefficient=float(estimate.coefficient[0]) / parts.unit,
+        coefficient_u=float(estimate.coefficient_u[0]) / parts.unit,
+        by_direction=by_direction,
+        hold_out_gain=hold_out_gain,
+    )
+
+
+def _across_directions(
+    parts: DirectionParts, regressors: NDArray[np.float32], best: int
+) -> tuple[tuple[float, float], float]:
+    """Return the coefficient of one candidate in each direction, and what each direction's own best gains in the other, nats."""
     if parts.sides is None:
         return (np.nan, np.nan), np.nan
-    regressors = np.ascontiguousarray(columns[parts.rows], np.float32)
     banks = [fit_null(parts.grid, row) for row in parts.sides]
-    own = [float(estimate_effects(bank, regressors[:, [place]]).coefficient[0]) for bank in banks]
-    gained = 0.0
+    positive, negative = (float(estimate_effects(bank, regressors[:, [best]]).coefficient[0]) for bank in banks)
+    gain = 0.0
     for train, test in (banks, banks[::-1]):
         ratios = likelihood_ratios(train, whiten_series(train, train.values[None, :]), regressors)
         chosen = regressors[:, [int(ratios[0].argmax())]]
@@ -312,21 +424,52 @@ def _cross_directions(parts: Parts, columns: Array, place: int) -> tuple[tuple[f
         project = test.fitted.project
         before = project @ test.values
         after = project @ (test.values - prediction)
-        gained += 0.5 * test.freedom * float(np.log((before @ before) / (after @ after)))
-    return (own[0], own[1]), gained
+        gain += 0.5 * test.freedom * float(np.log((before @ before) / (after @ after)))
+    return (positive, negative), gain
 
 
-def serial_p(residual: Residual, rng: np.random.Generator) -> float:
-    """Permutation p that successive values are nearer to each other than chance (von Neumann 1941, Ann. Math. Stat. 12, 367)."""
+def serial_p_value(residual: Residual, rng: np.random.Generator) -> float:
+    """Test by permutation whether successive values lie nearer to each other than in random order.
+
+    Parameters
+    ----------
+    residual : Residual
+        Its mean over the directions is tested.
+    rng : numpy.random.Generator
+        For the 499 permutations.
+
+    Returns
+    -------
+    float
+        One-sided p-value.
+
+    Notes
+    -----
+    Sum of squared successive differences, the numerator of the ratio of von Neumann (1941, Ann. Math. Stat. 12, 367); its denominator is
+    the same for all permutations.
+    """
     series = residual.parts.mean
-    shuffled = rng.permuted(np.tile(series, (_LEVELS, 1)), axis=1)
+    shuffled = rng.permuted(np.tile(series, (_DRAWS, 1)), axis=1)
     measured = (np.diff(series) ** 2).sum()
     null = (np.diff(shuffled, axis=1) ** 2).sum(axis=1)
-    return float((np.sum(null <= measured) + 1) / (_LEVELS + 1))
+    return float((np.sum(null <= measured) + 1) / (_DRAWS + 1))
 
 
-def warm_up_like(seconds: Array, temperature: Array) -> float:
-    """Share of a temperature's variation that exponentials of one warm-up explain."""
+def warm_up_share(seconds: Array, temperature: Array) -> float:
+    """Return the share of a temperature's variance that one warm-up explains: a trend and exponentials from the first value on.
+
+    Parameters
+    ----------
+    seconds : (n,) ndarray, s
+        Increasing times.
+    temperature : (n,) ndarray, K
+        Local temperature at these times.
+
+    Returns
+    -------
+    float
+        Coefficient of determination, 0..1; time constants as in :data:`fusion.attribution.warm_up.WARM_UP_CONSTANTS_S`.
+    """
     trend = (seconds - seconds.mean()) / np.ptp(seconds)
     design = np.column_stack([np.ones_like(seconds), trend, warm_up_columns(seconds)])
     centred = temperature - temperature.mean()

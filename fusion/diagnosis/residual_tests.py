@@ -1,9 +1,9 @@
-"""What a residual shows, shape by shape: along time, at one instant, in frequency, along the axis, by direction.
+"""Tests of a model's residual for structure along time, at one instant, in frequency, along the axis and by direction.
 
-Shapes among the sites are tested on the estimated noise of every reading (:mod:`fusion.diagnosis.remainder`), those along time
-on the innovations: each reading against its prediction from all before it, in standard deviations. Where profile, effects and drift are
-all there is, innovations are exchangeable, so that permuting them gives every statistic its null, on the readings' own uneven times. Flat
-and linear shapes are what the drift is free to follow; of them the size is told, not a p-value.
+Patterns over targets and directions are tested on the estimated noise of every reading (:mod:`fusion.diagnosis.remainder`), patterns along
+time on the standardised innovations (one-step prediction errors). Under the null hypothesis that profile, effects and drift are complete,
+innovations are exchangeable, so that permutations give the null distribution of every statistic at the readings' own uneven times. Patterns
+that are flat or linear along the axis are absorbed by the drift; their size is reported instead of a p-value.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion._typing import Array
 from fusion.diagnosis import remainder
@@ -18,31 +19,40 @@ from fusion.effects.events import off_the_cycle
 from fusion.model.fit import ModelFit, unexplained_drift
 
 _PERMUTATIONS = 400
-#: Autocorrelations that count as memory; one turn of a cycle has some thirty readings.
+#: Number of autocorrelations tested, in readings; a cycle has some thirty readings.
 _LAGS = 12
-#: Shortest period, how many are looked at, half the resolution of the record apart, and how many turns the longest makes.
+#: Shortest period tested, min; maximum number of periods, spaced by half the resolution of the record; oscillations of the longest period.
 _SHORTEST_MIN = 3.0
 _MOST_PERIODS = 300
-_FEWEST_TURNS = 2.0
-#: Single readings beyond this many standard deviations count as this many.
+_FEWEST_OSCILLATIONS = 2.0
+#: Innovations are clipped at this number of standard deviations.
 _CLIP = 4.0
+#: Quantile of the largest power under the null hypothesis that is given as its limit.
 _LIMIT = 0.95
+#: Permutations that are evaluated at once.
 _BATCH = 50
 
 
 @dataclass(frozen=True)
 class ResidualTests:
-    """What the residual of one model shows.
+    """Structure in the residual of one model.
 
     Attributes
     ----------
-    p_values : chance of so much of every shape where the model is complete, each shape by itself
-    common_um, stretch_um : rms of the drift without a name, of all positions alike and of the stretch at the far end
-    event_s : instant of the strongest shift, s
-    innovations : (n,) every reading against its prediction from those before it, in standard deviations
-    periods_min, power : (m,) periods and their power, 1 where nothing but noise is
-    power_limit : the power that the strongest of all periods exceeds by chance once in 20 campaigns
-    period_is_cycle : whether the strongest rhythm is that of the cycles, where any slow change of profile or reversal has lines
+    p_values : dict
+        P-value of each test ("memory", "event", "rhythm", and those of :mod:`fusion.diagnosis.remainder`), not corrected for their number.
+    common_um, stretch_um : float, um
+        Rms of the unexplained drift: common to all positions, and proportional to position, at the far end.
+    event_s : float, s
+        Time of the largest shift.
+    innovations : (n,) ndarray
+        Prediction error of each reading from those before it, in standard deviations.
+    periods_min, power : (m,) ndarray, min and 1
+        Periods, longest first, and power of the innovations; noise has mean power 1.
+    power_limit : float
+        The power that the largest one exceeds under the null hypothesis in 5 % of campaigns.
+    period_is_cycle : bool
+        Whether the largest power lies at a harmonic of the cycle period, where any slow change of profile or reversal shows.
     """
 
     p_values: dict[str, float]
@@ -57,11 +67,11 @@ class ResidualTests:
 
     @property
     def period_min(self) -> float:
-        """Period of the strongest rhythm, min."""
+        """Period of the largest power, min."""
         return float(self.periods_min[np.argmax(self.power)])
 
     def as_json(self) -> dict[str, object]:
-        """What results.json says of one model's residual."""
+        """Return the entry of results.json."""
         return {
             "p_values": self.p_values,
             "drift_common_um": self.common_um,
@@ -73,12 +83,23 @@ class ResidualTests:
 
 
 def examine_residual(model: ModelFit, rng: np.random.Generator) -> ResidualTests:
-    """Test the residual of a model, shape by shape.
+    """Test the residual of a model for structure.
 
     Parameters
     ----------
-    model : fitted to the readings that are to be examined
-    rng : for the permutations
+    model : ModelFit
+        Fitted to the readings whose residual is tested.
+    rng : numpy.random.Generator
+        For the permutations, 400 for each group of tests.
+
+    Returns
+    -------
+    ResidualTests
+
+    Notes
+    -----
+    Innovations of a complete model are white: Harvey, Forecasting, Structural Time Series Models and the Kalman Filter (1989), chapter
+    5. Autocorrelation: Box and Pierce (1970), J. Am. Stat. Assoc. 65, 1509. Power: Lomb (1976), Astrophys. Space Sci. 39, 447.
     """
     readings, fit = model.readings.subset(model.used), model.fit
     whitened, _ = fit.system.whiten(fit.residual()[:, None])
@@ -88,13 +109,13 @@ def examine_residual(model: ModelFit, rng: np.random.Generator) -> ResidualTests
     periods = _periods_min(readings.seconds)
     phases = 2 * np.pi * readings.seconds[:, None] / (60.0 * periods)
     waves = np.hstack([np.cos(phases), np.sin(phases)]).astype(np.float32)
-    memory, shift, power = _along_time(clipped[None, :], window, waves)
-    null = [_along_time(_shuffled(clipped, rng), window, waves) for _ in range(_PERMUTATIONS // _BATCH)]
+    memory, shift, power = _time_statistics(clipped[None, :], window, waves)
+    null = [_time_statistics(_permutations_of(clipped, rng), window, waves) for _ in range(_PERMUTATIONS // _BATCH)]
     strongest = np.concatenate([powers.max(axis=1) for _, _, powers in null])
     p_values = {
-        "memory": _chance(memory[0], np.concatenate([memories for memories, _, _ in null])),
-        "event": _chance(shift[0].max(), np.concatenate([shifts.max(axis=1) for _, shifts, _ in null])),
-        "rhythm": _chance(power[0].max(), strongest),
+        "memory": _p_value(memory[0], np.concatenate([memories for memories, _, _ in null])),
+        "event": _p_value(shift[0].max(), np.concatenate([shifts.max(axis=1) for _, shifts, _ in null])),
+        "rhythm": _p_value(power[0].max(), strongest),
         **remainder.examine(readings, fit, rng).p_values,
     }
     drift, _ = unexplained_drift(fit)
@@ -113,34 +134,35 @@ def examine_residual(model: ModelFit, rng: np.random.Generator) -> ResidualTests
 
 
 def _periods_min(seconds: Array) -> Array:
-    """Periods that are looked at, longest first."""
+    """Return the periods that are tested, min, longest first."""
     span = float(seconds[-1] - seconds[0]) / 60.0
     return np.asarray(
-        1.0 / np.arange(_FEWEST_TURNS / span, 1.0 / _SHORTEST_MIN, 0.5 / span, dtype=np.float64)[:_MOST_PERIODS]
+        1.0 / np.arange(_FEWEST_OSCILLATIONS / span, 1.0 / _SHORTEST_MIN, 0.5 / span, dtype=np.float64)[:_MOST_PERIODS]
     )
 
 
-def _shuffled(values: Array, rng: np.random.Generator) -> Array:
-    """Permutations of values (n,), (batch, n)."""
+def _permutations_of(values: Array, rng: np.random.Generator) -> Array:
+    """Return a batch of permutations (batch, n) of values (n,)."""
     return rng.permuted(np.tile(values, (_BATCH, 1)), axis=1)
 
 
-def _along_time(series: Array, window: int, waves: np.ndarray) -> tuple[Array, Array, Array]:
-    """Of every series (r, n): its memory (r,), the size of the shift that begins at every reading (r, n'), the power of every wave (r, m).
+def _time_statistics(series: Array, window: int, waves: NDArray[np.float32]) -> tuple[Array, Array, Array]:
+    """Return statistics of series (r, n): memory (r,), size of a shift from each reading on (r, n - window + 1), and power (r, m).
 
-    Memory is the sum of squared autocorrelations (Box and Pierce 1970, J. Am. Stat. Assoc. 65, 1509); a shift shows in innovations as one
-    cycle of readings on the same side; power is that of Lomb (1976, Astrophys. Space Sci. 39, 447) where sine and cosine are orthogonal.
+    Memory is the sum of squared autocorrelations (Box and Pierce 1970). A shift appears in the innovations as one cycle of readings,
+    `window`, of the same sign. Power is that of Lomb (1976) for orthogonal sine and cosine, the columns of `waves` (n, 2 m).
     """
     centred = series - series.mean(axis=1, keepdims=True)
     variance = np.maximum((centred**2).mean(axis=1), 1e-300)
     lagged = [(centred[:, k:] * centred[:, :-k]).mean(axis=1) / variance for k in range(1, _LAGS + 1)]
     total = np.cumsum(np.pad(centred, ((0, 0), (1, 0))), axis=1)
     shift = np.abs(total[:, window:] - total[:, :-window]) / np.sqrt(window)
-    along = np.asarray(centred.astype(np.float32) @ waves, np.float64) ** 2
+    projected = np.asarray(centred.astype(np.float32) @ waves, np.float64) ** 2
     half = waves.shape[1] // 2
-    power = (along[:, :half] + along[:, half:]) / (series.shape[1] * variance[:, None])
+    power = (projected[:, :half] + projected[:, half:]) / (series.shape[1] * variance[:, None])
     return np.asarray(np.sum(np.square(lagged), axis=0)), shift, power
 
 
-def _chance(observed: float, null: Array) -> float:
+def _p_value(observed: float, null: Array) -> float:
+    """Return the permutation p-value, never 0 (Phipson and Smyth 2010, Stat. Appl. Genet. Mol. Biol. 9, 39)."""
     return float((1 + (null >= observed).sum()) / (1 + null.size))

@@ -1,16 +1,17 @@
-"""A machine with known truth: simulates a campaign and writes the files that real instruments would write.
+"""The digital twin: simulates a campaign of known truth and writes the files that real instruments would write.
 
 `simulate` gives every reading and its parts without rendering a frame; `write_campaign` renders the frames and writes the folder;
-`simulate_campaign` does both from a RECIPE.toml.
+`simulate_campaign` does both from a RECIPE.toml. `deviations_of` and `fields_of` give the truth as Datasets, without files, for studies
+by simulation. The twin shares no code with the analysis but the writers of the file formats.
 """
 
 from fusion.twin.camera import make_view
-from fusion.twin.datasets import deviations_of, fields_of
 from fusion.twin.instruments import simulate_campaign, truth_folder, write_campaign
 from fusion.twin.machine.recipe import Recipe, RecipeError
 from fusion.twin.recipe_file import packaged_recipe, read_recipe
 from fusion.twin.record import RecordTruth, simulate_record
 from fusion.twin.simulate import Truth, driver_log, environment_log, simulate
+from fusion.twin.truth import deviations_of, fields_of
 
 __all__ = [
     "Recipe",

@@ -1,28 +1,28 @@
-"""The twin's camera: pinhole and lens, low-emissivity discs, its own forward radiometry, noise, counts.
+"""The simulated camera: pinhole and lens, discs of low emissivity, forward radiometry, noise and counts.
 
-The forward formula is the vendor's measurement equation (FLIR user's manuals, "measurement formula"), written here by itself.
+The forward formula is the measurement equation of the vendor (FLIR user's manuals, "measurement formula"), implemented independently
+of the analysis.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from fusion._typing import Array
 from fusion.twin.machine.effects import EFFECTS
-from fusion.twin.machine.recipe import Camera, Plan
+from fusion.twin.machine.recipe import Camera, Plan, Recipe
 from fusion.twin.machine.streams import stream
 from fusion.twin.simulate import Truth
 
-Floats = NDArray[np.floating[Any]]
-Image = NDArray[np.floating[Any]]
+Image = NDArray[np.float32]
 KELVIN = 273.15
-#: Calibration of the camera model, as its sample files store it.
+#: Planck and atmospheric constants of the camera model, as its sample files store them.
 SC660 = {
     "planck_r1": 21106.77,
     "planck_b": 1501.0,
@@ -35,15 +35,29 @@ SC660 = {
     "atmosphere_beta2": -0.006670,
     "atmosphere_x": 1.9,
 }
+#: A pixel at an edge is the mean over the square of this number of points.
 SUBSAMPLES = 8
-#: A bad pixel shows one value between these for ever.
+#: Range of the counts that bad pixels show.
 BAD_COUNTS = (12000, 30000)
+#: Step of the grid on which the temperature field is evaluated before it is interpolated to the pixels.
 FIELD_STEP_MM = 1.0
+#: Emissivity of the room's surfaces beside the table.
 SURROUND_EMISSIVITY = 0.95
 
 
-def counts_of(temperature_degC: Floats | Image | float) -> Floats:
-    """Return the counts of a black body, R1 / (R2 (exp(B / T) - F)) - O."""
+def counts_of(temperature_degC: Array | Image | float) -> Array:
+    """Return the detector counts of a black body, R1 / (R2 (exp(B / T) - F)) - O.
+
+    Parameters
+    ----------
+    temperature_degC : ndarray or float, degC
+        Temperature of the black body.
+
+    Returns
+    -------
+    ndarray of the same shape
+        Counts (not rounded), with the constants of `SC660`.
+    """
     kelvin = np.asarray(temperature_degC) + KELVIN
     return np.asarray(
         SC660["planck_r1"] / (SC660["planck_r2"] * (np.exp(SC660["planck_b"] / kelvin) - SC660["planck_f"]))
@@ -52,7 +66,22 @@ def counts_of(temperature_degC: Floats | Image | float) -> Floats:
 
 
 def air_transmission(distance_m: float, temperature_degC: float, humidity: float) -> float:
-    """Return the transmission of the air over the whole path; humidity 0..1."""
+    """Return the transmission of the air in the optical path by the vendor's atmospheric model.
+
+    Parameters
+    ----------
+    distance_m : float, m
+        Length of the path.
+    temperature_degC : float, degC
+        Temperature of the air.
+    humidity : float
+        Relative humidity, 0..1.
+
+    Returns
+    -------
+    float
+        Transmission, 0..1.
+    """
     t = temperature_degC
     water = np.sqrt(humidity * np.exp(1.5587 + 0.06939 * t - 0.00027816 * t**2 + 0.00000068455 * t**3))
     k, root = SC660, np.sqrt(distance_m)
@@ -63,14 +92,26 @@ def air_transmission(distance_m: float, temperature_degC: float, humidity: float
 
 @dataclass(frozen=True)
 class View:
-    """How the camera sees the table's plane: pinhole `homography` (plan mm to ideal px), radial `k1` about `centre_px`."""
+    """Projection of the table's plane to the sensor.
 
-    homography: Floats
+    Attributes
+    ----------
+    homography : (3, 3) ndarray
+        Pinhole projection from plan coordinates, mm, to ideal pixels (column, row).
+    focal_px : float, px
+        Focal length.
+    k1 : float
+        Coefficient of the radial distortion about the centre: r is imaged at r (1 + k1 r^2), r in units of the focal length.
+    centre_px : tuple of two floats, px
+        Principal point (column, row).
+    """
+
+    homography: Array
     focal_px: float
     k1: float
     centre_px: tuple[float, float]
 
-    def to_sensor(self, points_mm: Floats) -> Floats:
+    def to_sensor(self, points_mm: Array) -> Array:
         """Return the pixels (n, 2) = (column, row) of points (n, 2) on the plane, mm."""
         points = np.asarray(points_mm, dtype=float)
         ideal = np.column_stack([points, np.ones(len(points))]) @ self.homography.T
@@ -78,29 +119,43 @@ class View:
         factor = 1.0 + self.k1 * np.sum(normal**2, axis=1, keepdims=True)
         return np.asarray(normal * factor * self.focal_px + self.centre_px)
 
-    def to_plan(self, points_px: Floats) -> Floats:
-        """Return the points (n, 2) on the plane, mm, that pixels (n, 2) look at; the lens is undone by Newton's method."""
-        seen = (np.asarray(points_px, dtype=float) - self.centre_px) / self.focal_px
-        radius = np.hypot(seen[:, 0], seen[:, 1])
+    def to_plan(self, points_px: Array) -> Array:
+        """Return the points (n, 2) on the plane, mm, imaged at pixels (n, 2); the distortion is inverted by Newton's method."""
+        normal = (np.asarray(points_px, dtype=float) - self.centre_px) / self.focal_px
+        radius = np.hypot(normal[:, 0], normal[:, 1])
         ideal = radius.copy()
         for _ in range(6):
             ideal -= (ideal * (1.0 + self.k1 * ideal**2) - radius) / (1.0 + 3.0 * self.k1 * ideal**2)
         scale = np.divide(ideal, radius, out=np.ones_like(radius), where=radius > 0)
         points = (
-            np.column_stack([seen * scale[:, None] * self.focal_px + self.centre_px, np.ones(len(seen))])
+            np.column_stack([normal * scale[:, None] * self.focal_px + self.centre_px, np.ones(len(normal))])
             @ np.linalg.inv(self.homography).T
         )
         return np.asarray(points[:, :2] / points[:, 2:])
 
     def shifted(self, columns: float, rows: float) -> View:
-        """Return the view of a camera that was knocked: everything lands some pixels away."""
+        """Return the view of a displaced camera: everything is imaged some pixels away."""
         move = np.array([[1.0, 0.0, columns], [0.0, 1.0, rows], [0.0, 0.0, 1.0]])
         centre = (self.centre_px[0] + columns, self.centre_px[1] + rows)
         return View(move @ self.homography, self.focal_px, self.k1, centre)
 
 
 def make_view(camera: Camera) -> View:
-    """Return the view of a camera at `distance_mm` from `centre_mm`, tilted, panned and rolled."""
+    """Return the view of a camera from its pose and lens.
+
+    Parameters
+    ----------
+    camera : Camera
+        Distance to `centre_mm`, tilt, pan and roll, focal length and distortion.
+
+    Returns
+    -------
+    View
+
+    Notes
+    -----
+    Homography of a plane: Hartley and Zisserman, Multiple View Geometry, 2nd ed. (2003), section 8.1.
+    """
     tilt, pan, roll = np.deg2rad([camera.tilt_deg, camera.pan_deg, camera.roll_deg])
     about_x = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
     about_y = np.array([[np.cos(pan), 0, np.sin(pan)], [0, 1, 0], [-np.sin(pan), 0, np.cos(pan)]])
@@ -113,14 +168,53 @@ def make_view(camera: Camera) -> View:
     return View(homography / homography[2, 2], camera.focal_px, camera.k1, centre)
 
 
-def fiducial_points(plan: Plan) -> Floats:
-    """Return the disc centres (n, 2) on the plan, mm."""
+def fiducial_points(plan: Plan) -> Array:
+    """Return the centres of the disc fiducials.
+
+    Parameters
+    ----------
+    plan : Plan
+
+    Returns
+    -------
+    (n, 2) ndarray, mm
+        Plan coordinates x, y.
+    """
     return np.column_stack([plan.fiducials_x_mm, plan.fiducials_y_mm]).astype(float)
+
+
+def reflected_spot(recipe: Recipe, x_mm: Array, y_mm: Array) -> Array:
+    """Return the spot in which the paint of the table reflects a warm body, as a weight of 1 at its centre.
+
+    Parameters
+    ----------
+    recipe : Recipe
+        Centre and size of the spot come from its effect `reflected_source`, or from that effect's defaults.
+    x_mm, y_mm : ndarray, mm
+        Plan coordinates, broadcast against each other. The spot is fixed in the room: for a moving table these are the plan
+        coordinates at axis position 0.
+
+    Returns
+    -------
+    ndarray
+        Weight of the body's radiance, 0..1.
+    """
+    given = [effect.parameters for effect in recipe.effect if effect.name == "reflected_source"]
+    spot = EFFECTS["reflected_source"].parameters | (given[0] if given else {})
+    return np.exp(-0.5 * ((x_mm - spot["x_mm"]) ** 2 + (y_mm - spot["y_mm"]) ** 2) / spot["spread_mm"] ** 2)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What every pixel looks at for one place of the table: coverage by table and discs (0..1), and where on the fine field."""
+    """What every pixel sees at one position of the table.
+
+    Attributes
+    ----------
+    table, disc : (row, column) ndarray
+        Share of the pixel that table and discs cover, 0..1; the surroundings fill the rest.
+    column_of_field, row_of_field : (row, column) ndarray
+        Place of the pixel on the temperature field of step `FIELD_STEP_MM`.
+    """
 
     table: Image
     disc: Image
@@ -129,12 +223,12 @@ class Scene:
 
 
 class Renderer:
-    """Renders frames of one campaign; scenes and the reflected spot are kept for as long as the table stands still.
+    """Renders the frames of one campaign; the scene is kept for as long as the table stands still.
 
     Parameters
     ----------
     truth : Truth
-        The campaign.
+        The campaign, from :func:`fusion.twin.simulate.simulate`.
     """
 
     def __init__(self, truth: Truth) -> None:
@@ -143,100 +237,95 @@ class Renderer:
         self.plan = truth.recipe.plan
         self.view = make_view(self.camera)
         self.knocked_view = self.view.shifted(*self.camera.knock_px)
-        self.x_mm = np.arange(0.0, self.plan.width_mm + FIELD_STEP_MM, FIELD_STEP_MM)
-        self.y_mm = np.arange(0.0, self.plan.height_mm + FIELD_STEP_MM, FIELD_STEP_MM)
+        self.x_mm = np.arange(0.0, self.plan.width_mm + FIELD_STEP_MM, FIELD_STEP_MM, dtype=float)
+        self.y_mm = np.arange(0.0, self.plan.height_mm + FIELD_STEP_MM, FIELD_STEP_MM, dtype=float)
         self.noise = stream(truth.recipe.campaign.seed, "detector")
         shape = (self.camera.rows, self.camera.columns)
-        self.slope = float(counts_of(25.5) - counts_of(24.5))
+        self.counts_per_K = float(counts_of(25.5) - counts_of(24.5))
         pattern = stream(truth.recipe.campaign.seed, "fixed pattern").standard_normal(shape)
-        self.pattern = (self.camera.fixed_pattern_K * self.slope * pattern).astype(np.float32)
+        self.pattern = (self.camera.fixed_pattern_K * self.counts_per_K * pattern).astype(np.float32)
         bad = stream(truth.recipe.campaign.seed, "bad pixels")
         self.bad_places = bad.choice(pattern.size, self.camera.bad_pixels, replace=False)
         self.bad_values = bad.integers(*BAD_COUNTS, self.camera.bad_pixels, dtype=np.uint16)
         self.transmission = air_transmission(
             self.camera.distance_mm * 1e-3, self.camera.atmospheric_temperature_degC, self.camera.relative_humidity
         )
-        self._looks_at: dict[bool, Floats] = {}
-        self._steps: dict[bool, Sequence[Floats]] = {}
+        self._points_seen: dict[bool, Array] = {}
+        self._steps: dict[bool, Sequence[Array]] = {}
         self._scene: tuple[tuple[float, bool], Scene] | None = None
 
     def scene(self, position_mm: float, knocked: bool) -> Scene:
-        """Return what the pixels look at with the table at an axis position; coverage by `SUBSAMPLES` squared points per pixel."""
+        """Return what the pixels see with the table at an axis position, mm, before or after the displacement of the camera."""
         key = (float(position_mm), bool(knocked))
         if self._scene is None or self._scene[0] != key:
             self._scene = (key, self._make_scene(*key))
         return self._scene[1]
 
     def render(self, number: int) -> NDArray[np.uint16]:
-        """Return the counts (row, column) of frame `number` (from 0)."""
+        """Return the counts (row, column) of frame `number` (from 0); the temporal noise differs from call to call."""
         frame = self.truth.frames.isel(frame=number)
         scene = self.scene(float(frame["table_position"]), bool(frame["knocked"]))
         field = self.truth.temperature(np.array([float(frame["time_s"])]), self.x_mm, self.y_mm)[0].astype(np.float32)
-        where = (scene.column_of_field, scene.row_of_field)
-        surface = np.asarray(cv2.remap(field, *where, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+        place = (scene.column_of_field, scene.row_of_field)
+        surface = np.asarray(cv2.remap(field, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
         counts = self._radiance(surface, scene, frame)
         if self.camera.blur_px > 0:
             counts = np.asarray(cv2.GaussianBlur(counts, (0, 0), self.camera.blur_px), np.float32)
-        noise = self.noise.standard_normal(counts.shape, dtype=np.float32) * np.float32(self.camera.netd_K * self.slope)
-        counts += noise + self.pattern + np.float32(float(frame["camera_offset_K"]) * self.slope)
+        noise = self.noise.standard_normal(counts.shape, dtype=np.float32)
+        offset = np.float32(float(frame["camera_offset_K"]) * self.counts_per_K)
+        counts += noise * np.float32(self.camera.netd_K * self.counts_per_K) + self.pattern + offset
         digital = np.asarray(np.clip(np.rint(counts), 0, 65535), dtype=np.uint16)
         digital.ravel()[self.bad_places] = self.bad_values
         return digital
 
     def _radiance(self, surface: Image, scene: Scene, frame: xr.Dataset) -> Image:
-        """Return noiseless counts: table, discs and surround each send what they emit and mirror, through the air."""
+        """Return noiseless counts: what table, discs and surroundings emit and reflect, attenuated by the air, plus its emission."""
         camera = self.camera
-        mirrored = np.float32(counts_of(camera.reflected_temperature_degC))
-        own = counts_of(surface).astype(np.float32)
-        table = camera.emissivity * own + (1.0 - camera.emissivity) * mirrored
+        reflected = np.float32(counts_of(camera.reflected_temperature_degC))
+        emitted = counts_of(surface).astype(np.float32)
+        table = camera.emissivity * emitted + (1.0 - camera.emissivity) * reflected
         if float(frame["reflected_K"]) != 0.0:
             table += (1.0 - camera.emissivity) * self._spot(bool(frame["knocked"]), float(frame["reflected_K"]))
-        disc = camera.disc_emissivity * own + (1.0 - camera.disc_emissivity) * mirrored
+        disc = camera.disc_emissivity * emitted + (1.0 - camera.disc_emissivity) * reflected
         room = float(np.interp(float(frame["time_s"]), self.truth.session.grid_s, self.truth.session.air_degC))
-        surround = SURROUND_EMISSIVITY * counts_of(room) + (1.0 - SURROUND_EMISSIVITY) * mirrored
+        surround = SURROUND_EMISSIVITY * counts_of(room) + (1.0 - SURROUND_EMISSIVITY) * reflected
         leaving = surround + scene.table * (table - surround) + scene.disc * (disc - surround)
-        through = self.transmission * leaving + (1.0 - self.transmission) * counts_of(
+        arriving = self.transmission * leaving + (1.0 - self.transmission) * counts_of(
             camera.atmospheric_temperature_degC
         )
-        return np.asarray(through, dtype=np.float32)
+        return np.asarray(arriving, dtype=np.float32)
 
     def _spot(self, knocked: bool, reflected_K: float) -> Image:
-        """Return the additional counts of a warm body that mirrors in a part of the table; fixed in the room, not on the table."""
-        recipe = self.truth.recipe
-        spot = (
-            EFFECTS["reflected_source"].parameters
-            | next(e for e in recipe.effect if e.name == "reflected_source").parameters
-        )
-        x_mm, y_mm = self._looks_at[knocked][..., 0], self._looks_at[knocked][..., 1]
-        weight = np.exp(-0.5 * ((x_mm - spot["x_mm"]) ** 2 + (y_mm - spot["y_mm"]) ** 2) / spot["spread_mm"] ** 2)
+        """Return the additional counts of a warm body that the table reflects in one part; fixed in the room, not on the table."""
+        points = self._points_seen[knocked]
+        weight = reflected_spot(self.truth.recipe, points[..., 0], points[..., 1])
         background = self.camera.reflected_temperature_degC
         return np.asarray(weight * float(counts_of(background + reflected_K) - counts_of(background)), dtype=np.float32)
 
     def _make_scene(self, position_mm: float, knocked: bool) -> Scene:
-        """Cover every pixel: by its centre where it lies wholly on one thing, by `SUBSAMPLES` squared points at the edges."""
+        """Cover every pixel: by its centre where it sees one thing only, by `SUBSAMPLES` squared points at the edges."""
         camera, plan = self.camera, self.plan
         view = self.knocked_view if knocked else self.view
-        moved = np.array(plan.direction) * position_mm
-        if knocked not in self._looks_at:
+        if knocked not in self._points_seen:
             pixels = np.stack(np.meshgrid(np.arange(camera.columns), np.arange(camera.rows)), axis=-1)
-            self._looks_at[knocked] = view.to_plan(pixels.reshape(-1, 2)).reshape(camera.rows, camera.columns, 2)
-            self._steps[knocked] = np.gradient(self._looks_at[knocked], axis=(1, 0))
-        at = self._looks_at[knocked] + moved
-        to_border, to_disc = self._distances(at.reshape(-1, 2))
+            self._points_seen[knocked] = view.to_plan(pixels.reshape(-1, 2)).reshape(camera.rows, camera.columns, 2)
+            self._steps[knocked] = np.gradient(self._points_seen[knocked], axis=(1, 0))
+        points = self._points_seen[knocked] + np.array(plan.direction) * position_mm
+        to_border, to_disc = self._distances(points.reshape(-1, 2))
         per_column, per_row = (step.reshape(-1, 2) for step in self._steps[knocked])
         reach = 0.8 * float(np.abs(per_column).max())
         table = ((to_border > 0) & (to_disc < 0)).astype(np.float32)
         disc = ((to_border > 0) & (to_disc >= 0)).astype(np.float32)
         edge = np.flatnonzero(np.minimum(np.abs(to_border), np.abs(to_disc)) < reach)
         offsets = (np.arange(SUBSAMPLES) + 0.5) / SUBSAMPLES - 0.5
-        right, down = (o.reshape(1, -1, 1) for o in np.meshgrid(offsets, offsets))
-        fine = at.reshape(-1, 2)[edge, None] + per_column[edge, None] * right + per_row[edge, None] * down
+        right, down = (offset.reshape(1, -1, 1) for offset in np.meshgrid(offsets, offsets))
+        fine = points.reshape(-1, 2)[edge, None] + per_column[edge, None] * right + per_row[edge, None] * down
         fine_border, fine_disc = self._distances(fine.reshape(-1, 2))
         table[edge] = ((fine_border > 0) & (fine_disc < 0)).reshape(edge.size, -1).mean(axis=1)
         disc[edge] = ((fine_border > 0) & (fine_disc >= 0)).reshape(edge.size, -1).mean(axis=1)
         shape = (camera.rows, camera.columns)
         size = np.array([plan.width_mm, plan.height_mm])
-        place = (np.clip(at, 0.0, size) / FIELD_STEP_MM).astype(np.float32)
+        place = (np.clip(points, 0.0, size) / FIELD_STEP_MM).astype(np.float32)
         return Scene(
             table=table.reshape(shape),
             disc=disc.reshape(shape),
@@ -244,12 +333,12 @@ class Renderer:
             row_of_field=np.ascontiguousarray(place[..., 1]),
         )
 
-    def _distances(self, at_mm: Floats) -> tuple[Floats, Floats]:
-        """Return how far inside the table's border and inside the nearest disc's rim points (n, 2) lie, mm, negative outside."""
-        x, y = np.ascontiguousarray(at_mm[:, 0]), np.ascontiguousarray(at_mm[:, 1])
+    def _distances(self, points_mm: Array) -> tuple[Array, Array]:
+        """Return how far points (n, 2) lie inside the table's border and inside the nearest disc's rim, mm, negative outside."""
+        x, y = np.ascontiguousarray(points_mm[:, 0]), np.ascontiguousarray(points_mm[:, 1])
         to_border = np.minimum(np.minimum(x, self.plan.width_mm - x), np.minimum(y, self.plan.height_mm - y))
         diameter = self.plan.fiducial_diameter_mm
-        to_disc = np.full(len(at_mm), -diameter)
+        to_disc = np.full(len(points_mm), -diameter)
         for disc_x, disc_y in fiducial_points(self.plan):
             near = np.flatnonzero(np.abs(x - disc_x) < diameter)
             near = near[np.abs(y[near] - disc_y) < diameter]

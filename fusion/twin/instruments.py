@@ -1,4 +1,4 @@
-"""The twin's instruments: a campaign folder as a laboratory would leave it, and the truth in a folder beside it."""
+"""Writes a simulated campaign as the files that the instruments of a laboratory would write, with the truth in a folder beside it."""
 
 from __future__ import annotations
 
@@ -16,17 +16,19 @@ from fusion.twin.machine.recipe import RecipeError
 from fusion.twin.machine.streams import stream
 from fusion.twin.recipe_file import read_recipe
 from fusion.twin.record import simulate_record, write_record
-from fusion.twin.simulate import Truth, driver_log, environment_log, simulate, spread
+from fusion.twin.simulate import Truth, driver_log, environment_log, moving_rms, simulate
 from interferometry.io.writers import write_deviations_csv, write_environment_csv, write_rtl
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import CalibratedRange, CameraIdentity, CameraParameters, Frame
 
 Progress = Callable[[int, int, str], None]
+#: Cell size of the true temperature fields in truth.nc.
 TRUTH_CELL_MM = 2.5
 IDENTITY = CameraIdentity(
     model="FLIR SC660", part="TWIN", serial="0", software="1.0", lens_model="FOL38", field_of_view_deg=23.9
 )
 RANGE = CalibratedRange(minimum_K=233.15, maximum_K=393.15, raw_minimum=8812, raw_maximum=57240)
+#: Variables of the environment log with their units.
 LOGGED = (
     ("air_temperature", "degC"),
     ("air_pressure", "hPa"),
@@ -36,26 +38,39 @@ LOGGED = (
 
 
 def simulate_campaign(recipe_path: Path, out: Path, *, progress: Progress | None = None) -> Path:
-    """Simulate the campaign of a RECIPE.toml and write it.
+    """Simulate the campaign that a recipe describes and write it as files.
 
     Parameters
     ----------
     recipe_path : Path
-        The recipe.
+        RECIPE.toml, with the tables of :class:`fusion.twin.machine.recipe.Recipe`; what it leaves out keeps its default.
     out : Path
         Folder of the campaign; the truth goes to ``<out>-truth`` beside it. Both must be absent or empty.
-    progress : callable, optional
-        Called as ``progress(done, total, what)``.
+    progress : callable or None
+        Called as ``progress(done, total, what)`` after every frame.
 
     Returns
     -------
     Path
-        The campaign file, ``<out>/campaign.toml``.
+        The campaign file, ``<out>/campaign.toml``. The same recipe writes the same bytes.
 
     Raises
     ------
     RecipeError
-        The recipe is wrong, or a folder is in the way.
+        The recipe cannot be read, is not TOML, or asks for what no machine can be; or one of the two folders is not empty.
+
+    Notes
+    -----
+    Physics of the simulated machine, camera and laser: docs/method/effects.md. It shares no code with the analysis.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> _ = (folder / "recipe.toml").write_text("test.cycles = 2")
+    >>> campaign = simulate_campaign(folder / "recipe.toml", folder / "campaign")
+    >>> sorted(path.name for path in campaign.parent.iterdir())
+    ['campaign.toml', 'drivers.csv', 'environment.csv', 'fiducials.csv', 'laser.csv', 'thermal']
     """
     recipe, out = read_recipe(Path(recipe_path)), Path(out)
     if recipe.record is None:
@@ -67,7 +82,18 @@ def simulate_campaign(recipe_path: Path, out: Path, *, progress: Progress | None
 
 
 def truth_folder(out: Path) -> Path:
-    """Return where the truth of the campaign in `out` is kept: beside it, never inside."""
+    """Return the folder in which the truth of a campaign is kept: beside the campaign, never inside.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the campaign.
+
+    Returns
+    -------
+    Path
+        ``<out>-truth``, absolute.
+    """
     out = Path(out).resolve()
     return out.with_name(f"{out.name}-truth")
 
@@ -78,11 +104,11 @@ def write_campaign(truth: Truth, out: Path, *, progress: Progress | None = None)
     Parameters
     ----------
     truth : Truth
-        From `simulate`.
+        From :func:`fusion.twin.simulate.simulate`.
     out : Path
-        Folder of the campaign; must be absent or empty.
-    progress : callable, optional
-        Called as ``progress(done, total, what)``.
+        Folder of the campaign; it and ``<out>-truth`` must be absent or empty.
+    progress : callable or None
+        Called as ``progress(done, total, what)`` after every frame.
 
     Returns
     -------
@@ -92,7 +118,7 @@ def write_campaign(truth: Truth, out: Path, *, progress: Progress | None = None)
     Raises
     ------
     RecipeError
-        `out` or the truth's folder holds something already.
+        `out` or the folder of the truth is not empty.
     """
     out = Path(out)
     _make_folders(out)
@@ -100,18 +126,18 @@ def write_campaign(truth: Truth, out: Path, *, progress: Progress | None = None)
     write_environment_csv(out / "environment.csv", environment_log(truth))
     _write_drivers(truth, out / "drivers.csv")
     _write_fiducials(truth, out / "fiducials.csv")
-    (out / "campaign.toml").write_text(campaign_text(truth), encoding="utf-8")
+    (out / "campaign.toml").write_text(_campaign_text(truth), encoding="utf-8")
     _write_truth(truth, truth_folder(out))
     _write_frames(truth, out / "thermal", progress)
     return out / "campaign.toml"
 
 
-def campaign_text(truth: Truth) -> str:
-    """Return the campaign file that the person at this machine would write, with what that person knows."""
+def _campaign_text(truth: Truth) -> str:
+    """Return the campaign file that the operator of this machine would write, with what the operator knows."""
     recipe = truth.recipe
     camera, plan = recipe.camera, recipe.plan
     clock = f'clock_offset = "{camera.clock_offset_s:g} s"\n' if camera.state_clock_offset else ""
-    # a .rtl holds no times of readings: they are rebuilt from what the operator set
+    # A .rtl file holds no times of readings; they are reconstructed from feed and dwell.
     motion = f'feed = "{recipe.test.feed_mm_per_min:g} mm/min"\ndwell = "{recipe.test.dwell_s:g} s"\n'
     duty = recipe.duty
     law = (
@@ -156,13 +182,14 @@ declared = ["axis_expansion", "table_offset"]
 
 
 def _make_folders(out: Path) -> None:
+    """Make the folders of the campaign and of its truth."""
     _check_free(out)
     out.mkdir(parents=True, exist_ok=True)
     truth_folder(out).mkdir(parents=True, exist_ok=True)
 
 
 def _check_free(out: Path) -> None:
-    """Refuse to write over anything."""
+    """Raise an error where a folder of the campaign holds something already."""
     for folder in (out, truth_folder(out)):
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise RecipeError(f"{folder} exists and is not an empty folder; name another output folder or empty it")
@@ -190,7 +217,7 @@ def _write_drivers(truth: Truth, path: Path) -> None:
 
 
 def _write_fiducials(truth: Truth, path: Path) -> None:
-    """Write the discs' places on the plan with pixel positions as rough as somebody reads them off a screen."""
+    """Write the discs' places on the plan with rough pixel positions, as read off a screen."""
     plan = truth.recipe.plan
     points = fiducial_points(plan)
     pixels = make_view(truth.recipe.camera).to_sensor(points)
@@ -213,9 +240,9 @@ def _write_fiducials(truth: Truth, path: Path) -> None:
 def _write_truth(truth: Truth, folder: Path) -> None:
     """Write truth.nc (readings and their parts, fields at the frames' times) and truth.json (numbers)."""
     plan, recipe = truth.recipe.plan, truth.recipe
-    x = np.arange(0.5 * TRUTH_CELL_MM, plan.width_mm, TRUTH_CELL_MM)
-    y = np.arange(0.5 * TRUTH_CELL_MM, plan.height_mm, TRUTH_CELL_MM)
-    per_cycle = (np.arange(truth.schedule.cycles) + 0.5) * truth.schedule.period_s
+    x = np.arange(0.5 * TRUTH_CELL_MM, plan.width_mm, TRUTH_CELL_MM, dtype=float)
+    y = np.arange(0.5 * TRUTH_CELL_MM, plan.height_mm, TRUTH_CELL_MM, dtype=float)
+    per_cycle = (np.arange(truth.schedule.cycles, dtype=float) + 0.5) * truth.schedule.period_s
     field_s = truth.session.frame_s if recipe.camera.table == "still" else per_cycle
     fields = xr.Dataset(
         {
@@ -230,7 +257,7 @@ def _write_truth(truth: Truth, folder: Path) -> None:
     readings = truth.readings.drop_encoding()
     xr.merge([readings, fields, truth.frames]).to_netcdf(folder / "truth.nc", engine="h5netcdf")
     view = make_view(recipe.camera)
-    moving = {name: spread(truth.in_order(name), truth.session) for name in truth.parts}
+    moving = {name: moving_rms(truth.in_order(name), truth.session) for name in truth.parts}
     content = {
         "recipe": asdict(recipe),
         "parts_rms_um": moving,

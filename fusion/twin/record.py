@@ -1,8 +1,8 @@
-"""The twin as a record: temperature sensors and displacement channels of a whole machine over hours, as in ISO 230-3.
+"""Simulation of a record: temperature sensors and displacement channels of a whole machine over hours, as in ISO 230-3.
 
-Parts of the machine are lumps of heat joined by conductances; the spindle is one of them and carries no sensor. Every channel
-moves with the parts that do, and with what the recipe switches on without declaring it. A ``cycle`` in an effect's parameters is
-an hour here, and an effect's rms counts all channels together.
+Parts of the machine are lumped heat capacities joined by conductances; the spindle is one of them and has no sensor. Every channel
+moves with the temperatures of the other parts, and with the undeclared effects of the recipe. A ``cycle`` in an effect's parameters is
+an hour here, and an effect's rms is taken over all channels together.
 """
 
 from __future__ import annotations
@@ -10,21 +10,19 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from fusion._typing import Array
 from fusion.twin.machine.effects import EFFECTS
 from fusion.twin.machine.recipe import EffectRecipe, Recipe, RecipeError, Record
 from fusion.twin.machine.session import Session
 from fusion.twin.machine.streams import first_order, random_levels, stream
 from fusion.twin.recipe_file import check_recipe
 
-Floats = NDArray[np.floating[Any]]
-#: Heat capacity (J/K) and exchange with the air (W/K) of every part; the spindle is heated and carries no sensor.
+#: Heat capacity (J/K) and heat transfer to the air (W/K) of every part.
 PARTS = {
     "spindle": (40e3, 3.0),
     "motor": (25e3, 9.0),
@@ -45,16 +43,28 @@ JOINTS = (
     ("bed", "table", 15.0),
     ("table", "screw", 10.0),
 )
+#: Powers at full load.
 SPINDLE_W = 320.0
 MOTOR_W = 90.0
-#: Effects of the library that mean something without positions.
+#: Effects of the library that do not need positions.
 IN_A_RECORD = ("thermal_lag", "unseen_heat_source", "step_event", "periodic_disturbance")
 CHANNELS = ("X", "Y", "Z", "A", "B", "C")
 
 
 @dataclass(frozen=True)
 class RecordTruth:
-    """A simulated record: `table` (time; sensor; channel) as logged and every part of the displacements, um; `parts` their names."""
+    """A simulated record.
+
+    Attributes
+    ----------
+    recipe : Recipe
+        The recipe asked for.
+    table : xarray.Dataset
+        As logged: `temperature` (time, sensor), degC; `displacement` (time, channel), um; `speed` (time,), 1/min. And every part of the
+        displacements (time, channel), um.
+    parts : tuple of str
+        Names of the parts that the displacement is the sum of.
+    """
 
     recipe: Recipe
     table: xr.Dataset
@@ -63,6 +73,15 @@ class RecordTruth:
 
 def simulate_record(recipe: Recipe) -> RecordTruth:
     """Simulate the record that the recipe's ``[record]`` asks for.
+
+    Parameters
+    ----------
+    recipe : Recipe
+        With a `record`; its tables of test, plan, camera and laser are not used.
+
+    Returns
+    -------
+    RecordTruth
 
     Raises
     ------
@@ -77,53 +96,75 @@ def simulate_record(recipe: Recipe) -> RecordTruth:
     if recipe.anomaly:
         raise RecipeError("anomaly: a record has no targets; remove the [[anomaly]] tables or the [record]")
     seed = recipe.campaign.seed
-    time_s = np.arange(0.0, 3600.0 * record.hours, record.step_s)
+    time_s = np.arange(0.0, 3600.0 * record.hours, record.step_s, dtype=float)
     duty = random_levels(time_s, 0.0, 1.0, record.mean_hold_min, stream(seed, "duty"))
     duty[duty < record.rest_share] = 0.0
-    hours = time_s / 3600.0
-    air = record.room_swing_K * np.sin(2 * np.pi * hours / 24.0 + stream(seed, "air").uniform(0.0, 2 * np.pi))
-    air -= air[0]
     axes = random_levels(time_s, 0.0, 1.0, 0.7 * record.mean_hold_min, stream(seed, "load of the axes"))
-    rises = solve_parts(duty, axes, air, record.step_s)
-    seen = rises[:, 1:]
-    names, channels = _sensors(record), CHANNELS[: record.channels]
-    rng = stream(seed, "sensors")
-    own = seen[:, np.arange(record.sensors) % seen.shape[1]] * rng.uniform(0.85, 1.1, record.sensors)
-    for column, minutes in enumerate(rng.uniform(*record.sensor_lag_min, record.sensors)):
-        own[:, column] = first_order(own[:, column], record.step_s, 60.0 * minutes)
-    logged = 20.0 + own + record.noise_K * rng.standard_normal(own.shape)
+    rises = solve_parts(duty, axes, _room_rise(record, time_s, seed), record.step_s)
+    with_sensor = rises[:, 1:]
 
-    per_K = stream(seed, "sensitivities").normal(0.0, record.sensitivity_um_per_K, (seen.shape[1], record.channels))
-    walks = stream(seed, "walks").standard_normal((time_s.size, record.channels)) * np.sqrt(record.step_s / 3600.0)
-    series: dict[str, Floats] = {
-        "quasi_static": seen @ per_K,
+    size = (time_s.size, record.channels)
+    per_K = stream(seed, "sensitivities").normal(
+        0.0, record.sensitivity_um_per_K, (with_sensor.shape[1], record.channels)
+    )
+    walks = stream(seed, "walks").standard_normal(size) * np.sqrt(record.step_s / 3600.0)
+    series: dict[str, Array] = {
+        "quasi_static": with_sensor @ per_K,
         "nuisance": record.walk_um_per_sqrt_h * np.cumsum(walks, axis=0),
-        "noise": record.noise_um * stream(seed, "noise").standard_normal((time_s.size, record.channels)),
+        "noise": record.noise_um * stream(seed, "noise").standard_normal(size),
     }
-    session = _session(recipe, record, time_s, duty, seen.mean(axis=1))
+    session = _session(recipe, record, time_s, duty, with_sensor.mean(axis=1))
     for effect in recipe.effect:
-        still = np.zeros((time_s.size, record.channels))
-        series[effect.name] = series.get(effect.name, still) + _effect(effect, session, record, seed)
+        series[effect.name] = series.get(effect.name, np.zeros(size)) + _effect(effect, session, record, seed)
     dims = ("time", "channel")
     start = np.datetime64(recipe.campaign.start.removesuffix("Z"), "ns")
     table = xr.Dataset(
         {
-            "temperature": (("time", "sensor"), np.round(logged, 3), {"units": "degC"}),
+            "temperature": (
+                ("time", "sensor"),
+                np.round(_logged_temperatures(record, with_sensor, seed), 3),
+                {"units": "degC"},
+            ),
             "displacement": (dims, np.round(np.sum(list(series.values()), axis=0), 3), {"units": "um"}),
             "speed": ("time", np.round(duty * record.top_speed_rpm), {"units": "1/min"}),
-            **{name: (dims, value, {"units": "um"}) for name, value in series.items()},
+            **{name: (dims, part, {"units": "um"}) for name, part in series.items()},
         },
         coords={
             "time": start + np.round(time_s * 1e9).astype("m8[ns]"),
-            "sensor": list(names),
-            "channel": list(channels),
+            "sensor": [f"T{number}" for number in range(1, record.sensors + 1)],
+            "channel": list(CHANNELS[: record.channels]),
         },
     )
     return RecordTruth(recipe, table, tuple(series))
 
 
+def _room_rise(record: Record, time_s: Array, seed: int) -> Array:
+    """Return the daily swing of the room temperature, K since the start."""
+    phase = stream(seed, "air").uniform(0.0, 2 * np.pi)
+    swing = record.room_swing_K * np.sin(2 * np.pi * (time_s / 3600.0) / 24.0 + phase)
+    return swing - swing[0]
+
+
+def _logged_temperatures(record: Record, rises: Array, seed: int) -> Array:
+    """Return what the sensors log (time, sensor), degC: their parts' rises (time, part), each with a gain, a lag and noise."""
+    rng = stream(seed, "sensors")
+    sensed = rises[:, np.arange(record.sensors) % rises.shape[1]] * rng.uniform(0.85, 1.1, record.sensors)
+    for column, minutes in enumerate(rng.uniform(*record.sensor_lag_min, record.sensors)):
+        sensed[:, column] = first_order(sensed[:, column], record.step_s, 60.0 * minutes)
+    return 20.0 + sensed + record.noise_K * rng.standard_normal(sensed.shape)
+
+
 def write_record(truth: RecordTruth, out: Path, beside: Path) -> Path:
-    """Write the record as CSV with its campaign file to `out`, its truth to `beside`; both folders exist.
+    """Write a simulated record as CSV with its campaign file, and its truth apart.
+
+    Parameters
+    ----------
+    truth : RecordTruth
+        From :func:`simulate_record`.
+    out : Path
+        Existing folder of the campaign.
+    beside : Path
+        Existing folder of the truth.
 
     Returns
     -------
@@ -165,21 +206,33 @@ drivers = ["spindle speed*"]
     return out / "campaign.toml"
 
 
-def _sensors(record: Record) -> tuple[str, ...]:
-    return tuple(f"T{number}" for number in range(1, record.sensors + 1))
+def solve_parts(duty: Array, axes: Array, air: Array, step_s: float) -> Array:
+    """Return the temperature rise of every part of the machine.
 
+    Parameters
+    ----------
+    duty, axes : (n,) ndarray
+        Loads of the spindle and of the axes' motor, 0..1.
+    air : (n,) ndarray, K
+        Rise of the room temperature.
+    step_s : float, s
+        Step of the series.
 
-def solve_parts(duty: Floats, axes: Floats, air: Floats, step_s: float) -> Floats:
-    """Return the rise (time, part) of every part of `PARTS`, K.
+    Returns
+    -------
+    (n, parts) ndarray, K
+        Rise of each part of `PARTS`, 0 at the first time; exact for loads and air that are constant over each step.
 
-    Loads of spindle and axes are 0..1, air is the room's rise in K, `step_s` their step; exact where they are constant over a step.
+    Notes
+    -----
+    Lumped capacities, C dT/dt = A T + q, advanced by the matrix exponential (Van Loan 1978, IEEE Trans. Autom. Control 23, 395).
     """
     names = list(PARTS)
     capacity = np.array([PARTS[name][0] for name in names])
     exchange = np.array([PARTS[name][1] for name in names])
     flow = -np.diag(exchange)
-    for one, other, conductance in JOINTS:
-        i, k = names.index(one), names.index(other)
+    for first, second, conductance in JOINTS:
+        i, k = names.index(first), names.index(second)
         flow[[i, k], [i, k]] -= conductance
         flow[[i, k], [k, i]] += conductance
     rate = flow / capacity[:, None]
@@ -195,49 +248,48 @@ def solve_parts(duty: Floats, axes: Floats, air: Floats, step_s: float) -> Float
     return rises
 
 
-def _session(recipe: Recipe, record: Record, time_s: Floats, duty: Floats, mean_rise: Floats) -> Session:
+def _session(recipe: Recipe, record: Record, time_s: Array, duty: Array, mean_rise: Array) -> Session:
     """Return the record as a session of one target, read at every step, whose cycles are hours."""
-    one, none = np.ones(time_s.size), np.zeros(time_s.size)
+    ones, zeros = np.ones(time_s.size), np.zeros(time_s.size)
     return Session(
-        seed=recipe.campaign.seed,
         time_s=time_s,
         cycle=(time_s // 3600.0).astype(int) + 1,
-        sign=one.astype(int),
-        target=one.astype(int),
-        position_mm=one,
-        travel_mm=1.0,
+        sign=ones.astype(int),
+        target=ones.astype(int),
+        position_mm=ones,
         cycles=int(np.ceil(record.hours)),
         period_s=3600.0,
+        seed=recipe.campaign.seed,
+        travel_mm=1.0,
         grid_s=time_s,
         duty=duty,
         table_rise_K=mean_rise,
-        probe_degC=none,
-        air_degC=none,
-        air_hPa=none,
-        air_percent=none,
-        refractivity=none,
-        frame_s=none[:0],
+        probe_degC=zeros,
+        air_degC=zeros,
+        air_hPa=zeros,
+        air_percent=zeros,
+        refractivity=zeros,
+        frame_s=zeros[:0],
     )
 
 
-def _effect(effect: EffectRecipe, session: Session, record: Record, seed: int) -> Floats:
-    """Return an undeclared effect (time, channel): one series, another size in every channel."""
+def _effect(effect: EffectRecipe, session: Session, record: Record, seed: int) -> Array:
+    """Return an undeclared effect (time, channel), um: one series with a random weight in every channel."""
     if effect.name not in IN_A_RECORD:
         raise RecipeError(f"effect {effect.name}: a record has no positions; use one of {', '.join(IN_A_RECORD)}")
-    share = stream(seed, f"share of {effect.name}").normal(0.0, 1.0, record.channels)
-    value = np.multiply.outer(
-        EFFECTS[effect.name].series(session, **effect.parameters), share / np.sqrt(np.mean(share**2))
-    )
+    weight = stream(seed, f"share of {effect.name}").normal(0.0, 1.0, record.channels)
+    weight /= np.sqrt(np.mean(weight**2))
+    series = np.multiply.outer(EFFECTS[effect.name].series(session, **effect.parameters), weight)
     if effect.amplitude_um is None:
-        return np.asarray(value)
-    found = _centred_rms(value)
-    if found == 0.0:
+        return np.asarray(series)
+    rms = _centred_rms(series)
+    if rms == 0.0:
         raise RecipeError(
             f"effect {effect.name}: nothing moves in this record, so it cannot be scaled; change its parameters"
         )
-    return np.asarray(value * effect.amplitude_um / found)
+    return np.asarray(series * effect.amplitude_um / rms)
 
 
-def _centred_rms(value: Floats) -> float:
+def _centred_rms(series: Array) -> float:
     """Return the rms over all channels about each channel's mean."""
-    return float(np.sqrt(np.mean((value - value.mean(axis=0)) ** 2)))
+    return float(np.sqrt(np.mean((series - series.mean(axis=0)) ** 2)))

@@ -1,21 +1,21 @@
-"""The twin at work: from a recipe to every reading of the test and everything that made it what it is.
+"""Simulation of a campaign: from a recipe to every reading of the test and every part that it is the sum of.
 
-Nothing is rendered here; a campaign of 100 cycles takes well under a second, so that studies can run hundreds.
-
-What moves the twin's readings besides temperature: static profile, wandering nuisance, the laser's noise.
+No frame is rendered here; a campaign of 100 cycles takes well under a second, so that studies can run hundreds. The steps, in order:
+heat and air behind the readings, the readings' parts (static profile, declared effects, random drift, noise, undeclared effects,
+anomalies), what the camera adds of its own, and what the environment unit and the machine log.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from fusion._typing import Array
 from fusion.twin.machine.air import Air, simulate_air
-from fusion.twin.machine.effects import ANOMALIES, EFFECTS, told_air
+from fusion.twin.machine.effects import ANOMALIES, EFFECTS, logged_air
 from fusion.twin.machine.heat import Plate, solve_plate
 from fusion.twin.machine.recipe import AnomalyRecipe, Drift, EffectRecipe, Laser, Profile, Recipe, RecipeError, Source
 from fusion.twin.machine.schedule import Schedule, duty_levels, make_schedule
@@ -23,20 +23,39 @@ from fusion.twin.machine.session import Session
 from fusion.twin.machine.streams import first_order, random_levels, stream
 from fusion.twin.recipe_file import check_recipe
 
-Floats = NDArray[np.floating[Any]]
+#: Step of the time grid on which heat and air are solved.
 GRID_STEP_S = 10.0
+#: Warming of the camera's housing after it is switched on at the start of the test, and its time constant.
 CAMERA_WARM_UP_K = 6.0
 CAMERA_WARM_UP_S = 1500.0
-PROBE_AT_MM = (640.0, 30.0)
+#: Plan point of the material temperature sensor.
+PROBE_MM = (640.0, 30.0)
+#: Correlation time of the Ornstein-Uhlenbeck drift.
+OU_HOURS = 1.0
+_SIGNS = {"both": (1, -1), "positive": (1,), "negative": (-1,)}
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What the instruments recorded and why.
+    """A simulated campaign: what the instruments recorded, and why.
 
-    `recipe` is the one that was asked for, with the size of a sensor's fault found.
-    `readings` (cycle, direction, target): `deviation` as measured (NaN where lost), `time`, and one variable per part of it, um;
-    their names are `parts`. `frames` (time): what the camera adds of its own. `plate` gives the true field anywhere, any time.
+    Attributes
+    ----------
+    recipe : Recipe
+        The recipe asked for, with the size of a sensor fault that gives its rms.
+    schedule : Schedule
+        When and where each reading is taken.
+    session : Session
+        The states behind the readings.
+    plate : Plate
+        The true temperature field, at any point and time.
+    readings : xarray.Dataset
+        (cycle, direction, target): `deviation` as measured, um (NaN where lost), `time`, one variable in um for every part of the
+        deviation, `mean_profile` and `scatter`.
+    frames : xarray.Dataset
+        (frame,): true time `time_s`, offset `camera_offset_K`, `reflected_K`, `housing` temperature, `table_position` and `knocked`.
+    parts : tuple of str
+        Names of the parts that the deviation is the sum of.
     """
 
     recipe: Recipe
@@ -47,30 +66,31 @@ class Truth:
     frames: xr.Dataset
     parts: tuple[str, ...]
 
-    def clock(self, time_s: Floats) -> NDArray[np.datetime64]:
-        """Return seconds since the start of the test as UTC times of the laser's clock, ms."""
-        start = np.datetime64(self.recipe.campaign.start.removesuffix("Z"), "ms")
-        return np.asarray(start + np.round(np.asarray(time_s) * 1e3).astype("timedelta64[ms]"))
+    def clock(self, time_s: Array) -> NDArray[np.datetime64]:
+        """Return times in s since the start of the test as UTC times of the laser's clock, rounded to ms."""
+        return _clock(self.recipe, time_s)
 
-    def in_order(self, name: str) -> Floats:
-        """Return a variable of `readings` in the order the readings were taken."""
+    def in_order(self, name: str) -> Array:
+        """Return a variable of `readings` in the order in which the readings were taken, (n,)."""
         ordered = self.readings[name].values.copy()
         ordered[:, 1] = ordered[:, 1, ::-1]
         return np.asarray(ordered.ravel())
 
-    def temperature(self, time_s: Floats, x_mm: Floats, y_mm: Floats, *, cell_mm: float = 0.0) -> Floats:
-        """Return the true table temperature (time, y, x), degC, at points or averaged over square cells around them."""
-        return np.asarray(
-            self.plate.field(time_s, x_mm, y_mm, cell_mm=cell_mm) + self.recipe.table.initial_temperature_degC
-        )
+    def temperature(self, time_s: Array, x_mm: Array, y_mm: Array, *, cell_mm: float = 0.0) -> Array:
+        """Return the true table temperature (time, y, x), degC, at plan points or averaged over square cells around them.
+
+        Parameters are those of :meth:`fusion.twin.machine.heat.Plate.field`.
+        """
+        return self.plate.field(time_s, x_mm, y_mm, cell_mm=cell_mm) + self.recipe.table.initial_temperature_degC
 
 
 def simulate(recipe: Recipe) -> Truth:
-    """Simulate a campaign without rendering a frame.
+    """Simulate a positioning campaign without rendering a frame.
 
     Parameters
     ----------
     recipe : Recipe
+        Machine, test and effects; the same recipe gives the same numbers.
 
     Returns
     -------
@@ -79,102 +99,62 @@ def simulate(recipe: Recipe) -> Truth:
     Raises
     ------
     RecipeError
-        The recipe asks for something that no test can be, such as an effect that moves no reading.
+        The recipe asks for a record, a value is impossible, the cycle does not fit into its period, or an effect moves no reading.
+
+    Examples
+    --------
+    >>> truth = simulate(Recipe().vary(test={"cycles": 3}))
+    >>> dict(truth.readings["deviation"].sizes)
+    {'cycle': 3, 'direction': 2, 'target': 16}
+    >>> truth.parts
+    ('static_profile', 'axis_expansion', 'table_offset', 'nuisance', 'noise')
     """
     seed = check_recipe(recipe).campaign.seed
     if recipe.record is not None:
         raise RecipeError("this recipe asks for a [record]; use simulate_record, or remove the table")
     schedule = make_schedule(recipe.test, seed)
-    grid_s = np.arange(-60.0 * recipe.table.preheat_min, schedule.duration_s + 10 * GRID_STEP_S, GRID_STEP_S)
+    grid_s = np.arange(
+        -60.0 * recipe.table.preheat_min, schedule.duration_s + 10 * GRID_STEP_S, GRID_STEP_S, dtype=float
+    )
     duty = duty_levels(recipe.duty, grid_s, seed)
     air = simulate_air(recipe.room, grid_s, seed)
-    plate, local_rise = _heat(recipe, schedule, grid_s, duty, air)
+    plate, local_rises = _heat(recipe, schedule, grid_s, duty, air)
     session = _session(recipe, schedule, grid_s, duty, air, plate)
-    recipe = replace(recipe, effect=tuple(_size_fault(effect, session) for effect in recipe.effect))
+    recipe = replace(recipe, effect=tuple(_with_fault_sized(effect, session) for effect in recipe.effect))
 
-    line = plate.line_integrals(schedule.positions_mm)
-    line -= [np.interp(0.0, grid_s, column) for column in line.T]
-    at_target = np.stack([session.at_readings(column) for column in line.T])
     series = {
         "static_profile": static_profile(recipe.profile, session, seed),
-        "axis_expansion": recipe.drift.expansion_ppm_per_K
-        * 1e-3
-        * at_target[schedule.target - 1, np.arange(schedule.time_s.size)],
+        "axis_expansion": _axis_expansion(recipe.drift, schedule, session, plate),
         "table_offset": recipe.drift.offset_um_per_K * session.at_readings(session.table_rise_K),
         "nuisance": nuisance(recipe.drift, session, seed),
         "noise": laser_noise(recipe.laser, session, seed),
     }
-    housing = session.at_frames(session.air_degC) + CAMERA_WARM_UP_K * (
-        1.0 - np.exp(-session.frame_s / CAMERA_WARM_UP_S)
-    )
-    own_drift = recipe.camera.drift_K_per_K * (housing - np.interp(0.0, grid_s, session.air_degC))
-    camera = {"camera_offset_K": _ffc_steps(recipe, session) + own_drift, "reflected_K": np.zeros(session.frame_s.size)}
     for effect in recipe.effect:
-        seen = EFFECTS[effect.name].unit == "K"
-        value = _scale_camera(effect, recipe, session) if seen else _scale(effect, recipe, session)
-        if seen:
-            camera["reflected_K" if effect.name == "reflected_source" else "camera_offset_K"] += value
-            value = np.zeros(schedule.time_s.size)
-        series[_free_name(effect.name, series)] = value
-    for number, anomaly in enumerate(recipe.anomaly):
-        name = _free_name(f"anomaly_{anomaly.target}_{anomaly.kind}", series)
-        series[name] = _anomaly(anomaly, session, local_rise[number], seed)
+        series[_unused_name(effect.name, series)] = _scaled(effect, session)
+    for anomaly, local_rise in zip(recipe.anomaly, local_rises, strict=True):
+        name = _unused_name(f"anomaly_{anomaly.target}_{anomaly.kind}", series)
+        series[name] = _anomaly(anomaly, session, local_rise, seed)
     readings = _dataset(recipe, schedule, series)
-    frames = xr.Dataset(
-        {name: ("frame", value, {"units": "K"}) for name, value in camera.items()}
-        | {
-            "time_s": ("frame", session.frame_s, {"units": "s", "long_name": "true time since the start of the test"}),
-            "housing": ("frame", housing, {"units": "degC", "long_name": "temperature of the camera's housing"}),
-            "table_position": ("frame", schedule.table_position(session.frame_s), {"units": "mm"}),
-            "knocked": ("frame", _knocked(recipe, session).astype(np.int8)),
-        }
-    )
-    return Truth(recipe, schedule, session, plate, readings, frames, tuple(series))
+    return Truth(recipe, schedule, session, plate, readings, _frames(recipe, schedule, session), tuple(series))
 
 
-def environment_log(truth: Truth) -> xr.Dataset:
-    """Return what the laser's environment unit logs once a minute, sensor noise, faults and resolution included."""
-    session, recipe = truth.session, truth.recipe
-    minute = np.arange(0.0, truth.schedule.duration_s, 60.0)
-    told = (session.air_degC, session.air_hPa)
-    for effect in recipe.effect:
-        if effect.name == "sensor_fault":
-            told = told_air(session, **(EFFECTS[effect.name].parameters | effect.parameters))
-    rng = stream(recipe.campaign.seed, "environment unit")
-    columns = {
-        "air_temperature": (told[0], 0.004, 2, "degC"),
-        "air_pressure": (told[1], 0.02, 2, "hPa"),
-        "relative_humidity": (session.air_percent, 0.05, 1, "percent"),
-        "material_temperature": (session.probe_degC, 0.004, 2, "degC"),
+def _clock(recipe: Recipe, time_s: Array) -> NDArray[np.datetime64]:
+    """Return times in s since the start of the test as UTC times, rounded to ms."""
+    start = np.datetime64(recipe.campaign.start.removesuffix("Z"), "ms")
+    return np.asarray(start + np.round(np.asarray(time_s) * 1e3).astype("timedelta64[ms]"))
+
+
+# Heat and air behind the readings.
+
+
+def _heat(recipe: Recipe, schedule: Schedule, grid_s: Array, duty: Array, air: Air) -> tuple[Plate, list[Array]]:
+    """Solve the plate with all sources; also the rise (m,) at each anomalous target due to a heat source of its own."""
+    local_sources = {
+        number: _local_source(recipe, schedule, anomaly)
+        for number, anomaly in enumerate(recipe.anomaly)
+        if anomaly.kind == "local_temperature"
     }
-    noisy = {
-        name: (
-            "time",
-            np.round(np.interp(minute, session.grid_s, value) + noise * rng.standard_normal(minute.size), digits),
-            {"units": unit},
-        )
-        for name, (value, noise, digits, unit) in columns.items()
-    }
-    return xr.Dataset(noisy, coords={"time": truth.clock(minute).astype("datetime64[ns]")})
-
-
-def driver_log(truth: Truth) -> xr.Dataset:
-    """Return the load of the machine as logged once a minute."""
-    minute = np.arange(0.0, truth.schedule.duration_s, 60.0)
-    level = truth.session.duty[np.searchsorted(truth.session.grid_s, minute)]
-    return xr.Dataset(
-        {"duty": ("time", level.round(3), {"units": "1"})},
-        coords={"time": truth.clock(minute).astype("datetime64[ns]")},
-    )
-
-
-def _heat(
-    recipe: Recipe, schedule: Schedule, grid_s: Floats, duty: Floats, air: Air
-) -> tuple[Plate, dict[int, Floats]]:
-    """Solve the plate with all sources; also the rise that each locally warm target owes to its own source."""
-    seed = recipe.campaign.seed
-    own = {n: _local_source(recipe, schedule, a) for n, a in enumerate(recipe.anomaly) if a.kind == "local_temperature"}
-    sources = (*recipe.source, *own.values())
+    sources = (*recipe.source, *local_sources.values())
     power = np.zeros((grid_s.size, len(sources)))
     for column, source in enumerate(sources):
         if source.follows == "duty":
@@ -182,163 +162,256 @@ def _heat(
         elif source.follows == "constant":
             drive = np.ones(grid_s.size)
         else:
-            drive = random_levels(grid_s, 0.0, 1.0, 35.0, stream(seed, f"own drive of {source.name}"), two=True)
+            rng = stream(recipe.campaign.seed, f"own drive of {source.name}")
+            drive = random_levels(grid_s, 0.0, 1.0, 35.0, rng, alternate=True)
         power[:, column] = source.power_W * first_order(drive, GRID_STEP_S, 60.0 * source.time_constant_min)
     start = recipe.table.initial_temperature_degC
     plate = solve_plate(recipe.plan, recipe.table, sources, power, air.temperature_degC - start, grid_s)
-    local_rise: dict[int, Floats] = {n: np.zeros(grid_s.size) for n in range(len(recipe.anomaly))}
-    for column, (number, source) in enumerate(own.items(), len(recipe.source)):
+    local_rises = [np.zeros(grid_s.size) for _ in recipe.anomaly]
+    for column, (number, source) in enumerate(local_sources.items(), len(recipe.source)):
         alone = solve_plate(recipe.plan, recipe.table, (source,), power[:, [column]], np.zeros(grid_s.size), grid_s)
-        local_rise[number] = alone.points(np.array([source.x_mm]), np.array([source.y_mm]))[:, 0]
-    return plate, local_rise
+        local_rises[number] = alone.points(np.array([source.x_mm]), np.array([source.y_mm]))[:, 0]
+    return plate, local_rises
 
 
 def _local_source(recipe: Recipe, schedule: Schedule, anomaly: AnomalyRecipe) -> Source:
-    """Return the small source under a locally warm target."""
-    at = np.array(recipe.plan.origin_mm) + np.array(recipe.plan.direction) * schedule.positions_mm[anomaly.target - 1]
-    return Source(f"target {anomaly.target}", float(at[0]), float(at[1]), 14.0, 14.0, 6.0, 4.0, "own")
+    """Return the small heat source under an anomalous target."""
+    position = schedule.positions_mm[anomaly.target - 1]
+    x_mm, y_mm = np.array(recipe.plan.origin_mm) + np.array(recipe.plan.direction) * position
+    return Source(f"target {anomaly.target}", float(x_mm), float(y_mm), 14.0, 14.0, 6.0, 4.0, "own")
 
 
-def _session(recipe: Recipe, schedule: Schedule, grid_s: Floats, duty: Floats, air: Air, plate: Plate) -> Session:
-    """Collect what effects may look at."""
-    camera = recipe.camera
-    if camera.table == "still":
-        burst = (
-            schedule.last_reading_s
-            + camera.frame_after_s
-            + np.arange(camera.frames_per_cycle) * camera.burst_interval_s
-        )
-        if burst[-1] >= schedule.period_s:
-            raise RecipeError(
-                f"camera: the last frame of a cycle is due {burst[-1]:.1f} s after its start, past its end at {schedule.period_s:.1f} s; "
-                "lower frame_after_s or frames_per_cycle, or raise test.period_s"
-            )
-        frame_s = (np.arange(schedule.cycles)[:, None] * schedule.period_s + burst).ravel()
-    else:
-        frame_s = np.arange(0.5 * camera.frame_interval_s, schedule.duration_s, camera.frame_interval_s)
-    probe = plate.points(np.array([PROBE_AT_MM[0]]), np.array([PROBE_AT_MM[1]]))[:, 0]
+def _session(recipe: Recipe, schedule: Schedule, grid_s: Array, duty: Array, air: Air, plate: Plate) -> Session:
+    """Collect the states that effects act through."""
+    probe = plate.points(np.array([PROBE_MM[0]]), np.array([PROBE_MM[1]]))[:, 0]
+    probe = first_order(probe, GRID_STEP_S, 60.0 * recipe.room.probe_lag_min)
     return Session(
-        seed=recipe.campaign.seed,
         time_s=schedule.time_s,
         cycle=schedule.cycle,
         sign=schedule.sign,
         target=schedule.target,
         position_mm=schedule.position_mm,
-        travel_mm=float(schedule.positions_mm[-1]),
         cycles=schedule.cycles,
         period_s=schedule.period_s,
+        seed=recipe.campaign.seed,
+        travel_mm=float(schedule.positions_mm[-1]),
         grid_s=grid_s,
         duty=duty,
         table_rise_K=plate.mean() - np.interp(0.0, grid_s, plate.mean()),
-        probe_degC=recipe.table.initial_temperature_degC
-        + first_order(probe, GRID_STEP_S, 60.0 * recipe.room.probe_lag_min),
+        probe_degC=recipe.table.initial_temperature_degC + probe,
         air_degC=air.temperature_degC,
         air_hPa=air.pressure_hPa,
         air_percent=air.humidity_percent,
         refractivity=air.index,
-        frame_s=frame_s,
+        frame_s=_frame_times(recipe, schedule),
     )
 
 
-def _scale(effect: EffectRecipe, recipe: Recipe, session: Session) -> Floats:
-    """Return an effect's series in um, scaled to the rms that the recipe asks for (a sensor's fault is scaled before)."""
-    value = EFFECTS[effect.name].series(session, **effect.parameters)
+def _frame_times(recipe: Recipe, schedule: Schedule) -> Array:
+    """Return the true times of the frames, s."""
+    camera = recipe.camera
+    if camera.table == "moving":
+        return np.arange(0.5 * camera.frame_interval_s, schedule.duration_s, camera.frame_interval_s, dtype=float)
+    burst = (
+        schedule.last_reading_s + camera.frame_after_s + np.arange(camera.frames_per_cycle) * camera.burst_interval_s
+    )
+    if burst[-1] >= schedule.period_s:
+        raise RecipeError(
+            f"camera: the last frame of a cycle is due {burst[-1]:.1f} s after its start, past its end at {schedule.period_s:.1f} s; "
+            "lower frame_after_s or frames_per_cycle, or raise test.period_s"
+        )
+    return (np.arange(schedule.cycles)[:, None] * schedule.period_s + burst).ravel()
+
+
+# The parts of every reading.
+
+
+def static_profile(profile: Profile, session: Session, seed: int) -> Array:
+    """Return the static positioning error: slope, bow, roughness, cyclic error and reversal error.
+
+    Parameters
+    ----------
+    profile : Profile
+        Sizes of the five parts.
+    session : Session
+        Readings of the test.
+    seed : int
+        Seed of the campaign.
+
+    Returns
+    -------
+    (n,) ndarray, um
+    """
+    rng = stream(seed, "profile")
+    targets = int(session.target.max())
+    rough = profile.rough_um * rng.standard_normal(targets)
+    half_reversal = 0.5 * profile.reversal_um * (1.0 + 0.15 * rng.standard_normal(targets))
+    cyclic = profile.pitch_um * np.sin(2 * np.pi * session.position_mm / profile.lead_mm + rng.uniform(0.0, 2 * np.pi))
+    smooth = profile.slope_um * session.share + 4.0 * profile.bow_um * session.share * (1.0 - session.share)
+    target = session.target - 1
+    return np.asarray(smooth + cyclic + rough[target] + session.sign * half_reversal[target])
+
+
+def _axis_expansion(drift: Drift, schedule: Schedule, session: Session, plate: Plate) -> Array:
+    """Return the expansion of the table between the laser's zero and each target, um: coefficient times integral of the rise."""
+    integrals = plate.line_integrals(schedule.positions_mm)
+    integrals -= [session.at_start(column) for column in integrals.T]
+    at_readings = np.stack([session.at_readings(column) for column in integrals.T])
+    return drift.expansion_ppm_per_K * 1e-3 * at_readings[schedule.target - 1, np.arange(schedule.time_s.size)]
+
+
+def nuisance(drift: Drift, session: Session, seed: int) -> Array:
+    """Return the drift that no physical quantity explains: a common part, and one proportional to position.
+
+    Both move in real time, between the readings of a pass as well.
+
+    Parameters
+    ----------
+    drift : Drift
+        Kind and intensities: the standard deviation after one hour (random_walk, integrated) or the stationary one (ou, with a
+        correlation time of one hour).
+    session : Session
+        Readings of the test.
+    seed : int
+        Seed of the campaign.
+
+    Returns
+    -------
+    (n,) ndarray, um
+    """
+    hours = np.diff(session.time_s, prepend=0.0) / 3600.0
+    common = drift.walk_common_um_per_sqrt_h * _walk(drift.walk, hours, stream(seed, "common walk"))
+    slope = drift.walk_slope_um_per_sqrt_h * _walk(drift.walk, hours, stream(seed, "slope walk"))
+    return np.asarray(common + session.share * slope)
+
+
+def _walk(kind: str, hours: Array, rng: np.random.Generator) -> Array:
+    """Return a random drift of unit intensity at the ends of the given steps, h."""
+    increments = rng.standard_normal(hours.size) * np.sqrt(hours)
+    if kind == "random_walk":
+        return np.cumsum(increments)
+    if kind == "integrated":
+        return np.asarray(np.sqrt(3.0) * np.cumsum(np.cumsum(increments) * hours))
+    state = np.zeros(hours.size)
+    if kind == "ou":
+        decay = np.exp(-hours / OU_HOURS)
+        innovations = np.sqrt(1.0 - decay**2) * rng.standard_normal(hours.size)
+        state[0] = rng.standard_normal()
+        for k in range(1, hours.size):
+            state[k] = decay[k] * state[k - 1] + innovations[k]
+    return state
+
+
+def laser_noise(laser: Laser, session: Session, seed: int) -> Array:
+    """Return the random error of every reading.
+
+    Parameters
+    ----------
+    laser : Laser
+        Standard deviation, its spread over the targets, and tails of the distribution.
+    session : Session
+        Readings of the test.
+    seed : int
+        Seed of the campaign.
+
+    Returns
+    -------
+    (n,) ndarray, um
+    """
+    rng = stream(seed, "noise")
+    n = session.time_s.size
+    unit = rng.standard_normal(n) if laser.tails == "normal" else rng.standard_t(4, n) / np.sqrt(2.0)
+    sizes = np.exp(laser.noise_spread * stream(seed, "noise spread").standard_normal(int(session.target.max())))
+    return np.asarray(laser.noise_um * sizes[session.target - 1] * unit)
+
+
+def _scaled(effect: EffectRecipe, session: Session) -> Array:
+    """Return an effect's series in um, scaled to the rms that the recipe asks for; 0 for an effect that only the camera sees."""
+    if EFFECTS[effect.name].unit == "K":
+        return np.zeros(session.time_s.size)
+    series = EFFECTS[effect.name].series(session, **effect.parameters)
+    # The size of a sensor fault has been found before, because the environment log shows it too.
     if effect.amplitude_um is None or effect.name == "sensor_fault":
-        return value
-    return np.asarray(value * _gain(effect.amplitude_um, spread(value, session), f"effect {effect.name}"))
+        return series
+    return series * _gain(effect.amplitude_um, moving_rms(series, session), f"effect {effect.name}")
 
 
-def _size_fault(effect: EffectRecipe, session: Session) -> EffectRecipe:
-    """Return a sensor's fault with the jump that gives the wanted rms: what is logged and what the laser errs by stay one."""
+def _with_fault_sized(effect: EffectRecipe, session: Session) -> EffectRecipe:
+    """Return a sensor fault with the jump that gives the wanted rms, so that the log shows the jump that the laser errs by."""
     if effect.name != "sensor_fault" or effect.amplitude_um is None:
         return effect
     parameters = EFFECTS[effect.name].parameters | effect.parameters
     if parameters["kind"] == "stuck":
         raise RecipeError(
-            "effect sensor_fault: a stuck sensor errs by what it misses; remove amplitude_um, or use kind = 'jump'"
+            "effect sensor_fault: the error of a stuck sensor follows from the air; remove amplitude_um, or use kind = 'jump'"
         )
+    # The refractivity is not linear in temperature and pressure.
     for _ in range(8):
-        found = spread(EFFECTS[effect.name].series(session, **parameters), session)
-        parameters["size"] *= _gain(effect.amplitude_um, found, "effect sensor_fault")
+        rms = moving_rms(EFFECTS[effect.name].series(session, **parameters), session)
+        parameters["size"] *= _gain(effect.amplitude_um, rms, "effect sensor_fault")
     return replace(effect, parameters=parameters)
 
 
-def _scale_camera(effect: EffectRecipe, recipe: Recipe, session: Session) -> Floats:
-    """Return what an effect adds to the camera's view in K; an rms in um counts what it does to the declared model's prediction."""
-    parameters = effect.parameters | ({} if effect.amplitude_K is None else {"K": effect.amplitude_K})
-    value = EFFECTS[effect.name].series(session, **parameters)
-    if effect.amplitude_um is None:
-        return value
-    if effect.name == "reflected_source":
-        raise RecipeError("effect reflected_source: amplitude_um has no meaning for a spot; write amplitude_K")
-    error = np.interp(session.time_s, session.frame_s, value)
-    predicted = error * (recipe.drift.expansion_ppm_per_K * 1e-3 * session.position_mm + recipe.drift.offset_um_per_K)
-    return np.asarray(value * _gain(effect.amplitude_um, spread(predicted, session), "effect camera_offset"))
-
-
-def _anomaly(anomaly: AnomalyRecipe, session: Session, local_rise: Floats, seed: int) -> Floats:
-    """Return an anomalous target's own series, um."""
+def _anomaly(anomaly: AnomalyRecipe, session: Session, local_rise_K: Array, seed: int) -> Array:
+    """Return the motion of an anomalous target, um; 0 at all other targets."""
     rng = stream(seed, f"anomaly {anomaly.target} {anomaly.kind}")
-    there = (session.target == anomaly.target) & np.isin(
-        session.sign, {"both": (1, -1), "positive": (1,), "negative": (-1,)}[anomaly.direction]
-    )
-    value = np.where(there, ANOMALIES[anomaly.kind](session, local_rise, rng, anomaly.at_cycle), 0.0)
-    return np.asarray(
-        value * _gain(anomaly.amplitude_um, spread(value, session), f"anomaly at target {anomaly.target}")
-    )
+    affected = (session.target == anomaly.target) & np.isin(session.sign, _SIGNS[anomaly.direction])
+    series = np.where(affected, ANOMALIES[anomaly.kind](session, local_rise_K, rng, anomaly.at_cycle), 0.0)
+    return series * _gain(anomaly.amplitude_um, moving_rms(series, session), f"anomaly at target {anomaly.target}")
 
 
-def spread(series: Floats, session: Session) -> float:
-    """Return the rms (um) about the mean per target and direction, over the targets and directions that move at all."""
-    moving = grid(series, session.cycles)
+def moving_rms(series: Array, session: Session) -> float:
+    """Return the rms about the mean per target and direction, over the targets and directions that move at all.
+
+    Parameters
+    ----------
+    series : (n,) ndarray, um
+        One value per reading, in the order in which they are taken.
+    session : Session
+        Readings of the test.
+
+    Returns
+    -------
+    float, um
+        0 where nothing moves.
+    """
+    moving = _by_site(series, session.cycles)
     moving = moving - moving.mean(axis=0)
     affected = np.abs(moving).max(axis=0) > 1e-12
     return float(np.sqrt(np.mean(moving[:, affected] ** 2))) if affected.any() else 0.0
 
 
-def grid(series: Floats, cycles: int) -> Floats:
+def _by_site(series: Array, cycles: int) -> Array:
     """Return readings in the order taken as (cycle, direction, target), direction positive then negative."""
-    out = np.array(series).reshape(cycles, 2, -1)
-    out[:, 1] = out[:, 1, ::-1]
-    return out
+    laid = np.array(series).reshape(cycles, 2, -1)
+    laid[:, 1] = laid[:, 1, ::-1]
+    return laid
 
 
-def _gain(wanted_um: float, found_um: float, what: str) -> float:
-    if found_um == 0.0:
+def _gain(wanted_um: float, rms_um: float, what: str) -> float:
+    """Return the factor that brings a series to the wanted rms."""
+    if rms_um == 0.0:
         raise RecipeError(
             f"{what}: nothing moves in this test, so it cannot be scaled to {wanted_um} um rms; change its parameters"
         )
-    return wanted_um / found_um
+    return wanted_um / rms_um
 
 
-def _free_name(name: str, taken: dict[str, Floats]) -> str:
+def _unused_name(name: str, taken: dict[str, Array]) -> str:
     """Return the name, numbered where the recipe uses it again."""
     count = 1 + sum(t == name or t.startswith(f"{name}_again") for t in taken)
     return name if count == 1 else f"{name}_again{count}"
 
 
-def _ffc_steps(recipe: Recipe, session: Session) -> Floats:
-    """Return the camera's zero per frame: a new random offset after every flat-field correction, K."""
-    number = (session.frame_s // (60.0 * recipe.camera.ffc_interval_min)).astype(int)
-    offsets = stream(recipe.campaign.seed, "ffc").standard_normal(number.max() + 1)
-    return np.asarray(recipe.camera.ffc_step_K * offsets[number])
-
-
-def _knocked(recipe: Recipe, session: Session) -> NDArray[np.bool_]:
-    """Return which frames come after somebody knocked the camera."""
-    cycle = recipe.camera.knock_cycle
-    return np.asarray((session.frame_s >= session.start_of(cycle)) & (cycle > 0))
-
-
-def _dataset(recipe: Recipe, schedule: Schedule, series: dict[str, Floats]) -> xr.Dataset:
-    """Return the readings as (cycle, direction, target), measured deviation and every part of it."""
+def _dataset(recipe: Recipe, schedule: Schedule, series: dict[str, Array]) -> xr.Dataset:
+    """Return the readings as (cycle, direction, target): measured deviation, time, every part, and what statistics should find."""
     dims = ("cycle", "direction", "target")
-    parts = {name: (dims, grid(value, schedule.cycles), {"units": "um"}) for name, value in series.items()}
-    deviation = np.sum([value for _, value, _ in parts.values()], axis=0)
+    parts = {name: (dims, _by_site(part, schedule.cycles), {"units": "um"}) for name, part in series.items()}
+    deviation = np.sum([part for _, part, _ in parts.values()], axis=0)
     random = np.sum(
-        [value for name, (_, value, _) in parts.items() if name == "noise" or name.endswith("structural")], axis=0
+        [part for name, (_, part, _) in parts.items() if name == "noise" or name.endswith("structural")], axis=0
     )
-    known = {
+    statistics = {
         "mean_profile": (
             dims[1:],
             (deviation - random).mean(axis=0),
@@ -353,14 +426,13 @@ def _dataset(recipe: Recipe, schedule: Schedule, series: dict[str, Floats]) -> x
     lost = (
         stream(recipe.campaign.seed, "lost readings").uniform(size=np.shape(deviation)) < recipe.test.missing_fraction
     )
-    start = np.datetime64(recipe.campaign.start.removesuffix("Z"), "ns")
-    time = start + np.round(grid(schedule.time_s, schedule.cycles) * 1e3).astype("timedelta64[ms]")
+    time = _clock(recipe, _by_site(schedule.time_s, schedule.cycles)).astype("datetime64[ns]")
     return xr.Dataset(
         {
             "deviation": (dims, np.where(lost, np.nan, deviation), {"units": "um"}),
             "time": (dims, time),
             **parts,
-            **known,
+            **statistics,
         },
         coords={
             "cycle": np.arange(1, schedule.cycles + 1),
@@ -371,53 +443,110 @@ def _dataset(recipe: Recipe, schedule: Schedule, series: dict[str, Floats]) -> x
     )
 
 
-OU_HOURS = 1.0
+# What the camera adds of its own.
 
 
-def static_profile(profile: Profile, session: Session, seed: int) -> Floats:
-    """Return the static positioning error of every reading, um: scale, bow, roughness, cyclic error, reversal."""
-    rng = stream(seed, "profile")
-    targets = int(session.target.max())
-    rough = profile.rough_um * rng.standard_normal(targets)
-    reversal = 0.5 * profile.reversal_um * (1.0 + 0.15 * rng.standard_normal(targets))
-    cyclic = profile.pitch_um * np.sin(2 * np.pi * session.position_mm / profile.lead_mm + rng.uniform(0.0, 2 * np.pi))
-    smooth = profile.slope_um * session.share + 4.0 * profile.bow_um * session.share * (1.0 - session.share)
-    return np.asarray(smooth + cyclic + rough[session.target - 1] + session.sign * reversal[session.target - 1])
+def _frames(recipe: Recipe, schedule: Schedule, session: Session) -> xr.Dataset:
+    """Return time, offset, reflection, housing temperature, table position and displacement of every frame."""
+    camera = recipe.camera
+    warm_up = CAMERA_WARM_UP_K * (1.0 - np.exp(-session.frame_s / CAMERA_WARM_UP_S))
+    housing = session.at_frames(session.air_degC) + warm_up
+    housing_drift = camera.drift_K_per_K * (housing - session.at_start(session.air_degC))
+    offset, reflected = _ffc_offsets(recipe, session) + housing_drift, np.zeros(session.frame_s.size)
+    for effect in recipe.effect:
+        if effect.name == "reflected_source":
+            reflected = reflected + _scaled_for_camera(effect, recipe, session)
+        elif EFFECTS[effect.name].unit == "K":
+            offset = offset + _scaled_for_camera(effect, recipe, session)
+    knocked = (session.frame_s >= session.start_of(camera.knock_cycle)) & (camera.knock_cycle > 0)
+    return xr.Dataset(
+        {
+            "camera_offset_K": ("frame", offset, {"units": "K"}),
+            "reflected_K": ("frame", reflected, {"units": "K"}),
+            "time_s": ("frame", session.frame_s, {"units": "s", "long_name": "true time since the start of the test"}),
+            "housing": ("frame", housing, {"units": "degC", "long_name": "temperature of the camera's housing"}),
+            "table_position": ("frame", schedule.table_position(session.frame_s), {"units": "mm"}),
+            "knocked": ("frame", knocked.astype(np.int8)),
+        }
+    )
 
 
-def nuisance(drift: Drift, session: Session, seed: int) -> Floats:
-    """Return the drift that no physics of the recipe explains, um: a common part and one that grows along the travel.
+def _ffc_offsets(recipe: Recipe, session: Session) -> Array:
+    """Return the camera's offset per frame, K: a new random one after every flat-field correction."""
+    number = (session.frame_s // (60.0 * recipe.camera.ffc_interval_min)).astype(int)
+    offsets = stream(recipe.campaign.seed, "ffc").standard_normal(number.max() + 1)
+    return np.asarray(recipe.camera.ffc_step_K * offsets[number])
 
-    Both move in real time, between the readings of a pass as well. The intensity is the standard deviation after one hour
-    (random_walk, integrated) or the stationary one with a correlation time of one hour (ou).
+
+def _scaled_for_camera(effect: EffectRecipe, recipe: Recipe, session: Session) -> Array:
+    """Return what an effect adds to the camera's view, K; an rms in um is that of the declared model's error of prediction."""
+    parameters = effect.parameters | ({} if effect.amplitude_K is None else {"K": effect.amplitude_K})
+    series = EFFECTS[effect.name].series(session, **parameters)
+    if effect.amplitude_um is None:
+        return series
+    if effect.name == "reflected_source":
+        raise RecipeError("effect reflected_source: amplitude_um has no meaning for a spot; write amplitude_K")
+    error = np.interp(session.time_s, session.frame_s, series)
+    predicted = error * (recipe.drift.expansion_ppm_per_K * 1e-3 * session.position_mm + recipe.drift.offset_um_per_K)
+    return series * _gain(effect.amplitude_um, moving_rms(predicted, session), "effect camera_offset")
+
+
+# What is logged beside the readings.
+
+
+def environment_log(truth: Truth) -> xr.Dataset:
+    """Return what the laser's environment unit logs once a minute, with sensor noise, faults and resolution.
+
+    Parameters
+    ----------
+    truth : Truth
+        From :func:`simulate`.
+
+    Returns
+    -------
+    xarray.Dataset
+        (time,): air_temperature, degC; air_pressure, hPa; relative_humidity, percent; material_temperature, degC.
     """
-    hours = np.diff(session.time_s, prepend=0.0) / 3600.0
-    common = drift.walk_common_um_per_sqrt_h * _walk(drift.walk, hours, stream(seed, "common walk"))
-    slope = drift.walk_slope_um_per_sqrt_h * _walk(drift.walk, hours, stream(seed, "slope walk"))
-    return np.asarray(common + session.share * slope)
+    session, recipe = truth.session, truth.recipe
+    minute = np.arange(0.0, truth.schedule.duration_s, 60.0, dtype=float)
+    temperature, pressure = session.air_degC, session.air_hPa
+    for effect in recipe.effect:
+        if effect.name == "sensor_fault":
+            temperature, pressure = logged_air(session, **(EFFECTS[effect.name].parameters | effect.parameters))
+    rng = stream(recipe.campaign.seed, "environment unit")
+    columns = {
+        "air_temperature": (temperature, 0.004, 2, "degC"),
+        "air_pressure": (pressure, 0.02, 2, "hPa"),
+        "relative_humidity": (session.air_percent, 0.05, 1, "percent"),
+        "material_temperature": (session.probe_degC, 0.004, 2, "degC"),
+    }
+    noisy = {
+        name: (
+            "time",
+            np.round(np.interp(minute, session.grid_s, true) + noise * rng.standard_normal(minute.size), digits),
+            {"units": unit},
+        )
+        for name, (true, noise, digits, unit) in columns.items()
+    }
+    return xr.Dataset(noisy, coords={"time": truth.clock(minute).astype("datetime64[ns]")})
 
 
-def laser_noise(laser: Laser, session: Session, seed: int) -> Floats:
-    """Return the random error of every reading, um; `noise_spread` is the relative natural spread of its size over the targets."""
-    rng = stream(seed, "noise")
-    n = session.time_s.size
-    unit = rng.standard_normal(n) if laser.tails == "normal" else rng.standard_t(4, n) / np.sqrt(2.0)
-    sizes = np.exp(laser.noise_spread * stream(seed, "noise spread").standard_normal(int(session.target.max())))
-    return np.asarray(laser.noise_um * sizes[session.target - 1] * unit)
+def driver_log(truth: Truth) -> xr.Dataset:
+    """Return the load of the machine as logged once a minute.
 
+    Parameters
+    ----------
+    truth : Truth
+        From :func:`simulate`.
 
-def _walk(kind: str, hours: Floats, rng: np.random.Generator) -> Floats:
-    """Return a wandering series of unit intensity over the given steps."""
-    kicks = rng.standard_normal(hours.size) * np.sqrt(hours)
-    if kind == "random_walk":
-        return np.cumsum(kicks)
-    if kind == "integrated":
-        return np.asarray(np.sqrt(3.0) * np.cumsum(np.cumsum(kicks) * hours))
-    state = np.zeros(hours.size)
-    if kind == "ou":
-        decay = np.exp(-hours / OU_HOURS)
-        fresh = np.sqrt(1.0 - decay**2) * rng.standard_normal(hours.size)
-        state[0] = rng.standard_normal()
-        for k in range(1, hours.size):
-            state[k] = decay[k] * state[k - 1] + fresh[k]
-    return state
+    Returns
+    -------
+    xarray.Dataset
+        (time,): duty, 0..1.
+    """
+    minute = np.arange(0.0, truth.schedule.duration_s, 60.0, dtype=float)
+    level = truth.session.duty[np.searchsorted(truth.session.grid_s, minute)]
+    return xr.Dataset(
+        {"duty": ("time", level.round(3), {"units": "1"})},
+        coords={"time": truth.clock(minute).astype("datetime64[ns]")},
+    )

@@ -18,9 +18,9 @@ from fusion.loop.axis import close_loop, hold_out
 from fusion.loop.result import LoopResult, rmse
 from fusion.model.fit import ModelFit, Term, fit_model
 from fusion.twin import simulate
-from fusion.twin.datasets import deviations_of, fields_of
 from fusion.twin.machine.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import driver_log, environment_log
+from fusion.twin.truth import deviations_of, fields_of
 
 DECLARED = ("axis_expansion", "table_offset")
 CYCLES = 60

@@ -1,4 +1,4 @@
-"""Campaigns with one odd position (target 3) of known cause, under a drift that walks at random."""
+"""Campaigns with one anomalous target (number 3) of known cause, under a drift that is a random walk."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import xarray as xr
 
 from tests.fusion import film_simulator as simulator
 
-#: What is put in -> what the diagnosis must call it.
+#: Simulated cause -> cause that the diagnosis must name.
 CAUSES = {
     "structural": "structural",
     "local_temperature": "local_temperature",
@@ -26,11 +26,11 @@ def odd_position(cause: str, rng: np.random.Generator, *, rms_um: float = 0.3, n
     slope = 0.3 * np.cumsum(rng.standard_normal(cycles))
     fused = simulator.session(np.zeros((cycles, 1, 1)), common, slope, rng, noise_um=noise_um).fused
     rise = 3.0 * simulator.smooth_series(str(rng.choice(["duty", "rw"])), rng)
-    seen = np.tile(rise[:, None], (1, 16)) + 0.02 * rng.standard_normal((cycles, 16))
+    measured = np.tile(rise[:, None], (1, 16)) + 0.02 * rng.standard_normal((cycles, 16))
     fused = fused.assign_coords(
         frame_time=simulator.START + (np.arange(cycles) * simulator.PERIOD_S * 1e9).astype("timedelta64[ns]")
     )
-    fused["local_rise_series"] = (("frame_time", "target"), seen, {"units": "K"})
+    fused["local_rise_series"] = (("frame_time", "target"), measured, {"units": "K"})
     deviation = fused["deviation"].values.copy()
     deviation[:, :, 2] += rms_um * _effect(cause, rise, rng)
     fused["deviation"] = (fused["deviation"].dims, deviation, {"units": "um"})

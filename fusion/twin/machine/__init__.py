@@ -1,1 +1,1 @@
-"""The simulated machine: schedule, heat, air, drift and effects, known exactly."""
+"""The simulated machine: recipe, schedule, heat, air and effects, with exactly known states."""

@@ -11,8 +11,8 @@ from fusion.alignment.align import AxisGeometry, align
 from fusion.attribution.attribute import correlate
 from fusion.diagnosis.diagnose import diagnose
 from fusion.twin import simulate
-from fusion.twin.datasets import deviations_of, fields_of
 from fusion.twin.machine.recipe import AnomalyRecipe, Recipe
+from fusion.twin.truth import deviations_of, fields_of
 
 CAUSES = {
     "structural": "structural",

@@ -1,6 +1,6 @@
-"""Sets and checks the thresholds of the diagnosis on simulated campaigns: 0.3 um rms of effect beside 0.4 um of noise.
+"""Thresholds of the diagnosis on simulated campaigns: effects of 0.3 um rms beside 0.4 um of noise.
 
-Run with ``-m slow -s``: prints for each cause the verdicts as it is set, and the rates that other thresholds would give.
+Run with ``-m slow -s``: prints the diagnoses of each cause, and the rates that other thresholds would give.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fusion.diagnosis.diagnose import THRESHOLDS, Diagnosis, diagnose
 from tests.fusion.residual_simulator import CAUSES, odd_position
 
 RUNS = int(os.environ.get("THERMOFUSE_RUNS", "200"))
-#: Wanted share of right names; None: only wrong names count.
+#: Minimum share of right causes; None: only wrong causes are counted.
 BARS = {
     "structural": 0.95,
     "local_temperature": 0.90,
@@ -35,21 +35,21 @@ class Flag:
     direction: str = "both"
 
 
-def verdicts(cause: str) -> list[Diagnosis]:
+def diagnoses_of(cause: str) -> list[Diagnosis]:
     return [diagnose([Flag()], odd_position(cause, np.random.default_rng([seed, 41])))[0] for seed in range(RUNS)]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cause", list(BARS))
 def test_right_names_and_no_wrong_ones(cause):
-    found = verdicts(cause)
-    names = Counter(one.cause for one in found)
+    diagnoses = diagnoses_of(cause)
+    names = Counter(diagnosis.cause for diagnosis in diagnoses)
     right = CAUSES[cause]
     low, high = proportion_confint(names[right], RUNS, method="wilson")
     print(f"\n{cause}: {dict(names)} of {RUNS}; {right} {names[right] / RUNS:.2f} [{low:.2f}, {high:.2f}]")
     if right in THRESHOLDS:
         by_threshold = {
-            tried: round(float(np.mean([one.evidence[f"probability_{right}"] >= tried for one in found])), 2)
+            tried: round(float(np.mean([d.evidence[f"probability_{right}"] >= tried for d in diagnoses])), 2)
             for tried in TRIED
         }
         print(f"  share with probability of {right} above a threshold: {by_threshold}; set: {THRESHOLDS[right]}")

@@ -1,4 +1,4 @@
-"""The residual's shapes: an event and a rhythm are seen and placed, and a complete model shows nothing."""
+"""Structure in the residual: an event and a periodic disturbance are detected and located, and a complete model shows none."""
 
 from __future__ import annotations
 
@@ -21,40 +21,40 @@ def residual_of(*effects: EffectRecipe):
     return readings, examine_residual(fit_model(readings, terms), np.random.default_rng(1))
 
 
-def test_a_complete_model_shows_no_shape():
-    _, found = residual_of()
+def test_a_complete_model_shows_no_structure():
+    _, tests = residual_of()
     # Nine shapes: the smallest p of nine true nulls is below 0.005 once in 22 campaigns, and this one is not among them.
-    assert min(found.p_values.values()) > 0.005
-    assert found.innovations.std() == pytest.approx(1.0, abs=0.05)  # 1,900 readings give it to 0.016
-    assert np.median(found.power) == pytest.approx(np.log(2.0), abs=0.2)  # power of noise is exponential with mean 1
+    assert min(tests.p_values.values()) > 0.005
+    assert tests.innovations.std() == pytest.approx(1.0, abs=0.05)  # 1,900 readings give it to 0.016
+    assert np.median(tests.power) == pytest.approx(np.log(2.0), abs=0.2)  # power of noise is exponential with mean 1
 
 
-def test_an_event_is_seen_where_it_is():
-    readings, found = residual_of(EffectRecipe("step_event", amplitude_um=1.0, parameters={"at_cycle": 30}))
-    assert found.p_values["event"] < 0.005
+def test_an_event_is_detected_at_its_time():
+    readings, tests = residual_of(EffectRecipe("step_event", amplitude_um=1.0, parameters={"at_cycle": 30}))
+    assert tests.p_values["event"] < 0.005
     start = readings.seconds[readings.cycle == 30].min()
-    assert abs(found.event_s - start) < 252.0  # within a cycle
+    assert abs(tests.event_s - start) < 252.0  # within a cycle
 
 
-def test_a_rhythm_is_seen_with_its_period():
+def test_a_periodic_disturbance_is_detected_with_its_period():
     effect = EffectRecipe("periodic_disturbance", amplitude_um=0.4, parameters={"period_min": 9.0, "shape": "flat"})
-    _, found = residual_of(effect)
-    assert found.p_values["rhythm"] < 0.005
-    assert found.period_min == pytest.approx(9.0, rel=0.03)  # half the resolution of 4.2 h is 1.8 % of it
-    assert found.power.max() > found.power_limit
-    assert not found.period_is_cycle
+    _, tests = residual_of(effect)
+    assert tests.p_values["rhythm"] < 0.005
+    assert tests.period_min == pytest.approx(9.0, rel=0.03)  # half the resolution of 4.2 h is 1.8 % of it
+    assert tests.power.max() > tests.power_limit
+    assert not tests.period_is_cycle
 
 
-def test_a_changing_reversal_is_known_by_the_rhythm_of_the_cycles():
-    _, found = residual_of(EffectRecipe("reversal_drift", amplitude_um=0.6))
-    assert found.p_values["direction"] < 0.005
-    assert found.period_is_cycle
-    rows = describe_residual({"residual_tests": {"declared": found.as_json(), "final": found.as_json()}})
-    told = {shape: declared for shape, declared, _ in rows}
-    assert told["a rhythm"].endswith("min (that of the cycles)")
+def test_a_changing_reversal_error_shows_at_the_period_of_the_cycles():
+    _, tests = residual_of(EffectRecipe("reversal_drift", amplitude_um=0.6))
+    assert tests.p_values["direction"] < 0.005
+    assert tests.period_is_cycle
+    rows = describe_residual({"residual_tests": {"declared": tests.as_json(), "final": tests.as_json()}})
+    table = {shape: declared for shape, declared, _ in rows}
+    assert table["a rhythm"].endswith("min (that of the cycles)")
 
 
-def test_the_same_seed_gives_the_same_chances():
+def test_the_same_seed_gives_the_same_p_values():
     _, first = residual_of()
     _, again = residual_of()
     assert first.p_values == again.p_values

@@ -10,9 +10,9 @@ from fusion.alignment.readings import read_fused
 from fusion.loop.axis import close_loop, on_corrected_fields
 from fusion.loop.camera_correction import correct_fields, corrected_variables, find_field_errors
 from fusion.twin import simulate
-from fusion.twin.datasets import deviations_of, fields_of
 from fusion.twin.machine.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import driver_log, environment_log
+from fusion.twin.truth import deviations_of, fields_of
 
 AXIS = AxisGeometry((500.0, 90.0), (-1.0, 0.0))
 DECLARED = ["axis_expansion", "table_offset"]

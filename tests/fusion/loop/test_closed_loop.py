@@ -15,9 +15,9 @@ from fusion.effects.jumps import event_instants, instants_near
 from fusion.effects.library import library
 from fusion.loop.axis import LoopError, close_loop, set_aside_sites
 from fusion.twin import simulate
-from fusion.twin.datasets import deviations_of, fields_of
 from fusion.twin.machine.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import driver_log, environment_log
+from fusion.twin.truth import deviations_of, fields_of
 from tests.fusion import loop_bench
 
 DECLARED = ["axis_expansion", "table_offset"]

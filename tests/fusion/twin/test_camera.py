@@ -1,4 +1,4 @@
-"""The twin's camera sees what geometry and radiation say it must."""
+"""The simulated camera obeys projection, lens and radiation: geometry, counts, noise and its own errors."""
 
 from __future__ import annotations
 
@@ -32,9 +32,11 @@ def temperature_by_hand(counts: np.ndarray, camera: Camera) -> np.ndarray:
     root = np.sqrt(camera.distance_mm / 1000)
     tau = k["atmosphere_x"] * np.exp(-root * (k["atmosphere_alpha1"] + k["atmosphere_beta1"] * np.sqrt(omega)))
     tau += (1 - k["atmosphere_x"]) * np.exp(-root * (k["atmosphere_alpha2"] + k["atmosphere_beta2"] * np.sqrt(omega)))
-    own = (counts - (1 - tau) * black(t)) / tau
-    own = (own - (1 - camera.emissivity) * black(camera.reflected_temperature_degC)) / camera.emissivity
-    return k["planck_b"] / np.log(k["planck_r1"] / (k["planck_r2"] * (own + k["planck_o"])) + k["planck_f"]) - 273.15
+    surface = (counts - (1 - tau) * black(t)) / tau
+    surface = (surface - (1 - camera.emissivity) * black(camera.reflected_temperature_degC)) / camera.emissivity
+    return (
+        k["planck_b"] / np.log(k["planck_r1"] / (k["planck_r2"] * (surface + k["planck_o"])) + k["planck_f"]) - 273.15
+    )
 
 
 def test_pixels_and_plan_are_each_others_inverse():
@@ -50,7 +52,7 @@ def test_lens_is_the_one_of_opencv():
     straight = make_view(Camera(k1=0.0)).to_sensor(points)
     normal = (straight - view.centre_px) / camera.focal_px
     inner = np.array([[camera.focal_px, 0, view.centre_px[0]], [0, camera.focal_px, view.centre_px[1]], [0, 0, 1]])
-    seen, _ = cv2.projectPoints(
+    projected, _ = cv2.projectPoints(
         np.column_stack([normal, np.ones(len(normal))]),
         np.zeros(3),
         np.zeros(3),
@@ -58,7 +60,7 @@ def test_lens_is_the_one_of_opencv():
         np.array([camera.k1, 0, 0, 0.0]),
     )
     # float64 throughout
-    np.testing.assert_allclose(view.to_sensor(points), seen[:, 0], atol=1e-9)
+    np.testing.assert_allclose(view.to_sensor(points), projected[:, 0], atol=1e-9)
 
 
 def test_whole_table_is_in_view():
@@ -78,13 +80,13 @@ def test_counts_give_back_the_tables_temperature():
     counts = renderer.render(11)
     rows, columns = np.nonzero(renderer.scene(0.0, False).table == 1.0)
     points = renderer.view.to_plan(np.column_stack([columns, rows]))
-    seen = temperature_by_hand(counts[rows, columns].astype(float), truth.recipe.camera)
+    measured = temperature_by_hand(counts[rows, columns].astype(float), truth.recipe.camera)
     time_s = truth.session.frame_s[[11]]
     some = np.random.default_rng(3).choice(len(points), 300, replace=False)
     true = np.array([truth.temperature(time_s, points[[k], 0], points[[k], 1])[0, 0, 0] for k in some])
     # half a count is 3 mK; linear interpolation of the 1 mm field adds well under 1 mK
-    assert np.abs(seen[some] - true).max() < 4e-3
-    assert abs(np.mean(seen[some] - true)) < 0.5e-3
+    assert np.abs(measured[some] - true).max() < 4e-3
+    assert abs(np.mean(measured[some] - true)) < 0.5e-3
 
 
 def test_noise_is_the_netd_and_differs_between_frames():
@@ -118,11 +120,11 @@ def test_discs_mirror_the_surroundings():
     renderer = Renderer(truth)
     counts = renderer.render(11)
     column, row = np.rint(renderer.view.to_sensor(fiducial_points(BASE.plan)[:1])[0]).astype(int)
-    seen = temperature_by_hand(np.array(float(counts[row, column])), truth.recipe.camera)
+    measured = temperature_by_hand(np.array(float(counts[row, column])), truth.recipe.camera)
     table = truth.temperature(truth.session.frame_s[[11]], np.array([40.0]), np.array([18.0]))[0, 0, 0]
     mirrored = 0.15 * table + 0.85 * 22.0
     # radiances, not temperatures, mix: over 2 K that is worth 0.03 K; the paint's own emissivity is assumed for the disc
-    assert seen == pytest.approx(mirrored, abs=0.08)
+    assert measured == pytest.approx(mirrored, abs=0.08)
 
 
 def test_table_moves_through_the_view_and_its_field_with_it():

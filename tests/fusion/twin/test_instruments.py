@@ -1,4 +1,4 @@
-"""The twin writes what a laboratory would leave, and nothing of the truth stands where the analysis looks."""
+"""The twin writes the files of a laboratory, and nothing of the truth is in the folder that the analysis reads."""
 
 from __future__ import annotations
 
@@ -11,13 +11,10 @@ import pytest
 import xarray as xr
 
 from fusion.twin import simulate
-from fusion.twin.datasets import deviations_of, fields_of
 from fusion.twin.instruments import simulate_campaign, truth_folder, write_campaign
-from fusion.twin.machine.recipe import EffectRecipe, Recipe, RecipeError
+from fusion.twin.machine.recipe import Recipe, RecipeError
 from fusion.twin.recipe_file import read_recipe
-from interferometry.contract import DEVIATIONS
 from interferometry.io.readers import read_deviations, read_environment
-from thermography.contract import FIELDS
 from thermography.io.flir import index_frames, read_frame
 
 RECIPE = """
@@ -66,7 +63,7 @@ def test_campaign_file_names_what_is_there(campaign):
     assert "clock_offset" not in content["thermography"]
 
 
-def test_truth_stands_beside_the_campaign_and_is_not_told_in_it(campaign):
+def test_truth_stands_beside_the_campaign_and_is_not_stated_in_it(campaign):
     beside = truth_folder(campaign.parent)
     assert {path.name for path in beside.iterdir()} == {"truth.nc", "truth.json"}
     assert beside.parent == campaign.parent.resolve().parent
@@ -141,13 +138,13 @@ def test_folder_that_holds_something_is_refused(tmp_path, taken):
     assert [p.name for p in (tmp_path / taken).iterdir()] == ["precious.txt"]
 
 
-def test_empty_folder_is_used_and_progress_is_told(tmp_path):
+def test_empty_folder_is_used_and_progress_is_reported(tmp_path):
     (tmp_path / "out").mkdir()
-    told = []
+    steps: list[tuple] = []
     write_campaign(
-        simulate(Recipe().vary(test={"cycles": 2})), tmp_path / "out", progress=lambda *step: told.append(step)
+        simulate(Recipe().vary(test={"cycles": 2})), tmp_path / "out", progress=lambda *step: steps.append(step)
     )
-    assert told == [(1, 2, "render frames"), (2, 2, "render frames")]
+    assert steps == [(1, 2, "render frames"), (2, 2, "render frames")]
 
 
 def test_moving_table_is_written_as_a_sequence(tmp_path):
@@ -166,57 +163,6 @@ def test_rtl_holds_the_same_deviations(tmp_path):
     write_campaign(truth, tmp_path / "out")
     read = read_deviations(tmp_path / "out" / "laser.rtl")
     np.testing.assert_allclose(read["deviation"].values, truth.readings["deviation"].values, atol=0.6e-4)
-
-
-def test_datasets_without_files_keep_the_contracts():
-    truth = simulate(Recipe().vary(test={"cycles": 5, "missing_fraction": 0.1}))
-    for dataset, contract in ((deviations_of(truth), DEVIATIONS), (fields_of(truth), FIELDS)):
-        for name, (dims, units, kind) in contract.items():
-            assert dataset[name].dims == dims, name
-            assert dataset[name].dtype.kind == kind, name
-            assert dataset[name].attrs.get("units", "") == units, name
-    deviations = deviations_of(truth)
-    assert np.array_equal(np.isnat(deviations["time"].values), np.isnan(deviations["deviation"].values))
-
-
-def test_fields_without_files_are_cell_means_with_the_frames_noise():
-    truth = simulate(Recipe().vary(test={"cycles": 6}))
-    quiet, noisy = fields_of(truth, noise_K=0.0), fields_of(truth)
-    fine_x, fine_y = np.arange(0.25, 700, 0.5)[600:610], np.arange(0.25, 180, 0.5)[150:160]
-    cell = truth.temperature(truth.session.frame_s, fine_x, fine_y).mean(axis=(1, 2))
-    np.testing.assert_allclose(quiet["temperature"].sel(x=302.5, y=77.5), cell, atol=1e-4)
-    noise = (noisy["temperature"] - quiet["temperature"]).std()
-    # 50 mK over 18.9 pixels of 5 mm
-    assert float(noise) == pytest.approx(0.0115, abs=0.0005)
-
-
-def test_burst_lowers_the_noise_of_a_cycle_and_shows_its_spread():
-    one, many = (simulate(Recipe().vary(test={"cycles": 4}, camera={"frames_per_cycle": n})) for n in (1, 16))
-    quiet = fields_of(many, noise_K=0.0)["temperature"]
-    left = [float((fields_of(truth)["temperature"] - quiet).std()) for truth in (one, many)]
-    # 22,680 values of noise; within three seconds the table itself moves by well under 1 mK
-    assert left[0] / left[1] == pytest.approx(4.0, rel=0.05)
-    assert float(fields_of(many)["temperature_spread"].mean()) == pytest.approx(0.0115 * np.sqrt(15 / 16), rel=0.05)
-
-
-def test_fields_without_files_show_what_the_camera_adds():
-    effects = (EffectRecipe("camera_offset", amplitude_K=0.5, parameters={"at_cycle": 3}),)
-    spot = (EffectRecipe("reflected_source", amplitude_K=40.0, parameters={"follows": "constant"}),)
-    plain = fields_of(simulate(Recipe().vary(test={"cycles": 6})), noise_K=0.0)["temperature"]
-    lifted = fields_of(simulate(Recipe().vary(test={"cycles": 6}, effect=effects)), noise_K=0.0)["temperature"] - plain
-    np.testing.assert_allclose(lifted.mean(["y", "x"]), [0, 0, 0.5, 0.5, 0.5, 0.5], atol=1e-12)
-    mirrored = fields_of(simulate(Recipe().vary(test={"cycles": 6}, effect=spot)), noise_K=0.0)["temperature"] - plain
-    peak = mirrored[-1].argmax(["y", "x"])
-    # the spot's centre lies on the border of two cells in x and of two in y
-    assert abs(float(mirrored["x"][peak["x"]]) - 480.0) == 2.5
-    assert abs(float(mirrored["y"][peak["y"]]) - 60.0) == 2.5
-    # 3 % of 40 K over 97 %, warmed up to 99 %
-    assert float(mirrored[-1].max()) == pytest.approx(1.23, abs=0.05)
-
-
-def test_fields_of_a_moving_table_need_frames():
-    with pytest.raises(ValueError, match=r"fields_of needs camera\.table = 'still'; write the campaign"):
-        fields_of(simulate(Recipe().vary(test={"cycles": 2}, camera={"table": "moving"})))
 
 
 def test_truth_holds_the_cell_means_of_the_true_field(campaign, truth):

@@ -1,4 +1,4 @@
-"""A recipe says what it means or is refused with file, key, value and remedy."""
+"""A recipe is read as it is meant, or refused with file, key, value and remedy."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_tables_and_lists_reach_the_recipe(tmp_path):
             r"RECIPE\.toml: unknown key 'test\.cycels', did you mean 'cycles'\?; known here: cycles",
         ),
         ("[tset]\n", r"unknown key 'tset', did you mean 'test'\?"),
-        ("[test]\ncycles = 4.5", r"test\.cycles = 4\.5; write a int"),
+        ("[test]\ncycles = 4.5", r"test\.cycles = 4\.5; write a whole number"),
         ("[test]\nfeed_mm_per_min = 'fast'", r"test\.feed_mm_per_min = 'fast'; write a finite number"),
         ("[test]\nfeed_mm_per_min = nan", r"test\.feed_mm_per_min = nan; write a finite number"),
         ("[test]\ncycles = 0", r"test\.cycles = 0; write a number above 0"),
@@ -76,14 +76,14 @@ def test_tables_and_lists_reach_the_recipe(tmp_path):
         ("[plan]\ndirection = [-1, 1]", r"plan\.direction = \[-1\.0, 1\.0\]; write a unit vector such as \[-1, 0\]"),
         ("[plan]\norigin_mm = [1]", r"plan\.origin_mm has 1 numbers; write two, \[x, y\]"),
         ("[plan]\nfiducials_x_mm = [1]", r"fiducials_x_mm and plan\.fiducials_y_mm differ in length"),
-        ("[[source]]\nname = 'a'", r"source\[0\]\.x_mm is missing"),
+        ("[[source]]\nname = 'a'", r"source 1: x_mm is missing"),
         ("[[effect]]\nname = 'slip'", r"effect 1: name = 'slip'; known: air_index, angular_growth"),
         ("[[effect]]\nname = 'step_evnt'", r"did you mean 'step_event'\?"),
         (
             "[[effect]]\nname = 'step_event'\nat = 3",
             r"effect 1 \(step_event\): unknown key 'at'.*; known: um, at_cycle, at_part",
         ),
-        ("[[effect]]\nname = 'step_event'\nat_cycle = 'two'", r"at_cycle = 'two'; write a int such as 30"),
+        ("[[effect]]\nname = 'step_event'\nat_cycle = 'two'", r"at_cycle = 'two'; write a whole number such as 30"),
         ("[[effect]]\nname = 'thermal_lag'\nshape = 'cubic'", r"shape = 'cubic'; write one of flat, linear"),
         (
             "[[effect]]\nname = 'dead_path'\namplitude_K = 1",
@@ -91,8 +91,8 @@ def test_tables_and_lists_reach_the_recipe(tmp_path):
         ),
         ("[[effect]]\nname = 'camera_offset'\namplitude_K = 1\namplitude_um = 1", r"are both given; keep one"),
         ("[[anomaly]]\ntarget = 17", r"anomaly 1: target = 17; the test has targets 1 to 16"),
-        ("[[anomaly]]\ntarget = 3\nkind = 'odd'", r"anomaly\.kind = 'odd'; write one of structural"),
-        ("[test", r"RECIPE\.toml: is not TOML .*; mend the line"),
+        ("[[anomaly]]\ntarget = 3\nkind = 'odd'", r"anomaly 1: kind = 'odd'; write one of structural"),
+        ("[test", r"RECIPE\.toml: is not TOML .*; correct the line"),
     ],
 )
 def test_wrong_recipe_is_refused(tmp_path, text, message):
@@ -119,7 +119,7 @@ def test_unknown_packaged_recipe_names_those_there_are():
             {"test": {"period_s": 100.0}},
             r"test\.period_s = 100\.0 is shorter than one cycle, 19\d\.\d s; raise it or the feed",
         ),
-        ({"test": {"positions_mm": (0.0, 5.0, 4.0)}}, r"the target positions do not grow"),
+        ({"test": {"positions_mm": (0.0, 5.0, 4.0)}}, r"the target positions do not increase"),
         (
             {"camera": {"frame_after_s": 90.0}},
             r"camera: the last frame of a cycle is due 28\d\.\d s after its start, past its end at 252",
@@ -130,7 +130,7 @@ def test_unknown_packaged_recipe_names_those_there_are():
         ),
         (
             {"effect": (EffectRecipe("sensor_fault", amplitude_um=1.0, parameters={"kind": "stuck"}),)},
-            r"effect sensor_fault: a stuck sensor errs by what it misses; remove amplitude_um, or use kind = 'jump'",
+            r"effect sensor_fault: the error of a stuck sensor follows from the air; remove amplitude_um, or use kind = 'jump'",
         ),
         (
             {"effect": (EffectRecipe("sensor_fault"), EffectRecipe("sensor_fault"))},
@@ -152,3 +152,10 @@ def test_library_holds_every_effect_that_the_analysis_names():
     periodic_disturbance pitch_error camera_offset reflected_source laser_warm_up sensor_fault"""
     outside = {"telegraph_switching", "travelling_chirp", "local_creep", "direction_scale"}
     assert set(EFFECTS) == set(named.split()) | outside
+
+
+def test_all_faults_of_a_recipe_are_named_together(tmp_path):
+    text = "[test]\ncycles = 0\nfeed_mm_per_min = '300'\n[duty]\nkind = 'wild'"
+    with pytest.raises(RecipeError) as refused:
+        read_recipe(write(tmp_path, text))
+    assert all(key in str(refused.value) for key in ("test.cycles = 0", "test.feed_mm_per_min = '300'", "duty.kind"))

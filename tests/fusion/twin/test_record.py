@@ -1,4 +1,4 @@
-"""The twin's record: lumps that keep energy, an unseen spindle, sensors and channels that the record reader takes."""
+"""The simulated record: lumped capacities that conserve energy, a spindle without sensor, and a file that the analysis can read."""
 
 from __future__ import annotations
 
@@ -45,21 +45,21 @@ def test_switched_effect_changes_only_its_own_series(name):
     for part in plain.parts:
         np.testing.assert_array_equal(truth.table[part].values, plain.table[part].values)
     np.testing.assert_array_equal(truth.table["temperature"].values, plain.table["temperature"].values)
-    own = truth.table[name]
-    assert float(((own - own.mean("time")) ** 2).mean() ** 0.5) == pytest.approx(0.7, rel=1e-9)
+    effect = truth.table[name]
+    assert float(((effect - effect.mean("time")) ** 2).mean() ** 0.5) == pytest.approx(0.7, rel=1e-9)
     # logged with three decimals
-    np.testing.assert_allclose(truth.table["displacement"] - plain.table["displacement"], own, atol=1.1e-3)
+    np.testing.assert_allclose(truth.table["displacement"] - plain.table["displacement"], effect, atol=1.1e-3)
 
 
 def test_unseen_heat_follows_the_speed_and_no_sensor():
     effect = EffectRecipe("unseen_heat_source", 1.0, parameters={"time_constant_min": 5.0})
     table = simulate_record(BASE.vary(effect=(effect,))).table
     source = table["unseen_heat_source"].values[:, 0]
-    late = np.corrcoef(table["speed"].values[:-6], source[6:])[0, 1]
-    assert abs(late) > 0.9
-    seen = np.column_stack([table["temperature"].values, np.ones(source.size)])
-    left = source - seen @ np.linalg.lstsq(seen, source, rcond=None)[0]
-    assert left.std() > 0.3 * source.std()
+    correlation = np.corrcoef(table["speed"].values[:-6], source[6:])[0, 1]
+    assert abs(correlation) > 0.9
+    regressors = np.column_stack([table["temperature"].values, np.ones(source.size)])
+    rest = source - regressors @ np.linalg.lstsq(regressors, source, rcond=None)[0]
+    assert rest.std() > 0.3 * source.std()
 
 
 def test_record_is_read_back(tmp_path):
@@ -83,7 +83,7 @@ def test_record_is_read_back(tmp_path):
     ("tables", "message"),
     [
         ({"record": {"hours": 0.0}}, r"record\.hours = 0\.0; write a number above 0"),
-        ({"record": {"channels": 7}}, r"record\.channels = 7; there are at most 6"),
+        ({"record": {"channels": 7}}, r"record\.channels = 7; write a number up to 6"),
         ({"anomaly": (AnomalyRecipe(3),)}, r"anomaly: a record has no targets; remove the \[\[anomaly\]\] tables"),
         (
             {"effect": (EffectRecipe("dead_path"),)},
