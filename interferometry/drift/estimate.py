@@ -85,7 +85,7 @@ def estimate_drift(
         - ``profile`` (direction, target) in the stated thermal state, with u, and ``covariance`` (direction, target,
           other_direction, other_target; um2) of all its values; ``profile_relative`` to the first target of the same
           direction, with u.
-        - ``reversal`` (target): reversal value B_i, positive minus negative direction, with u.
+        - ``reversal`` (target): reversal error B_i, positive minus negative direction, with u.
         - ``scatter`` (direction, target): random standard deviation, with u and ``scatter_freedom`` (1), its degrees of
           freedom; ``scatter_position`` (target): both directions together; ``sigma``: of an ordinary reading.
         - ``drift`` (cycle, direction, target) from the stated thermal state at every reading, with u, and every component as
@@ -500,7 +500,7 @@ def _profile_variables(
 
 
 def _reversal(cells: NDArray[np.int64], profile: Array, covariance: Array, targets: int) -> tuple[Array, Array]:
-    """Return the reversal value B_i of each target and its standard uncertainty, NaN where a direction is missing."""
+    """Return the reversal error B_i of each target and its standard uncertainty, NaN where a direction is missing."""
     index = {(int(direction), int(target)): cell for cell, (direction, target) in enumerate(cells)}
     reversal, reversal_u = np.full(targets, np.nan), np.full(targets, np.nan)
     for target in range(targets):
