@@ -88,7 +88,7 @@ def air_index(
     Returns
     -------
     ndarray
-        Index (1), of the shape of the broadcast inputs.
+        Index (1), of the shape of the broadcast inputs; NaN where an input is.
 
     References
     ----------
@@ -99,8 +99,14 @@ def air_index(
     >>> f"{air_index(20.0, 1013.25, 50.0):.8f}"
     '1.00027137'
     """
-    index = np.vectorize(lambda t, p, h: ref_index.ciddor(wavelength_nm, t, p * 100.0, h), otypes=[float])
-    return np.asarray(index(air_temperature_degC, air_pressure_hPa, relative_humidity_percent))
+
+    def index(temperature_degC: float, pressure_hPa: float, humidity_percent: float) -> float:
+        if np.isnan(temperature_degC + pressure_hPa + humidity_percent):
+            return np.nan
+        return float(ref_index.ciddor(wavelength_nm, temperature_degC, pressure_hPa * 100.0, humidity_percent))
+
+    of_each = np.vectorize(index, otypes=[float])
+    return np.asarray(of_each(air_temperature_degC, air_pressure_hPa, relative_humidity_percent))
 
 
 def environment_factor(

@@ -194,3 +194,15 @@ def test_readings_without_conditions_are_refused_or_counted(campaign: tuple[xr.D
     timeless["time"].values[:] = np.datetime64("NaT")
     with pytest.raises(CompensationError, match="no reading has a time"):
         compensate(timeless, environment)
+
+
+def test_a_missing_reading_stays_missing_and_leaves_the_others_alone(campaign: tuple[xr.Dataset, xr.Dataset]) -> None:
+    deviations, environment = campaign
+    complete = compensate(deviations, environment, applied_factor_um=(0.31639, 0.31639))
+    lost = deviations.copy(deep=True)
+    lost["deviation"].values[3, 0, 5] = np.nan
+    lost["time"].values[3, 0, 5] = np.datetime64("NaT")
+    redone = compensate(lost, environment, applied_factor_um=(0.31639, 0.31639))
+    assert np.argwhere(np.isnan(redone["deviation"].values)).tolist() == [[3, 0, 5]]
+    kept = np.isfinite(redone["deviation"].values)
+    np.testing.assert_array_equal(redone["deviation"].values[kept], complete["deviation"].values[kept])
