@@ -193,15 +193,15 @@ def _drop_misplaced(path: Path, readings: list[_Reading], left_out: list[Rejecte
         by_target[reading.target].append(reading)
     kept: list[_Reading] = []
     for target, group in sorted(by_target.items()):
-        usual = float(np.median([reading.position for reading in group]))
-        off = [reading for reading in group if abs(reading.position - usual) > POSITION_TOLERANCE_MM]
+        typical = float(np.median([reading.position for reading in group]))
+        off = [reading for reading in group if abs(reading.position - typical) > POSITION_TOLERANCE_MM]
         if len(off) > max(1, 0.1 * len(group)):
             raise LaserFormatError(
-                f"{path}: target {target} stands at {off[0].position} mm on line {off[0].line} but at {usual} mm elsewhere "
+                f"{path}: target {target} stands at {off[0].position} mm on line {off[0].line} but at {typical} mm elsewhere "
                 f"({len(off)} of {len(group)} readings disagree); position_mm is the programmed position, the same in every cycle"
             )
         for reading in off:
-            reason = f"target {target} stands at {usual} mm elsewhere"
+            reason = f"target {target} stands at {typical} mm elsewhere"
             left_out.append(RejectedLine(path.name, reading.line, str(reading.position), reason))
         kept += [reading for reading in group if reading not in off]
     positions = {target: group[0].position for target, group in by_target.items()}
@@ -222,11 +222,11 @@ def _drop_wrong_times(path: Path, readings: list[_Reading], left_out: list[Rejec
     steps = np.diff([centres[number] for number in numbers])
     if np.any(steps <= 0):
         return readings
-    usual = float(np.median(steps))
+    typical = float(np.median(steps))
     bounds: dict[int, tuple[float, float]] = {}
     for i, number in enumerate(numbers):
-        early = centres[numbers[i - 1]] if i else centres[number] - usual
-        late = centres[numbers[i + 1]] if i + 1 < len(numbers) else centres[number] + usual
+        early = centres[numbers[i - 1]] if i else centres[number] - typical
+        late = centres[numbers[i + 1]] if i + 1 < len(numbers) else centres[number] + typical
         bounds[number] = (early, late)
     kept = []
     for reading in readings:

@@ -44,9 +44,9 @@ VECTORS = [
 def test_index_of_air_meets_the_published_vectors(
     temperature: float, pressure: float, humidity: float, wavelength: float, index: float
 ) -> None:
-    found = air_index(temperature, pressure * 10, humidity, wavelength_nm=wavelength)
+    computed = air_index(temperature, pressure * 10, humidity, wavelength_nm=wavelength)
     # The vectors are printed to 1e-9.
-    assert float(found) == pytest.approx(index, abs=0.6e-9)
+    assert float(computed) == pytest.approx(index, abs=0.6e-9)
 
 
 def test_sensitivities_of_the_index() -> None:

@@ -11,8 +11,6 @@ import pytest
 import xarray as xr
 
 from interferometry.deviations import build_deviations
-from interferometry.io.delimited import LaserFormatError
-from interferometry.io.ecmc import read_ecmc_log
 from interferometry.io.readers import read_deviations
 from interferometry.iso230 import Iso230Budget, budget_table, evaluate_iso230, evaluate_windows
 from tests.interferometry.simulated_campaigns import simulate
@@ -225,33 +223,3 @@ def test_temperature_and_expansion_enter_as_the_product_rule_says() -> None:
 def test_a_negative_uncertainty_is_refused() -> None:
     with pytest.raises(ValueError, match="device_ppm=-1 is negative"):
         Iso230Budget(device_ppm=-1)
-
-
-def log(folder: Path, old: str = "", new: str = "") -> Path:
-    lines = ["UNIT=mm", "CYCLES=2", "POSITIONS=2"]
-    lines += [f"TGT_DATA[{t}]={10 * t}" for t in (1, 2)]
-    lines += [f"REF_DATA_{d}[{t},{c}]={10 * t + c / 1000}" for d in ("FWD", "BWD") for t in (1, 2) for c in (1, 2)]
-    text = "\n".join(lines)
-    assert old in text
-    path = folder / "log.dat"
-    path.write_text(text.replace(old, new, 1), encoding="utf-8")
-    return path
-
-
-def test_logs_of_assignments_are_read(tmp_path: Path) -> None:
-    test = read_deviations(log(tmp_path))
-    assert test["deviation"].values[:, 0, :] == pytest.approx(np.array([[1.0, 1.0], [2.0, 2.0]]))
-    assert test["time"].attrs["origin"] == "none"
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("UNIT=mm", "UNIT=inch", "UNIT=inch is not known; use one of mm, um, m"),
-        ("CYCLES=2", "CYCLES=5", "CYCLES=5, but 2 were found"),
-        ("TGT_DATA[2]", "TGT_DATA[3]", r"TGT_DATA gives targets \[1, 3\]"),
-    ],
-)
-def test_logs_that_break_their_promises_are_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
-    with pytest.raises(LaserFormatError, match=message):
-        read_ecmc_log(log(tmp_path, old, new))

@@ -40,12 +40,12 @@ def test_average_drift_agrees_with_dense_conditioning(order: int, rng: np.random
     average, covariance, with_drift = average_drift(system, weights, y)
 
     prior = dense_drift_covariance(seconds, order, ratios)
-    seen = np.einsum("kc,ckbj->kbj", loadings, prior)
-    total = np.einsum("kbj,jb->kj", seen, loadings) + np.diag(variance)
-    seen, total = seen[observed], total[np.ix_(observed, observed)]
-    gain = np.linalg.solve(total, seen.reshape(seen.shape[0], -1))
+    with_readings = np.einsum("kc,ckbj->kbj", loadings, prior)
+    total = np.einsum("kbj,jb->kj", with_readings, loadings) + np.diag(variance)
+    with_readings, total = with_readings[observed], total[np.ix_(observed, observed)]
+    gain = np.linalg.solve(total, with_readings.reshape(with_readings.shape[0], -1))
     mean = np.einsum("kp,kbj->bjp", y[observed], gain.reshape(-1, 2, n))
-    posterior = prior - np.einsum("kai,kbj->aibj", seen, gain.reshape(-1, 2, n))
+    posterior = prior - np.einsum("kai,kbj->aibj", with_readings, gain.reshape(-1, 2, n))
     np.testing.assert_allclose(average, np.einsum("j,bjp->bp", weights, mean), atol=1e-9)
     np.testing.assert_allclose(covariance, np.einsum("i,aibj,j->ab", weights, posterior, weights), atol=1e-9)
     np.testing.assert_allclose(with_drift, np.einsum("aibj,j->iab", posterior, weights), atol=1e-9)
