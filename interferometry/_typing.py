@@ -1,4 +1,4 @@
-"""Types that annotations share."""
+"""Array types shared by the annotations."""
 
 from __future__ import annotations
 

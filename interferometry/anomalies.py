@@ -1,19 +1,20 @@
-"""Positions that do not behave like the others: excess scatter, slow excess, step, periodic motion.
+"""Anomalous positions: excess scatter, slow local motion, a step, or a periodic motion of one position.
 
-Everything is tested on the random part of the joint estimate, which belongs to one position and direction; the
-differences of the paper belong to two. Null distributions come from permutations of the readings themselves, so that
-heavy tails do not raise false alarms, and every p-value is corrected for all positions, directions and kinds looked at.
+Everything is tested on the random part of the joint estimate, which belongs to one position and direction; differences of neighbouring
+positions would belong to two. Null distributions come from permutations of the readings themselves, so that heavy tails do not raise
+false alarms, and every p-value is family-wise: corrected for all positions, directions and kinds of anomaly.
 
-Two questions are kept apart: "do the positions scatter unequally?" (permutation, robust against tails) and "does one
-stand out from the natural spread of the others?" (generalised extreme Studentized deviate, Rosner 1983, Technometrics
-25, 165). A position with excess scatter is an anomaly of the machine only if both say so.
+Two questions about scatter are kept apart: "do the positions scatter unequally?" (permutation test, robust against tails) and "does one
+stand out from the natural spread of the others?" (generalised extreme Studentized deviate test). A position with excess scatter is an
+anomaly of the machine only if both say so.
 
-Which of a few numbers stand out from the natural spread of the others.
+In this order: the public test; excess scatter; motions over the cycles; the generalised extreme Studentized deviate test.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,41 +24,47 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from interferometry._typing import Array
+from interferometry.drift.gls import von_neumann_p_value
 from interferometry.errors import InterferometryError
 
 #: Share of the error probability given to each kind of anomaly (Bonferroni weights; they sum to one).
 WEIGHTS = {"scatter": 0.7, "slow": 0.1, "step": 0.1, "periodic": 0.1}
-#: Standardised readings beyond this count as if they lay there (efficiency 0.99 under a normal distribution).
+#: Standardised readings are winsorised at this many standard deviations (efficiency 0.99 under a normal distribution).
 WINSOR = 3.0
+#: Cycles over which sums are taken for slow motion, and which a step needs before and after it.
 BLOCK_CYCLES = 5
+#: Shortest test and shortest series that are examined for motion over the cycles.
 SHORTEST_TEST_CYCLES = 15
 MOST_ANOMALIES = 4
+#: Level at which the remainder of a step is still called slow.
+SLOW_REMAINDER_LEVEL = 0.01
 
 
 @dataclass(frozen=True)
 class Anomaly:
-    """One position that does not behave like the others.
+    """One position that behaves unlike the others.
 
     Attributes
     ----------
     target : int
+        Number of the position.
     direction : str
         "positive", "negative" or "both".
     kind : str
         "scatter", "slow", "step" or "periodic".
     p_value : float
-        Corrected for all positions, directions and kinds (family-wise).
+        Family-wise: corrected for all positions, directions and kinds.
     scatter_um : float
-        Random standard deviation of the position and direction.
+        Random standard deviation of the position and direction, um.
     extra_um : float
-        Standard deviation beyond that of the other positions; for a step its height, for a period its amplitude.
+        Standard deviation beyond that of the other positions, um; the height of a step, the amplitude of a period.
     stands_out : bool
-        Whether it is more than the natural spread of scatter between positions (generalised ESD, 5 %). Always true of
-        the other kinds, which no spread of scatter can produce.
+        Whether scatter exceeds its natural spread between positions (generalised extreme Studentized deviate test, 5 %). Always true
+        of the other kinds, which no spread of scatter can produce.
     at_cycle : int or None
-        Of a step: the first cycle after it.
+        Number of the first cycle after a step; None for other kinds.
     period_s : float or None
-        Of a periodic motion.
+        Period of a periodic motion, s; None for other kinds.
     """
 
     target: int
@@ -74,102 +81,114 @@ class Anomaly:
 def detect_anomalies(
     estimated: xr.Dataset, deviations: xr.Dataset, *, level: float = 0.05, permutations: int = 399, seed: int = 0
 ) -> list[Anomaly]:
-    """Find anomalous positions.
+    """Find positions that behave unlike the others.
 
     Parameters
     ----------
     estimated : xarray.Dataset
-        What `drift.estimate_drift` returns.
+        What `estimate_drift` returns.
     deviations : xarray.Dataset
-        The deviations it was estimated from.
+        The deviations that it was estimated from (keeps ``contract.DEVIATIONS``).
     level : float
         Probability of any false anomaly in a whole test.
     permutations : int
+        Number of permutations; at least 199 for a level of 0.05.
     seed : int
-        Of the permutations, so that a result is repeatable.
+        Of the random generator, so that a result is repeatable.
 
     Returns
     -------
     list of Anomaly
-        The most significant first; at most one per position and kind.
+        The most significant first; at most one per position and kind. Motions over the cycles are sought in tests of at least
+        15 cycles.
 
     Raises
     ------
     InterferometryError
         ``permutations`` are too few to reach ``level`` in the kind with the smallest weight.
+
+    Notes
+    -----
+    docs/method/anomalies.md. Scatter: readings are permuted between the positions of a pass, the largest excess of a position is compared
+    with its permutation distribution, step down. Slow motion and steps: cycles are permuted, all positions alike (Westfall and Young 1993,
+    *Resampling-based multiple testing*). Periods: largest normalised power over all frequencies and series (Scargle 1982, Astrophys. J.
+    263, 835), Bonferroni. Standing out: Rosner (1983), Technometrics 25, 165.
+
+    Examples
+    --------
+    Sixteen positions, of which the third scatters three times as much as the others:
+
+    >>> import numpy as np
+    >>> from interferometry.deviations import build_deviations
+    >>> from interferometry.drift.estimate import estimate_drift
+    >>> rng = np.random.default_rng(0)
+    >>> deviation = rng.normal(0, 0.3, (14, 2, 16))
+    >>> deviation[:, :, 2] *= 3
+    >>> time = np.datetime64("2026-03-09T06:30") + 8 * np.arange(deviation.size).reshape(deviation.shape) * np.timedelta64(1, "s")
+    >>> test = build_deviations(range(1, 15), range(1, 17), 20.0 * np.arange(16), deviation, time)
+    >>> [(a.target, a.direction, a.kind, a.stands_out) for a in detect_anomalies(estimate_drift(test), test)]
+    [(3, 'both', 'scatter', True)]
     """
     needed = int(np.ceil(1.0 / (level * min(WEIGHTS.values()))))
     if permutations + 1 < needed:
         raise InterferometryError(f"permutations={permutations} cannot reach level={level}; use at least {needed - 1}")
     rng = np.random.default_rng(seed)
-    found = _scatter_anomalies(estimated, level, permutations, rng)
+    anomalies = _scatter_anomalies(estimated, level, permutations, rng)
     if estimated.sizes["cycle"] >= SHORTEST_TEST_CYCLES:
-        found += _series_anomalies(estimated, deviations, level, permutations, rng)
-    return sorted(found, key=lambda one: one.p_value)
-
-
-def detectable_extra(estimated: xr.Dataset, *, level: float = 0.05, power: float = 0.8) -> float:
-    """Return the extra standard deviation (um) at one position that this test would find with the given power."""
-    freedom = float(np.nanmedian(np.nansum(estimated["scatter_freedom"].values, axis=0)))
-    targets = estimated.sizes["target"]
-    needed = stats.norm.isf(level * WEIGHTS["scatter"] / targets) + stats.norm.ppf(power)
-    ratio = np.exp(2 * needed / np.sqrt(2 * freedom))
-    return float(estimated["sigma"]) * float(np.sqrt(ratio - 1))
+        anomalies += _series_anomalies(estimated, deviations, level, permutations, rng)
+    return sorted(anomalies, key=lambda anomaly: anomaly.p_value)
 
 
 def _scatter_anomalies(
     estimated: xr.Dataset, level: float, permutations: int, rng: np.random.Generator
 ) -> list[Anomaly]:
-    """Excess scatter, step-down: a position that is found leaves the pool before the others are tested again."""
+    """Return positions with excess scatter, step down: each leaves the pool before the others are tested again."""
     z = estimated["standardised"].values
     scatter = estimated["scatter_position"].values
     usable = np.flatnonzero(np.isfinite(scatter) & (scatter > 0))
     stands_out = np.zeros(scatter.size, dtype=bool)
     stands_out[usable] = generalised_esd(np.log(scatter[usable]), most=MOST_ANOMALIES, high_only=True)
-    found: list[Anomaly] = []
-    remaining = usable
-    while remaining.size > 3 and len(found) < MOST_ANOMALIES:
-        observed, largest = _scatter_test(z[:, :, remaining], permutations, rng)
-        at = int(np.argmax(observed))
-        p = float(1 + np.count_nonzero(largest >= observed[at])) / (permutations + 1)
+    anomalies: list[Anomaly] = []
+    pool = usable
+    while pool.size > 3 and len(anomalies) < MOST_ANOMALIES:
+        excess, largest = _scatter_test(z[:, :, pool], permutations, rng)
+        worst = int(np.argmax(excess))
+        p = float(1 + np.count_nonzero(largest >= excess[worst])) / (permutations + 1)
         if p > level * WEIGHTS["scatter"]:
             break
-        target = int(remaining[at])
-        others = np.delete(remaining, at)
+        target = int(pool[worst])
+        others = np.delete(pool, worst)
         direction = _scatter_direction(estimated, target, others)
-        own = _own_scatter(estimated, target, direction)
-        usual = float(np.median(scatter[others]))
-        found.append(
+        scatter_um = _scatter_of(estimated, target, direction)
+        typical = float(np.median(scatter[others]))
+        anomalies.append(
             Anomaly(
                 target=int(estimated["target"].values[target]),
                 direction=direction,
                 kind="scatter",
                 p_value=min(1.0, p / WEIGHTS["scatter"]),
-                scatter_um=own,
-                extra_um=float(np.sqrt(max(own**2 - usual**2, 0.0))),
-                stands_out=bool(stands_out[target] and scatter[target] > usual),
+                scatter_um=scatter_um,
+                extra_um=float(np.sqrt(max(scatter_um**2 - typical**2, 0.0))),
+                stands_out=bool(stands_out[target] and scatter[target] > typical),
             )
         )
-        remaining = others
-    return found
+        pool = others
+    return anomalies
 
 
 def _scatter_test(z: Array, permutations: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return each target's excess, and the largest one of each permutation of targets within a pass.
+    """Return the excess of each target (target,), and the largest one of each permutation of targets within a pass (permutation,).
 
-    Parameters
-    ----------
-    z : (cycle, direction, target) ndarray
-        Standardised readings, NaN where missing.
+    z (cycle, direction, target) holds standardised readings, NaN where missing.
     """
     present = np.isfinite(z)
     cycle, direction, target = np.nonzero(present)
     squares = np.minimum(z[present] ** 2, WINSOR**2)
     centred = (squares - squares.mean()) / squares.std()
     weight = 1.0 / np.sqrt(np.maximum(np.bincount(target, minlength=z.shape[2]), 1))
-    observed = np.bincount(target, centred, minlength=z.shape[2]) * weight
+    excess = np.bincount(target, centred, minlength=z.shape[2]) * weight
     starts = np.flatnonzero(np.diff(cycle * z.shape[1] + direction, prepend=-1))
-    return observed, _largest_sums(centred, target, np.append(starts, target.size), weight, permutations, rng)
+    return excess, _largest_sums(centred, target, np.append(starts, target.size), weight, permutations, rng)
 
 
 @njit(cache=True)
@@ -181,38 +200,38 @@ def _largest_sums(
     permutations: int,
     rng: np.random.Generator,
 ) -> Array:
-    """Shuffle values within each pass (Fisher and Yates) and return the largest weighted sum of a target, per permutation."""
+    """Shuffle values within each pass (Fisher and Yates 1938) and return the largest weighted sum of a target, (permutation,)."""
     largest = np.empty(permutations)
     shuffled = values.copy()
     for k in range(permutations):
         sums = np.zeros(weight.size)
-        for one in range(starts.size - 1):
-            for at in range(starts[one + 1] - 1, starts[one], -1):
-                other = rng.integers(starts[one], at + 1)
-                shuffled[at], shuffled[other] = shuffled[other], shuffled[at]
-        for at in range(values.size):
-            sums[target[at]] += shuffled[at]
+        for j in range(starts.size - 1):
+            for i in range(starts[j + 1] - 1, starts[j], -1):
+                other = rng.integers(starts[j], i + 1)
+                shuffled[i], shuffled[other] = shuffled[other], shuffled[i]
+        for i in range(values.size):
+            sums[target[i]] += shuffled[i]
         largest[k] = (sums * weight).max()
     return largest
 
 
 def _scatter_direction(estimated: xr.Dataset, target: int, others: NDArray[np.int64]) -> str:
-    """Return the direction of the excess: both, unless one has none and the other differs from it."""
+    """Return the direction of the excess: "both", unless one direction has none and the other differs from it."""
     variance = estimated["scatter"].values[:, target] ** 2
     freedom = estimated["scatter_freedom"].values[:, target]
     names = estimated["direction"].values
     if variance.size < 2 or not np.isfinite(variance).all():
         return str(names[int(np.isfinite(variance).argmax())])
-    usual = np.nanmedian(estimated["scatter"].values[:, others] ** 2, axis=1)
-    weak = int(np.argmin(variance / usual))
+    typical = np.nanmedian(estimated["scatter"].values[:, others] ** 2, axis=1)
+    weak = int(np.argmin(variance / typical))
     strong = 1 - weak
-    alone = stats.chi2.sf(variance[weak] / usual[weak] * freedom[weak], freedom[weak]) > 0.05
-    ratio = (variance[strong] / usual[strong]) / (variance[weak] / usual[weak])
-    differs = stats.f.sf(ratio, freedom[strong], freedom[weak]) < 0.025
-    return str(names[strong]) if alone and differs else "both"
+    weak_is_ordinary = stats.chi2.sf(variance[weak] / typical[weak] * freedom[weak], freedom[weak]) > 0.05
+    ratio = (variance[strong] / typical[strong]) / (variance[weak] / typical[weak])
+    directions_differ = stats.f.sf(ratio, freedom[strong], freedom[weak]) < 0.025
+    return str(names[strong]) if weak_is_ordinary and directions_differ else "both"
 
 
-def _own_scatter(estimated: xr.Dataset, target: int, direction: str) -> float:
+def _scatter_of(estimated: xr.Dataset, target: int, direction: str) -> float:
     if direction == "both":
         return float(estimated["scatter_position"].values[target])
     return float(estimated["scatter"].sel(direction=direction).values[target])
@@ -220,7 +239,7 @@ def _own_scatter(estimated: xr.Dataset, target: int, direction: str) -> float:
 
 @dataclass(frozen=True)
 class _Series:
-    """Standardised residuals per cycle of one position: one direction, or both together."""
+    """Which series of standardised residuals per cycle: target index, and "positive", "negative" or "both"."""
 
     target: int
     direction: str
@@ -229,43 +248,47 @@ class _Series:
 def _series_anomalies(
     estimated: xr.Dataset, deviations: xr.Dataset, level: float, permutations: int, rng: np.random.Generator
 ) -> list[Anomaly]:
-    """Slow excess, steps and periods; for the first two, cycles are permuted, all positions alike."""
+    """Return slow motions, steps and periods; for the first two, cycles are permuted, all positions alike."""
     labels, values = _series(estimated)
     if not labels:
         return []
-    n = values.shape[1]
-    seconds = _cycle_seconds(deviations)
-    orders = np.array([rng.permutation(n) for _ in range(permutations)])
-    found: list[Anomaly] = []
-    periodogram = _Periodogram(seconds)
-    p_values = {"periodic": periodogram.p_values(values)}
-    strength = {"periodic": periodogram.power(values).max(axis=-1)}
-    for kind, statistic in (("slow", _slow), ("step", _step)):
-        observed = statistic(values)
-        shuffled = np.concatenate(
-            [statistic(values[:, order].transpose(1, 0, 2)) for order in np.array_split(orders, 10)]
-        )
-        centre, spread = shuffled.mean(axis=0), shuffled.std(axis=0)
-        largest = ((shuffled - centre) / spread).max(axis=1)
-        strength[kind] = (observed - centre) / spread
-        reached = np.count_nonzero(largest[:, None] >= strength[kind], axis=0)
-        p_values[kind] = (1 + reached) / (permutations + 1)
+    orders = np.array([rng.permutation(values.shape[1]) for _ in range(permutations)])
+    periodogram = _Periodogram(_cycle_seconds(deviations))
+    tests = {"periodic": (periodogram.power(values).max(axis=-1), periodogram.p_values(values))}
+    for kind, statistic in (("slow", _slowness), ("step", _largest_step)):
+        tests[kind] = _permutation_test(values, statistic, orders)
     significant: dict[str, dict[int, tuple[float, int]]] = {}
-    for kind, p in p_values.items():
+    for kind, (strength, p) in tests.items():
         best: dict[int, tuple[float, int]] = {}
-        for at in np.argsort(-strength[kind]):
-            target = labels[at].target
-            if p[at] <= level * WEIGHTS[kind] and target not in best:
-                best[target] = (float(p[at]) / WEIGHTS[kind], int(at))
+        for row in np.argsort(-strength):
+            target = labels[row].target
+            if p[row] <= level * WEIGHTS[kind] and target not in best:
+                best[target] = (float(p[row]) / WEIGHTS[kind], int(row))
         significant[kind] = best
-    for kind, target in _settle(significant, values):
-        p_value, at = significant[kind][target]
-        found.append(_describe_series(estimated, kind, labels[at], values[at], min(p_value, 1.0), seconds))
-    return found
+    anomalies = []
+    for kind, target in _one_kind_per_target(significant, values):
+        p_value, row = significant[kind][target]
+        anomalies.append(_describe_series(estimated, kind, labels[row], values[row], min(p_value, 1.0), periodogram))
+    return anomalies
+
+
+def _permutation_test(
+    values: Array, statistic: Callable[[Array], Array], orders: NDArray[np.int64]
+) -> tuple[Array, Array]:
+    """Return each series' standardised statistic and its p-value against the largest one of each permutation, (series,)."""
+    shuffled = np.concatenate([statistic(values[:, order].transpose(1, 0, 2)) for order in np.array_split(orders, 10)])
+    centre, spread = shuffled.mean(axis=0), shuffled.std(axis=0)
+    largest = ((shuffled - centre) / spread).max(axis=1)
+    strength = (statistic(values) - centre) / spread
+    reached = np.count_nonzero(largest[:, None] >= strength, axis=0)
+    return strength, (1 + reached) / (len(orders) + 1)
 
 
 def _series(estimated: xr.Dataset) -> tuple[list[_Series], Array]:
-    """Return standardised series per target for each direction and for both, gaps filled with 0, and their labels."""
+    """Return the series of each target, per direction and for both together, and their labels.
+
+    Values (series, cycle) are standardised residuals, winsorised and centred, 0 where missing.
+    """
     z = np.clip(estimated["standardised"].values, -WINSOR, WINSOR)
     names = [str(name) for name in estimated["direction"].values]
     labels, rows = [], []
@@ -282,29 +305,35 @@ def _series(estimated: xr.Dataset) -> tuple[list[_Series], Array]:
 
 
 def _cycle_seconds(deviations: xr.Dataset) -> Array:
-    """Return the middle of each cycle in seconds since the first reading; a cycle without readings lies between its neighbours."""
+    """Return the middle of each cycle, s since the first reading; a cycle without readings lies between its neighbours."""
     time = deviations["time"].values.astype("datetime64[ns]")
-    first = time[~np.isnat(time)].min()
-    known = ~np.isnat(time)
-    measured = known.any(axis=(1, 2))
-    seconds = np.where(known, (time - first).astype("f8") * 1e-9, 0.0)
-    middles = seconds.sum(axis=(1, 2))[measured] / known.sum(axis=(1, 2))[measured]
+    has_time = ~np.isnat(time)
+    first = time[has_time].min()
+    measured = has_time.any(axis=(1, 2))
+    seconds = np.where(has_time, (time - first).astype("f8") * 1e-9, 0.0)
+    middles = seconds.sum(axis=(1, 2))[measured] / has_time.sum(axis=(1, 2))[measured]
     return np.interp(np.arange(measured.size), np.flatnonzero(measured), middles)
 
 
-def _slow(values: Array) -> Array:
+def _slowness(values: Array) -> Array:
     """Energy of sums over blocks of cycles (..., series, cycle) -> (..., series): large where neighbours in time agree."""
     n = values.shape[-1] // BLOCK_CYCLES * BLOCK_CYCLES
     blocks = values[..., :n].reshape(*values.shape[:-1], -1, BLOCK_CYCLES).sum(axis=-1)
     return (blocks**2).sum(axis=-1) / (values**2).sum(axis=-1)
 
 
-def _step(values: Array) -> Array:
+def _largest_step(values: Array) -> Array:
     """Largest standardised difference of means before and after any cycle (..., series, cycle) -> (..., series)."""
     return np.abs(_step_profile(values)).max(axis=-1)
 
 
+def _step_index(row: Array) -> int:
+    """Index of the first cycle after the largest step of a series (cycle,)."""
+    return int(np.argmax(np.abs(_step_profile(row)))) + BLOCK_CYCLES
+
+
 def _step_profile(values: Array) -> Array:
+    """Standardised difference of means before and after each cycle that leaves a block on either side."""
     n = values.shape[-1]
     before = np.arange(BLOCK_CYCLES, n - BLOCK_CYCLES + 1)
     total = values.sum(axis=-1, keepdims=True)
@@ -314,7 +343,7 @@ def _step_profile(values: Array) -> Array:
 
 
 class _Periodogram:
-    """Largest normalised power over periods from three cycles to a third of the test, at the cycles' own times."""
+    """Normalised power of series (series, cycle) at periods from three cycles to a third of the test, at the cycles' own times (s)."""
 
     def __init__(self, seconds: Array) -> None:
         length = float(seconds[-1] - seconds[0])
@@ -337,42 +366,35 @@ class _Periodogram:
         return np.minimum(1.0, np.exp(-largest / 2) * self.frequency.size * values.shape[0])
 
 
-def _settle(significant: dict[str, dict[int, tuple[float, int]]], values: Array) -> list[tuple[str, int]]:
-    """Give each position one name: a step that leaves nothing slow behind is a step, a period is not also slow."""
-    settled = []
+def _one_kind_per_target(significant: dict[str, dict[int, tuple[float, int]]], values: Array) -> list[tuple[str, int]]:
+    """Give each target one kind: a step whose remainder is not slow is a step, a period is not also slow."""
+    chosen = []
     for target in sorted(set(itertools.chain.from_iterable(significant.values()))):
-        kinds = {kind: found[target] for kind, found in significant.items() if target in found}
+        kinds = {kind: by_target[target] for kind, by_target in significant.items() if target in by_target}
         if "step" in kinds:
             row = values[kinds["step"][1]]
-            at = int(np.argmax(np.abs(_step_profile(row)))) + BLOCK_CYCLES
-            left = np.concatenate([row[:at] - row[:at].mean(), row[at:] - row[at:].mean()])
-            settled.append(("slow" if "slow" in kinds and _is_slow(left) else "step", target))
+            step = _step_index(row)
+            remainder = np.concatenate([row[:step] - row[:step].mean(), row[step:] - row[step:].mean()])
+            is_slow = von_neumann_p_value(remainder) < SLOW_REMAINDER_LEVEL
+            chosen.append(("slow" if "slow" in kinds and is_slow else "step", target))
         elif "periodic" in kinds and ("slow" not in kinds or kinds["periodic"][0] <= kinds["slow"][0]):
-            settled.append(("periodic", target))
+            chosen.append(("periodic", target))
         else:
-            settled.append(("slow", target))
-    return settled
-
-
-def _is_slow(row: Array) -> bool:
-    """Tell whether a series is still slow, by the von Neumann ratio at the 1 % level."""
-    n = row.size
-    ratio = float((np.diff(row) ** 2).sum() / (row**2).sum())
-    return bool(stats.norm.cdf((ratio - 2.0) / np.sqrt(4.0 * (n - 2.0) / (n**2 - 1.0))) < 0.01)
+            chosen.append(("slow", target))
+    return chosen
 
 
 def _describe_series(
-    estimated: xr.Dataset, kind: str, label: _Series, row: Array, p_value: float, seconds: Array
+    estimated: xr.Dataset, kind: str, label: _Series, row: Array, p_value: float, periodogram: _Periodogram
 ) -> Anomaly:
-    scatter = _own_scatter(estimated, label.target, label.direction)
+    scatter = _scatter_of(estimated, label.target, label.direction)
     scale = scatter / (np.sqrt(2) if label.direction == "both" else 1.0)
     at_cycle, period_s = None, None
     if kind == "step":
-        at = int(np.argmax(np.abs(_step_profile(row)))) + BLOCK_CYCLES
-        extra = abs(float(row[at:].mean() - row[:at].mean())) * scale
-        at_cycle = int(estimated["cycle"].values[at])
+        step = _step_index(row)
+        extra = abs(float(row[step:].mean() - row[:step].mean())) * scale
+        at_cycle = int(estimated["cycle"].values[step])
     elif kind == "periodic":
-        periodogram = _Periodogram(seconds)
         power = periodogram.power(row)
         period_s = float(1 / periodogram.frequency[int(np.argmax(power))])
         extra = float(np.sqrt(2 * power.max() * row.var() / row.size)) * scale
@@ -394,39 +416,45 @@ def _describe_series(
 
 
 def generalised_esd(values: Array, *, most: int, level: float = 0.05, high_only: bool = False) -> NDArray[np.bool_]:
-    """Mark outliers by the generalised extreme Studentized deviate test (Rosner 1983).
+    """Mark outliers by the generalised extreme Studentized deviate test.
 
     Parameters
     ----------
     values : (n,) ndarray
+        In any unit; approximately normal but for the outliers.
     most : int
         Largest number of outliers looked for.
     level : float
+        Probability of any false outlier.
     high_only : bool
         Look for values that are too large only, and give the whole error probability to that side.
 
     Returns
     -------
-    (n,) bool ndarray
+    (n,) ndarray of bool
+        True for an outlier.
+
+    References
+    ----------
+    Rosner (1983), Percentage points for a generalized ESD many-outlier procedure, Technometrics 25, 165.
     """
     n = values.size
-    left = np.ones(n, dtype=bool)
-    order: list[int] = []
+    remaining = np.ones(n, dtype=bool)
+    removed: list[int] = []
     outliers = 0
     for i in range(1, min(most, n - 2) + 1):
-        centre, spread = values[left].mean(), values[left].std(ddof=1)
+        centre, spread = values[remaining].mean(), values[remaining].std(ddof=1)
         if spread == 0:
             break
-        deviation = np.where(
-            left, (values - centre) / spread if high_only else np.abs(values - centre) / spread, -np.inf
-        )
-        at = int(np.argmax(deviation))
+        deviate = (values - centre) / spread if high_only else np.abs(values - centre) / spread
+        deviate = np.where(remaining, deviate, -np.inf)
+        extreme = int(np.argmax(deviate))
         p = 1 - level / ((1 if high_only else 2) * (n - i + 1))
         t = stats.t.ppf(p, n - i - 1)
-        if deviation[at] > (n - i) * t / np.sqrt((n - i - 1 + t**2) * (n - i + 1)):
+        if deviate[extreme] > (n - i) * t / np.sqrt((n - i - 1 + t**2) * (n - i + 1)):
             outliers = i
-        order.append(at)
-        left[at] = False
+        removed.append(extreme)
+        remaining[extreme] = False
     marked = np.zeros(n, dtype=bool)
-    marked[order[:outliers]] = True
+    marked[removed[:outliers]] = True
     return marked

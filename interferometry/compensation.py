@@ -1,4 +1,4 @@
-"""Index of air, dead path and material expansion: what a laser's compensation did, undone and done again.
+"""Compensation of laser readings for air, dead path and material expansion: the applied one reversed, and done again.
 
 A linear interferometer counts half wavelengths. Its display multiplies them by the environment factor
 ``lambda_vac / (2 n (1 + alpha (T - 20 degC)))``: the wavelength in air of index n, and the scale of a material of
@@ -32,16 +32,27 @@ class CompensationError(InterferometryError):
 
 @dataclass(frozen=True)
 class SensorUncertainty:
-    """Standard uncertainties of what the compensation uses (defaults: an XL-80 with weather station, half its k = 2 figures).
+    """Standard uncertainties (k = 1) of the inputs of the compensation.
+
+    The defaults are those of an XL-80 with weather station, half its k = 2 specification.
 
     Attributes
     ----------
     air_temperature_K, air_pressure_hPa, relative_humidity_percent : float
+        Of the logged air: K, hPa, % relative humidity.
     material_temperature_K : float
+        Of the probe, or of the temperature that replaces it, K.
     expansion_coefficient_ppm_per_K : float
+        Of the material, ppm/K.
     formula_ppm : float
-        Of the equation for the index itself.
+        Of the equation for the index itself, ppm.
     dead_path_mm : float
+        Of the length of the dead path, mm.
+
+    Raises
+    ------
+    CompensationError
+        One of them is negative.
     """
 
     air_temperature_K: float = 0.1
@@ -53,9 +64,9 @@ class SensorUncertainty:
     dead_path_mm: float = 2.0
 
     def __post_init__(self) -> None:
-        for one in fields(self):
-            if getattr(self, one.name) < 0:
-                raise CompensationError(f"{one.name}={getattr(self, one.name)} is negative; give 0 or more")
+        for field in fields(self):
+            if getattr(self, field.name) < 0:
+                raise CompensationError(f"{field.name}={getattr(self, field.name)} is negative; give 0 or more")
 
 
 def air_index(
@@ -70,16 +81,32 @@ def air_index(
     Parameters
     ----------
     air_temperature_degC, air_pressure_hPa, relative_humidity_percent : array_like
-        Broadcast against each other.
+        Air temperature, degC; pressure, hPa; relative humidity, %. Broadcast against each other.
     wavelength_nm : float
-        In vacuum, 300 .. 1700.
+        Vacuum wavelength, nm, 300 .. 1700.
 
-    Notes
-    -----
+    Returns
+    -------
+    ndarray
+        Index (1), of the shape of the broadcast inputs; NaN where an input is.
+
+    References
+    ----------
     Ciddor (1996), Applied Optics 35, 1566, in the form of the NIST Engineering Metrology Toolbox, with 450 ppm CO2.
+
+    Examples
+    --------
+    >>> f"{air_index(20.0, 1013.25, 50.0):.8f}"
+    '1.00027137'
     """
-    one = np.vectorize(lambda t, p, h: ref_index.ciddor(wavelength_nm, t, p * 100.0, h), otypes=[float])
-    return np.asarray(one(air_temperature_degC, air_pressure_hPa, relative_humidity_percent))
+
+    def index(temperature_degC: float, pressure_hPa: float, humidity_percent: float) -> float:
+        if np.isnan(temperature_degC + pressure_hPa + humidity_percent):
+            return np.nan
+        return float(ref_index.ciddor(wavelength_nm, temperature_degC, pressure_hPa * 100.0, humidity_percent))
+
+    of_each = np.vectorize(index, otypes=[float])
+    return np.asarray(of_each(air_temperature_degC, air_pressure_hPa, relative_humidity_percent))
 
 
 def environment_factor(
@@ -89,7 +116,24 @@ def environment_factor(
     expansion_coefficient_ppm_per_K: float = 0.0,
     wavelength_nm: float = VACUUM_WAVELENGTH_NM,
 ) -> Array:
-    """Return the micrometres that one count stands for."""
+    """Return the environment factor: displacement per count of half a wavelength, lambda / (2 n (1 + alpha (T - 20 degC))).
+
+    Parameters
+    ----------
+    index : array_like
+        Refractive index of air (1).
+    material_temperature_degC : array_like
+        Temperature of the measured material, degC.
+    expansion_coefficient_ppm_per_K : float
+        Its expansion coefficient alpha, ppm/K; 0: lengths are not brought to 20 degC.
+    wavelength_nm : float
+        Vacuum wavelength, nm.
+
+    Returns
+    -------
+    ndarray
+        um per count, of the broadcast shape.
+    """
     stretch = _stretch(material_temperature_degC, expansion_coefficient_ppm_per_K)
     return wavelength_nm * 1e-3 / (2.0 * np.asarray(index) * stretch)
 
@@ -107,7 +151,24 @@ def implied_wavelength_nm(
     material_temperature_degC: Array | float,
     expansion_coefficient_ppm_per_K: float,
 ) -> Array:
-    """Return the vacuum wavelength that an instrument's environment factor implies: a check of file and sensors."""
+    """Return the vacuum wavelength that an instrument's environment factor implies: a check of file and sensors.
+
+    Parameters
+    ----------
+    factor_um : array_like
+        Environment factor of the instrument, um per count.
+    index : array_like
+        Refractive index of air at the same instants (1).
+    material_temperature_degC : array_like
+        Temperature of the measured material at the same instants, degC.
+    expansion_coefficient_ppm_per_K : float
+        That the instrument used, ppm/K.
+
+    Returns
+    -------
+    ndarray
+        nm, of the broadcast shape.
+    """
     unit = environment_factor(
         index,
         material_temperature_degC=material_temperature_degC,
@@ -118,7 +179,22 @@ def implied_wavelength_nm(
 
 
 def dead_path_error_um(index: Array, start_index: float, *, dead_path_mm: float) -> Array:
-    """Return what a display gains in um, with nothing moving, when the index leaves its value at the zeroing."""
+    """Return the dead-path error: the change of the display, with nothing moving, since the index was that of the zeroing.
+
+    Parameters
+    ----------
+    index : (n,) ndarray
+        Refractive index of air at each reading (1).
+    start_index : float
+        Refractive index where the display was set to zero (1).
+    dead_path_mm : float
+        Distance from the interferometer to the reflector where the display was set to zero, mm.
+
+    Returns
+    -------
+    (n,) ndarray
+        um.
+    """
     return dead_path_mm * 1e3 * (np.asarray(index) - start_index) / np.asarray(index)
 
 
@@ -129,7 +205,29 @@ def followed_factor_um(
     expansion_coefficient_ppm_per_K: float,
     wavelength_nm: float = VACUUM_WAVELENGTH_NM,
 ) -> Array:
-    """Return the factor (cycle, direction, target) of an instrument that followed the logged air and the logged probe."""
+    """Return the environment factor of an instrument that followed the logged air and the logged probe.
+
+    Parameters
+    ----------
+    deviations : xarray.Dataset
+        Keeps ``contract.DEVIATIONS``.
+    environment : xarray.Dataset
+        What `read_environment` returns.
+    expansion_coefficient_ppm_per_K : float
+        That the instrument used, ppm/K.
+    wavelength_nm : float
+        Vacuum wavelength, nm.
+
+    Returns
+    -------
+    (cycle, direction, target) ndarray
+        um per count at every reading; NaN where it has no time.
+
+    Raises
+    ------
+    CompensationError
+        No reading has a time, or one lies more than 15 minutes from any logged condition.
+    """
     air, _ = _conditions_at(deviations, environment)
     return environment_factor(
         _index_of(air, wavelength_nm),
@@ -152,40 +250,66 @@ def compensate(
     wavelength_nm: float = VACUUM_WAVELENGTH_NM,
     uncertainty: SensorUncertainty | None = None,
 ) -> xr.Dataset:
-    """Undo the instrument's compensation where its factor is known, and compensate with the logged conditions.
+    """Reverse the instrument's compensation where its factor is known, and compensate with the logged conditions.
 
     Parameters
     ----------
     deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``; every reading needs a time.
+        Keeps ``contract.DEVIATIONS``, with times.
     environment : xarray.Dataset
-        What `readers.read_environment` returns.
+        What `read_environment` returns.
     applied_factor_um : (float, float) or (cycle, direction, target) ndarray, optional
-        Environment factor at the start and end of the test, as a .rtl holds it, between them taken as linear in time; or
-        that of every reading, as `followed_factor_um` returns it. Left out: only the dead path remains to be corrected.
+        Environment factor, um per count: at the start and the end of the test, as a .rtl holds it, interpolated linearly in time; or of
+        every reading, as `followed_factor_um` returns it. None: only the dead path is corrected.
     expansion_coefficient_ppm_per_K : float
-        Of the axis or workpiece that is brought to 20 degC; 0 leaves the material as it is.
-    material_temperature_degC : xarray.DataArray, optional
-        (cycle, direction, target): temperature of the measured length at each reading, for instance seen by a camera.
-        Left out: the logged probe.
-    dead_path_mm, zero_mm : float
-        Distance from the interferometer to the reflector where the display was zeroed, and the axis position of that place.
+        Of the axis or workpiece whose length is brought to 20 degC, ppm/K; 0: it is left as it is.
+    material_temperature_degC : (cycle, direction, target) xarray.DataArray, optional
+        Temperature of the measured length at each reading, degC, for instance seen by a camera. None: the logged probe.
+    dead_path_mm : float
+        Distance from the interferometer to the reflector where the display was set to zero, mm.
+    zero_mm : float
+        Axis position of that place, mm.
     away : bool
         Whether the reflector moves away from the interferometer as the position grows.
     wavelength_nm : float
+        Vacuum wavelength of the laser, nm.
     uncertainty : SensorUncertainty, optional
+        None: its defaults.
 
     Returns
     -------
     xarray.Dataset
-        The deviations compensated, and beside them, in um at every reading: correction_scale and correction_dead_path
-        (both already added); air_u, material_u and dead_path_u, and compensation_u, their root sum of squares; air_index (1).
-        ``attrs["outside_environment"]`` counts readings beyond the log, which take its first or last condition.
+        The compensated deviations and, at every reading in um, ``correction_scale`` and ``correction_dead_path`` (both already added);
+        ``air_u``, ``material_u`` and ``dead_path_u``, standard uncertainties, and ``compensation_u``, their root sum of squares;
+        ``air_index`` (1). ``attrs["outside_environment"]`` counts readings before or after the log, which take its first or last
+        condition.
 
     Raises
     ------
     CompensationError
-        Readings have no time, or lie more than 15 minutes from any logged condition; or the factor is none of a laser in air.
+        No reading has a time, one lies more than 15 minutes from any logged condition, or the applied factor differs by more than
+        1000 ppm from the one of these conditions.
+
+    Notes
+    -----
+    A displayed length L is counts times the environment factor f = lambda / (2 n (1 + alpha (T - 20 degC))): the correction of scale is
+    L (f_now / f_applied - 1). Index of air: Ciddor (1996), Applied Optics 35, 1566. A change of index since the zeroing changes the
+    display by D (n - n_0) / n over a dead path D.
+
+    Examples
+    --------
+    An instrument that used an index of air of 1.00027 throughout, on a reading at 1 m:
+
+    >>> import numpy as np
+    >>> from interferometry.deviations import build_deviations
+    >>> time = np.array([[["2026-03-09T06:30"], ["2026-03-09T06:31"]]], "datetime64[ns]")
+    >>> test = build_deviations([1], [1], np.array([1000.0]), np.zeros((1, 2, 1)), time)
+    >>> air = {"air_temperature": 20.0, "air_pressure": 1013.25, "relative_humidity": 50.0, "material_temperature": 20.0}
+    >>> log = xr.Dataset({k: ("time", [v]) for k, v in air.items()}, {"time": time[0, 0]})
+    >>> factor = float(environment_factor(1.00027))
+    >>> redone = compensate(test, log, applied_factor_um=(factor, factor))
+    >>> redone["correction_scale"].values.round(2).tolist()
+    [[[-1.37], [-1.37]]]
     """
     air, outside = _conditions_at(deviations, environment)
     if material_temperature_degC is not None:
@@ -209,13 +333,13 @@ def compensate(
 
 
 def _corrected(deviations: xr.Dataset, added: dict[str, Array], u: dict[str, Array], index: Array) -> xr.Dataset:
-    """Return the deviations with what is added to them, and beside them its parts and their uncertainties."""
+    """Return the corrected deviations with the parts of the correction and their standard uncertainties."""
     dims, total = deviations["deviation"].dims, sum(added.values())
     corrected = deviations.assign(
         deviation=(dims, deviations["deviation"].values + total, deviations["deviation"].attrs),
         air_index=(dims, index, {"units": "1"}),
     )
-    together = np.sqrt(sum(np.square(one) for one in u.values()))
+    together = np.sqrt(sum(np.square(part) for part in u.values()))
     for name, values in {**added, **u, "compensation_u": together}.items():
         corrected[name] = (dims, np.broadcast_to(values, index.shape), {"units": "um"})
     return corrected
@@ -226,7 +350,7 @@ def _index_of(air: dict[str, Array], wavelength_nm: float) -> Array:
 
 
 def _scale(deviations: xr.Dataset, wanted_um: Array, applied_um: tuple[float, float] | Array | None) -> Array:
-    """Return by which share a displayed length has to grow, (cycle, direction, target)."""
+    """Return the relative correction of a displayed length (1), (cycle, direction, target)."""
     if applied_um is None:
         return np.zeros(wanted_um.shape)
     applied = _interpolate_factor(deviations, applied_um) if isinstance(applied_um, tuple) else applied_um
@@ -241,30 +365,33 @@ def _scale(deviations: xr.Dataset, wanted_um: Array, applied_um: tuple[float, fl
 
 def _seconds(deviations: xr.Dataset) -> Array:
     time = deviations["time"].values.astype("datetime64[ns]")
-    known = ~np.isnat(time)
-    if not known.any():
+    has_time = ~np.isnat(time)
+    if not has_time.any():
         raise CompensationError("no reading has a time; compensation needs the conditions at each reading")
-    return np.where(known, (time - time[known].min()).astype("f8") * 1e-9, np.nan)
+    return np.where(has_time, (time - time[has_time].min()).astype("f8") * 1e-9, np.nan)
 
 
 def _conditions_at(deviations: xr.Dataset, environment: xr.Dataset) -> tuple[dict[str, Array], int]:
     """Return logged conditions at every reading (linear in time), and how many readings lie outside the log."""
     _seconds(deviations)
     time = deviations["time"].values.astype("datetime64[ns]")
-    known = ~np.isnat(time)
+    has_time = ~np.isnat(time)
     logged = environment["time"].values.astype("datetime64[ns]")
-    at, log = time.astype("i8").astype("f8"), logged.astype("i8").astype("f8")
-    after = np.clip(np.searchsorted(log, at[known]), 1, log.size - 1) if log.size > 1 else np.zeros(at[known].size, int)
-    nearest = np.minimum(np.abs(at[known] - log[after]), np.abs(at[known] - log[np.maximum(after - 1, 0)])) * 1e-9
+    instant, log = time.astype("i8").astype("f8"), logged.astype("i8").astype("f8")
+    timed = instant[has_time]
+    after = np.clip(np.searchsorted(log, timed), 1, log.size - 1) if log.size > 1 else np.zeros(timed.size, int)
+    nearest = np.minimum(np.abs(timed - log[after]), np.abs(timed - log[np.maximum(after - 1, 0)])) * 1e-9
     if nearest.max() > LONGEST_GAP_S:
-        worst = time[known][int(np.argmax(nearest))]
+        worst = time[has_time][int(np.argmax(nearest))]
         raise CompensationError(
             f"the reading at {worst} lies {nearest.max() / 60:.0f} min from any logged condition ({logged[0]} .. {logged[-1]}); "
             "give the environment log of this test"
         )
-    outside = int(np.count_nonzero((at[known] < log[0]) | (at[known] > log[-1])))
+    outside = int(np.count_nonzero((timed < log[0]) | (timed > log[-1])))
     names = ("air_temperature", "air_pressure", "relative_humidity", "material_temperature")
-    return {name: np.where(known, np.interp(at, log, environment[name].values), np.nan) for name in names}, outside
+    return {
+        name: np.where(has_time, np.interp(instant, log, environment[name].values), np.nan) for name in names
+    }, outside
 
 
 def _interpolate_factor(deviations: xr.Dataset, applied_factor_um: tuple[float, float]) -> Array:
@@ -278,10 +405,10 @@ def _air_ppm(air: dict[str, Array], sensors: SensorUncertainty, wavelength_nm: f
     typical = [float(np.nanmean(air[name])) for name in ("air_temperature", "air_pressure", "relative_humidity")]
     squares = sensors.formula_ppm**2
     inputs = (sensors.air_temperature_K, sensors.air_pressure_hPa, sensors.relative_humidity_percent)
-    for at, u in enumerate(inputs):
+    for i, u in enumerate(inputs):
         high, low = list(typical), list(typical)
-        high[at] += u / 2
-        low[at] -= u / 2
+        high[i] += u / 2
+        low[i] -= u / 2
         difference = air_index(*high, wavelength_nm=wavelength_nm) - air_index(*low, wavelength_nm=wavelength_nm)
         squares += float(difference * 1e6) ** 2
     return float(np.sqrt(squares))

@@ -1,6 +1,6 @@
-"""What crosses the border of interferometry: names, dims, units and kinds of the deviations.
+"""Contract of the Dataset of deviations, which every reader returns and every evaluation takes.
 
-A contract maps a variable's name to ``(dims, units, kind)``, kind being a NumPy dtype kind (``f``, ``i``, ``u``, ``M``).
+A contract maps the name of a variable to ``(dims, units, kind)``, kind being a NumPy dtype kind (``f``, ``i``, ``u``, ``M``).
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The Dataset of deviations: built from plain arrays, and laid out as one series in measuring order.
-
-Why a reading is missing or doubtful: a small registry of flags, and the detectors that set them.
-"""
+"""The Dataset of positioning deviations: its flags, how it is built, and its readings in measuring order."""
 
 from __future__ import annotations
 
@@ -15,79 +12,19 @@ DIMS = ("cycle", "direction", "target")
 DIRECTIONS = ("positive", "negative")
 
 
-def build_deviations(
-    cycles: Sequence[int], targets: Sequence[int], position_mm: np.ndarray, deviation_um: np.ndarray, time: np.ndarray
-) -> xr.Dataset:
-    """Return a Dataset that keeps ``contract.DEVIATIONS`` from plain arrays.
-
-    Parameters
-    ----------
-    cycles, targets : sequences of int
-        Numbers from 1.
-    position_mm : (target,) ndarray
-        Programmed positions.
-    deviation_um : (cycle, direction, target) ndarray
-        Measured minus programmed position; NaN where there is no reading. Directions are positive, negative.
-    time : (cycle, direction, target) datetime64 ndarray
-        UTC; NaT where there is no reading or no time.
-    """
-    missing = np.where(np.isnan(deviation_um), np.uint8(MISSING.mask), np.uint8(0))
-    return xr.Dataset(
-        {
-            "deviation": (
-                DIMS,
-                deviation_um.astype("f8"),
-                {"units": "um", "long_name": "measured minus programmed position"},
-            ),
-            "time": (DIMS, time.astype("datetime64[ns]"), {"long_name": "time of the reading (UTC)"}),
-            "position": (
-                ("target",),
-                np.asarray(position_mm, dtype="f8"),
-                {"units": "mm", "long_name": "programmed position"},
-            ),
-            "quality_flag": (DIMS, missing, flag_attributes()),
-        },
-        coords={"cycle": list(cycles), "direction": list(DIRECTIONS), "target": list(targets)},
-    )
-
-
-def sort_readings(deviations: xr.Dataset) -> xr.Dataset:
-    """Return the readings as one series in the order in which they were measured.
-
-    Parameters
-    ----------
-    deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``.
-
-    Returns
-    -------
-    xarray.Dataset
-        Single dim "reading", sorted by time, missing readings left out: deviation (um), time (UTC), seconds (s since the first
-        reading), cycle, target, sign (+1 positive, -1 negative), position (mm).
-    """
-    present = np.isfinite(deviations["deviation"].values) & ~np.isnat(deviations["time"].values)
-    at_cycle, at_direction, at_target = np.nonzero(present)
-    time = deviations["time"].values[present].astype("datetime64[ns]")
-    order = np.argsort(time, kind="stable")
-    time = time[order]
-    seconds = (time - time[:1]) / np.timedelta64(1, "s") if time.size else np.empty(0)
-    sign = np.where(deviations["direction"].values[at_direction[order]] == "positive", 1, -1)
-    return xr.Dataset(
-        {
-            "deviation": (("reading",), deviations["deviation"].values[present][order], {"units": "um"}),
-            "time": (("reading",), time),
-            "seconds": (("reading",), seconds, {"units": "s"}),
-            "cycle": (("reading",), deviations["cycle"].values[at_cycle[order]]),
-            "target": (("reading",), deviations["target"].values[at_target[order]]),
-            "sign": (("reading",), sign, {"units": "1"}),
-            "position": (("reading",), deviations["position"].values[at_target[order]], {"units": "mm"}),
-        }
-    )
-
-
 @dataclass(frozen=True)
 class Flag:
-    """One bit of ``quality_flag``: its mask, its name and one sentence of meaning."""
+    """One bit of ``quality_flag``: why a reading is missing or doubtful.
+
+    Attributes
+    ----------
+    mask : int
+        Value of the bit, a power of two.
+    name : str
+        As in the CF attribute ``flag_meanings``.
+    meaning : str
+        One sentence.
+    """
 
     mask: int
     name: str
@@ -108,7 +45,63 @@ OUTLIER = Flag(16, "outlier", "It lies so far from the joint estimate that it wa
 REGISTRY: tuple[Flag, ...] = (MISSING, UNREADABLE, DUPLICATE, OUT_OF_ORDER, OUTLIER)
 
 
-def flag_attributes() -> dict[str, object]:
+def build_deviations(
+    cycles: Sequence[int], targets: Sequence[int], position_mm: np.ndarray, deviation_um: np.ndarray, time: np.ndarray
+) -> xr.Dataset:
+    """Build the Dataset of positioning deviations from plain arrays.
+
+    Parameters
+    ----------
+    cycles : (n_cycles,) sequence of int
+        Numbers of the cycles, from 1.
+    targets : (n_targets,) sequence of int
+        Numbers of the target positions, from 1.
+    position_mm : (n_targets,) array_like
+        Target positions, mm.
+    deviation_um : (n_cycles, 2, n_targets) ndarray
+        Positioning deviations x_ij, actual minus target position (ISO 230-2), um; first the positive, then the negative
+        direction of approach; NaN where there is no reading.
+    time : (n_cycles, 2, n_targets) ndarray of datetime64
+        UTC; NaT where there is no reading or no time.
+
+    Returns
+    -------
+    xarray.Dataset
+        Keeps ``contract.DEVIATIONS``: ``deviation`` (um), ``time`` (UTC) and ``quality_flag`` (cycle, direction, target), ``position``
+        (mm; target). Missing readings are flagged.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> deviation = np.array([[[0.0, 1.0], [0.5, np.nan]]])
+    >>> time = np.datetime64("2026-03-09T06:30") + np.array([[[0, 6], [20, 14]]], "timedelta64[s]")
+    >>> test = build_deviations([1], [1, 2], np.array([0.0, 100.0]), deviation, time)
+    >>> test["deviation"].sel(cycle=1, direction="negative").values.tolist()
+    [0.5, nan]
+    >>> test["quality_flag"].values.tolist()
+    [[[0, 0], [0, 1]]]
+    """
+    missing = np.where(np.isnan(deviation_um), np.uint8(MISSING.mask), np.uint8(0))
+    return xr.Dataset(
+        {
+            "deviation": (
+                DIMS,
+                deviation_um.astype("f8"),
+                {"units": "um", "long_name": "measured minus programmed position"},
+            ),
+            "time": (DIMS, time.astype("datetime64[ns]"), {"long_name": "time of the reading (UTC)"}),
+            "position": (
+                ("target",),
+                np.asarray(position_mm, dtype="f8"),
+                {"units": "mm", "long_name": "programmed position"},
+            ),
+            "quality_flag": (DIMS, missing, _flag_attributes()),
+        },
+        coords={"cycle": list(cycles), "direction": list(DIRECTIONS), "target": list(targets)},
+    )
+
+
+def _flag_attributes() -> dict[str, object]:
     """Return the CF attributes that explain ``quality_flag``."""
     return {
         "units": "1",
@@ -125,11 +118,15 @@ def set_flag(deviations: xr.Dataset, flag: Flag, where: np.ndarray) -> xr.Datase
     Parameters
     ----------
     deviations : xarray.Dataset
-        Deviations that keep ``contract.DEVIATIONS``.
+        Keeps ``contract.DEVIATIONS``.
     flag : Flag
         A record of the registry.
-    where : (cycle, direction, target) bool ndarray
+    where : (cycle, direction, target) ndarray of bool
         True where the flag applies; elsewhere the bits stay as they are.
+
+    Returns
+    -------
+    xarray.Dataset
     """
     marked = deviations.copy()
     bits = deviations["quality_flag"].values | np.where(where, np.uint8(flag.mask), np.uint8(0))
@@ -137,32 +134,66 @@ def set_flag(deviations: xr.Dataset, flag: Flag, where: np.ndarray) -> xr.Datase
     return marked
 
 
-def count_flags(deviations: xr.Dataset) -> dict[str, int]:
-    """Return how many readings carry each flag, by the flag's name."""
-    bits = deviations["quality_flag"].values
-    return {flag.name: int(np.count_nonzero(bits & flag.mask)) for flag in REGISTRY}
+def sort_readings(deviations: xr.Dataset) -> xr.Dataset:
+    """Return the readings as one series in the order in which they were measured.
 
-
-def detect_out_of_order(deviations: xr.Dataset) -> np.ndarray:
-    """Return True where a reading's time breaks the order of its pass.
-
-    Along the positive direction times grow with position, along the negative one they fall. Order is judged against the longest
-    run of readings in order, so that one wrong time marks itself and not its neighbours.
+    Parameters
+    ----------
+    deviations : xarray.Dataset
+        Keeps ``contract.DEVIATIONS``.
 
     Returns
     -------
-    (cycle, direction, target) bool ndarray
+    xarray.Dataset
+        Single dim "reading", sorted by time, without missing readings and readings without a time: ``deviation`` (um), ``time`` (UTC),
+        ``seconds`` (s since the first reading), ``cycle``, ``target``, ``sign`` (+1 positive, -1 negative), ``position`` (mm).
+    """
+    present = np.isfinite(deviations["deviation"].values) & ~np.isnat(deviations["time"].values)
+    cycle, direction, target = np.nonzero(present)
+    time = deviations["time"].values[present].astype("datetime64[ns]")
+    order = np.argsort(time, kind="stable")
+    time = time[order]
+    seconds = (time - time[:1]) / np.timedelta64(1, "s") if time.size else np.empty(0)
+    sign = np.where(deviations["direction"].values[direction[order]] == "positive", 1, -1)
+    return xr.Dataset(
+        {
+            "deviation": (("reading",), deviations["deviation"].values[present][order], {"units": "um"}),
+            "time": (("reading",), time),
+            "seconds": (("reading",), seconds, {"units": "s"}),
+            "cycle": (("reading",), deviations["cycle"].values[cycle[order]]),
+            "target": (("reading",), deviations["target"].values[target[order]]),
+            "sign": (("reading",), sign, {"units": "1"}),
+            "position": (("reading",), deviations["position"].values[target[order]], {"units": "mm"}),
+        }
+    )
+
+
+def detect_out_of_order(deviations: xr.Dataset) -> np.ndarray:
+    """Find readings whose time breaks the order of their pass.
+
+    In the positive direction times grow with position, in the negative direction they fall. A pass is compared with its longest run of
+    readings in order, so that one wrong time marks itself and not its neighbours.
+
+    Parameters
+    ----------
+    deviations : xarray.Dataset
+        Keeps ``contract.DEVIATIONS``.
+
+    Returns
+    -------
+    (cycle, direction, target) ndarray of bool
+        True where the time is out of order; False where there is none.
     """
     along = np.argsort(deviations["position"].values, kind="stable")
-    seconds = deviations["time"].values.astype("datetime64[ns]").astype("i8")
-    known = ~np.isnat(deviations["time"].values)
-    marked = np.zeros(known.shape, dtype=bool)
-    for cycle in range(known.shape[0]):
+    nanoseconds = deviations["time"].values.astype("datetime64[ns]").astype("i8")
+    has_time = ~np.isnat(deviations["time"].values)
+    marked = np.zeros(has_time.shape, dtype=bool)
+    for cycle in range(has_time.shape[0]):
         for direction, name in enumerate(deviations["direction"].values):
             order = along if name == "positive" else along[::-1]
-            order = order[known[cycle, direction, order]]
-            kept = _longest_increasing(seconds[cycle, direction, order])
-            marked[cycle, direction, order] = ~kept
+            order = order[has_time[cycle, direction, order]]
+            in_order = _longest_increasing(nanoseconds[cycle, direction, order])
+            marked[cycle, direction, order] = ~in_order
     return marked
 
 
@@ -178,8 +209,8 @@ def _longest_increasing(values: np.ndarray) -> np.ndarray:
             best = earlier[np.argmax(length[earlier])]
             length[i], before[i] = length[best] + 1, best
     kept = np.zeros(values.size, dtype=bool)
-    at = int(np.argmax(length))
-    while at >= 0:
-        kept[at] = True
-        at = int(before[at])
+    i = int(np.argmax(length))
+    while i >= 0:
+        kept[i] = True
+        i = int(before[i])
     return kept

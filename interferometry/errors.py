@@ -1,4 +1,4 @@
-"""The error that every fault of input in this package is."""
+"""Base class of the errors of this package."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ from __future__ import annotations
 class InterferometryError(ValueError):
     """Input that cannot be used; the message names the place, the value and the remedy.
 
-    Every error that this package raises about its input is a subclass, so that a caller recognises all of them by class.
+    Every error that this package raises about its input is of this class or a subclass.
     """

@@ -1,4 +1,4 @@
-"""What a positioning test holds beside its deviations, in lines: what is missing, and what the instrument did with the air."""
+"""Summary of a positioning test in lines of text: missing readings, times, environment, and a check of the environment factor."""
 
 from __future__ import annotations
 
@@ -9,24 +9,35 @@ import xarray as xr
 
 from interferometry.compensation import VACUUM_WAVELENGTH_NM, air_index, implied_wavelength_nm
 
-#: The laser's own wavelength and rounding of the file stay within this; beyond, a sensor or a setting is wrong.
+#: Tolerance of the implied wavelength, ppm: it covers the laser and the rounding of the file; beyond, a sensor or a setting is wrong.
 _WAVELENGTH_PPM = 0.3
 
 
 def describe_test(deviations: xr.Dataset) -> list[str]:
-    """Return lines on a test that `readers.read_deviations` has read; those that start with "warning" ask for a look."""
+    """Describe a positioning test as it was read.
+
+    Parameters
+    ----------
+    deviations : xarray.Dataset
+        What `read_deviations` returns.
+
+    Returns
+    -------
+    list of str
+        One fact per line; lines that start with "warning" ask for action.
+    """
     return [*_missing(deviations), *_times(deviations), *_environment(deviations), *_wavelength(deviations)]
 
 
 def _missing(deviations: xr.Dataset) -> list[str]:
-    held = np.isfinite(deviations["deviation"].values)
+    present = np.isfinite(deviations["deviation"].values)
     lines = []
-    for at, direction in enumerate(deviations["direction"].values):
-        absent = int((~held[:, at]).sum())
-        if not held[:, at].any():
+    for i, direction in enumerate(deviations["direction"].values):
+        missing = int((~present[:, i]).sum())
+        if not present[:, i].any():
             lines.append(f"warning: no reading in the {direction} direction")
-        elif absent:
-            lines.append(f"warning: {absent} of {held[:, at].size} readings missing in the {direction} direction")
+        elif missing:
+            lines.append(f"warning: {missing} of {present[:, i].size} readings missing in the {direction} direction")
     empty = json.loads(deviations.attrs.get("runs_empty", "[]"))
     if empty:
         lines.append(f"runs without a reading: {', '.join(str(run) for run in empty)}")
@@ -36,7 +47,9 @@ def _missing(deviations: xr.Dataset) -> list[str]:
 def _times(deviations: xr.Dataset) -> list[str]:
     if "time_u" not in deviations:
         return []
-    return [f"standard uncertainty of a rebuilt time {float(deviations['time_u']):.1f} s; feed and dwell lower it"]
+    return [
+        f"standard uncertainty of a reconstructed time {float(deviations['time_u']):.1f} s; feed and dwell lower it"
+    ]
 
 
 def _environment(deviations: xr.Dataset) -> list[str]:
@@ -56,7 +69,7 @@ def _environment(deviations: xr.Dataset) -> list[str]:
 
 
 def _wavelength(deviations: xr.Dataset) -> list[str]:
-    """Return the vacuum wavelength that factor, air and material imply: they were measured apart, so that one checks the other."""
+    """Return the vacuum wavelength that factor, air and material imply: independent sensors, so that one checks the others."""
     needed = ("environment_factor", "air_temperature", "air_pressure", "relative_humidity", "material_temperature")
     if not all(name in deviations for name in needed) or "expansion_coefficient" not in deviations:
         return []
@@ -72,11 +85,11 @@ def _wavelength(deviations: xr.Dataset) -> list[str]:
         expansion_coefficient_ppm_per_K=float(deviations["expansion_coefficient"].values[0]),
     )
     factor = deviations["environment_factor"].values
-    away = (float(np.mean(implied)) / VACUUM_WAVELENGTH_NM - 1.0) * 1e6
+    difference_ppm = (float(np.mean(implied)) / VACUUM_WAVELENGTH_NM - 1.0) * 1e6
     line = (
         f"environment factor {factor[0]:.9g} to {factor[1]:.9g} um: with this air and material a vacuum wavelength of "
-        f"{float(np.mean(implied)):.5f} nm, {away:+.3f} ppm from a stabilised HeNe laser's"
+        f"{float(np.mean(implied)):.5f} nm, {difference_ppm:+.3f} ppm from a stabilised HeNe laser's"
     )
-    if np.isfinite(away) and abs(away) <= _WAVELENGTH_PPM:
+    if np.isfinite(difference_ppm) and abs(difference_ppm) <= _WAVELENGTH_PPM:
         return [line]
     return [f"warning: {line}; the instrument used other air, another material temperature or another coefficient"]

@@ -1,11 +1,11 @@
 """Differences of neighbouring positions, and the conventional evaluation beside them.
 
-Equations (1) to (10) and the deviation charts of "Elimination of thermal drift in measuring the positioning
-accuracy of a three axis milling machine". What equations (5) and (6) call a sample standard deviation divides by
-n (n - 1): it is the standard uncertainty of a mean, and bears that name here, beside the real standard deviation.
+Equations (1) to (10) and the deviation charts of the paper "Elimination of thermal drift in measuring the positioning accuracy of a
+three axis milling machine". What its equations (5) and (6) call a sample standard deviation divides by n (n - 1): it is the standard
+uncertainty of a mean, and has that name here, beside the sample standard deviation.
 
-The chain of mean differences telescopes exactly to the mean profile: differencing cleans the standard deviation of
-drift, not the mean.
+The chain of mean differences telescopes exactly to the mean profile: differencing removes the drift from the standard deviation, not
+from the mean. Equations are numbered as in the paper; see docs/method/differences.md.
 """
 
 from __future__ import annotations
@@ -29,27 +29,33 @@ def place_targets(count: int, interval_mm: float, periodic_error_mm: float, rng:
     Parameters
     ----------
     count : int
+        Number of targets.
     interval_mm : float
-        Spacing p.
+        Spacing p, mm.
     periodic_error_mm : float
-        Amplitude of r, within the possible periodic error of the axis (for a screw, up to its lead).
+        Amplitude of the random part r, mm: within the period of the expected error (for a screw, up to its lead).
     rng : numpy.random.Generator
 
     Returns
     -------
     (count,) ndarray
-        Positions in mm.
+        Positions, mm.
     """
     return np.arange(count) * interval_mm + rng.uniform(-periodic_error_mm, periodic_error_mm, count)
 
 
 def coverage_factor(repetitions: np.ndarray) -> np.ndarray:
-    """Return 2 from thirty repetitions, Student's t for the same probability below.
+    """Return the coverage factor of borders: 2 from thirty repetitions, Student's t for the same probability (0.9545) below.
 
     Parameters
     ----------
-    repetitions : ndarray of int
-        Number n of repetitions; NaN results below 2.
+    repetitions : array_like of int
+        Number n of repetitions.
+
+    Returns
+    -------
+    ndarray
+        Of the same shape (1); NaN where n < 2.
     """
     n = np.asarray(repetitions)
     student = stats.t.ppf(0.5 + TWO_SIGMA_PROBABILITY / 2, np.maximum(n - 1, 1))
@@ -67,8 +73,9 @@ def evaluate_conventional(deviations: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        Per direction and target, in um: mean, standard_deviation (n - 1), mean_u (equation (5), the standard
-        uncertainty of the mean), lower and upper border (mean minus and plus k standard deviations); count and k.
+        Per direction and target, in um: ``mean``; ``standard_deviation`` (n - 1); ``mean_u``, the standard uncertainty of the mean,
+        equation (5); ``lower`` and ``upper`` border, mean minus and plus k standard deviations, equations (2) and (3). ``count`` n and
+        ``coverage_factor`` k (1).
     """
     x = deviations["deviation"]
     count = x.count("cycle")
@@ -94,21 +101,38 @@ def evaluate_neighbours(deviations: xr.Dataset) -> xr.Dataset:
     Parameters
     ----------
     deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``. Cycles in which either reading of a pair is missing do not count for the pair.
+        Positioning deviations (cycle, direction, target) in um, as `build_deviations` returns them; a cycle in which either reading of
+        a pair is missing does not count for the pair.
 
     Returns
     -------
     xarray.Dataset
-        Dim ``link``, labelled by its further target as in the paper (the first position is the reference and does not
-        count), per direction, in um: mean_difference (4), mean_difference_u (6), standard_deviation (n - 1),
-        position_standard_deviation (that divided by sqrt 2: one position's scatter if both positions scatter alike),
-        count, and covariance (direction, link, other_link; um2) of the mean differences. Links share a position, so
-        they are correlated: white noise gives -0.5.
+        Per direction and ``link``, a pair of neighbouring targets labelled by the one further along the axis as in the paper (the first
+        position is the reference and has none), in um: ``mean_difference`` (4); ``mean_difference_u``, its standard uncertainty (6);
+        ``standard_deviation`` (n - 1); ``position_standard_deviation``, that divided by sqrt 2: of one position, if both scatter
+        alike; ``count`` n (1); ``covariance`` (direction, link, other_link; um2) of the mean differences. Neighbouring links share a
+        position and are correlated: by -0.5 under white noise.
 
     Raises
     ------
     InterferometryError
         Fewer than two targets.
+
+    Notes
+    -----
+    Source: "Elimination of thermal drift in measuring the positioning accuracy of a three axis milling machine", equations (4), (6).
+
+    Examples
+    --------
+    A drift of 10 um from cycle to cycle leaves the difference of neighbours as it is:
+
+    >>> import numpy as np
+    >>> from interferometry.deviations import build_deviations
+    >>> deviation = np.array([[[0.0, 1.0], [0.0, 2.0]], [[10.0, 11.0], [10.0, 12.0]]])
+    >>> time = np.full(deviation.shape, np.datetime64("NaT", "ns"))
+    >>> links = evaluate_neighbours(build_deviations([1, 2], [1, 2], np.array([0.0, 100.0]), deviation, time))
+    >>> links["mean_difference"].values.tolist(), links["standard_deviation"].values.tolist()
+    ([[-1.0], [-2.0]], [[0.0], [0.0]])
     """
     x = _along_axis(deviations)
     if x.sizes["target"] < 2:
@@ -144,28 +168,28 @@ def build_chart(
     reference : {"time", "first_cycle"}
         Where the value at position 1 is taken: in the first cycle that reaches ``reference_s``, or in the first cycle.
     reference_s : float
-        Seconds since the first reading. The paper advises two hours, when changes have become slow. A shorter test
-        gives its last cycle.
+        Time since the first reading, s. The paper advises two hours, when changes have become slow. In a shorter test the last cycle
+        is taken.
 
     Returns
     -------
     xarray.Dataset
-        Per direction and target, in um: chart; border_u, k times equation (6); border_s, k times the standard
-        deviation of the differences; chart_u, the standard uncertainty of the chain from position 1 with the full
-        covariance of its links. Positions 1 and 2 have the same borders, as the paper draws them. reference_cycle
-        (direction) says which cycle gave the value at position 1; 0 where it was never read: there is no chart then.
+        Per direction and target, in um: ``chart``; ``border_u``, k times equation (6); ``border_s``, k times the standard deviation of
+        the differences; ``chart_u``, the standard uncertainty of the chain from position 1 with the full covariance of its links.
+        Positions 1 and 2 have the same borders, as in the paper. ``reference_cycle`` (direction): number of the cycle that gave the
+        value at position 1; 0 where it was never read, and the chart is NaN.
 
     Raises
     ------
     InterferometryError
-        An unknown reference.
+        An unknown reference, or fewer than two targets.
     """
     if reference not in ("time", "first_cycle"):
         raise InterferometryError(f"reference={reference!r} is neither 'time' nor 'first_cycle'")
     x = _along_axis(deviations)
     links = evaluate_neighbours(deviations)
-    at = _reference_cycles(deviations, x, reference, reference_s)
-    start = np.array([x.values[at[d], d, 0] if at[d] >= 0 else np.nan for d in range(x.sizes["direction"])])
+    chosen = _reference_cycles(deviations, x, reference, reference_s)
+    start = np.array([x.values[c, d, 0] if c >= 0 else np.nan for d, c in enumerate(chosen)])
     chain = np.cumsum(links["mean_difference"].values, axis=-1)
     chart = start[:, None] - np.concatenate([np.zeros((start.size, 1)), chain], axis=-1)
     k = coverage_factor(links["count"].values)
@@ -178,7 +202,7 @@ def build_chart(
             "chart_u": (dims, np.sqrt(variance), {"units": "um"}),
             "border_u": (dims, _repeat_first(k * links["mean_difference_u"].values), {"units": "um"}),
             "border_s": (dims, _repeat_first(k * links["standard_deviation"].values), {"units": "um"}),
-            "reference_cycle": (("direction",), [int(cycles[one]) if one >= 0 else 0 for one in at]),
+            "reference_cycle": (("direction",), [int(cycles[c]) if c >= 0 else 0 for c in chosen]),
         },
         coords={"direction": x["direction"].values, "target": x["target"].values},
         attrs={"reference": reference},
@@ -186,22 +210,41 @@ def build_chart(
 
 
 def compare(deviations: xr.Dataset, estimated: xr.Dataset | None = None) -> xr.Dataset:
-    """Set conventional and differenced standard deviations side by side, and that of the joint estimate.
-
-    The ratio s_i / s of the differences is a property of the drift: 0.71 without any, 3.09 where the drift's own
-    standard deviation is about 4.25 times the random one. It says nothing about an estimator's quality.
+    """Compare the conventional standard deviation of each position with that of the differences, and of the joint estimate.
 
     Parameters
     ----------
     deviations : xarray.Dataset
+        Positioning deviations (cycle, direction, target) in um, as `build_deviations` returns them.
     estimated : xarray.Dataset, optional
-        What `drift.estimate_drift` returns.
+        What `estimate_drift` returns for them.
 
     Returns
     -------
     xarray.Dataset
-        Per direction and link, in um: conventional (of the link's further target), differenced, differenced_single
-        (divided by sqrt 2), joint (the scatter of the joint estimate, if given); ratio of the first two.
+        Per direction and link (a pair of neighbouring targets, labelled by the further one), in um: ``conventional`` (of the further
+        target), ``differenced``, ``differenced_single`` (divided by sqrt 2), ``joint`` (scatter of the joint estimate, if given);
+        ``ratio`` of the first two (1).
+
+    Raises
+    ------
+    InterferometryError
+        Fewer than two targets.
+
+    Notes
+    -----
+    The ratio is a property of the drift, not of an estimator: sqrt(1/2) = 0.71 without any (equation (10) of the paper), 3.09 where the
+    standard deviation of the drift is about 4.25 times the random one.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from interferometry.deviations import build_deviations
+    >>> deviation = np.random.default_rng(0).normal(0, 1, (1000, 2, 2))
+    >>> time = np.full(deviation.shape, np.datetime64("NaT", "ns"))
+    >>> test = build_deviations(range(1000), [1, 2], np.array([0.0, 100.0]), deviation, time)
+    >>> compare(test)["ratio"].values.round(1).tolist()
+    [[0.7], [0.7]]
     """
     links = evaluate_neighbours(deviations)
     numbers = links["link"].values
@@ -222,7 +265,18 @@ def compare(deviations: xr.Dataset, estimated: xr.Dataset | None = None) -> xr.D
 
 
 def telescoping_error(deviations: xr.Dataset) -> float:
-    """Return max |chain - (mean_1 - mean_i)| in um over the targets: rounding only, where no reading is missing."""
+    """Return the largest difference between the chain of mean differences and the mean profile.
+
+    Parameters
+    ----------
+    deviations : xarray.Dataset
+        Keeps ``contract.DEVIATIONS``.
+
+    Returns
+    -------
+    float
+        max |sum of the links up to i - (mean_1 - mean_i)| over directions and targets, um: rounding only where no reading is missing.
+    """
     x = _along_axis(deviations)
     mean = x.mean("cycle").values
     chain = np.cumsum(evaluate_neighbours(deviations)["mean_difference"].values, axis=-1)
@@ -232,39 +286,50 @@ def telescoping_error(deviations: xr.Dataset) -> float:
 def resolve_links(pair_s_um: np.ndarray) -> np.ndarray:
     """Resolve standard deviations of neighbour differences into those of positions.
 
-    A position with excess scatter raises both of its links. The squares obey s_link^2 = s_i^2 + s_(i+1)^2, one equation
-    fewer than positions: of all non-negative solutions the one is taken in which fewest positions differ from the
-    usual one (absolute differences, by iterated reweighting).
+    A position with excess scatter raises both of its links.
 
     Parameters
     ----------
-    pair_s_um : (m - 1,) ndarray
+    pair_s_um : (m - 1,) array_like
+        Standard deviation of the difference of each pair of neighbours, um.
 
     Returns
     -------
     (m,) ndarray
+        Standard deviation of each position, um.
+
+    Notes
+    -----
+    s_link^2 = s_i^2 + s_(i+1)^2 is one equation fewer than positions. Of all non-negative solutions the one is taken in which fewest
+    positions differ from the typical one: least absolute differences by iteratively reweighted least squares.
     """
     variance = np.asarray(pair_s_um, float) ** 2
     links = variance.size
     sums = np.eye(links, links + 1) + np.eye(links, links + 1, 1)
-    usual = float(np.median(variance)) / 2
-    solution = np.full(links + 1, usual)
+    typical = float(np.median(variance)) / 2
+    solution = np.full(links + 1, typical)
     for _ in range(30):
-        weak = 0.3 * np.diag((np.maximum(np.abs(solution - usual) / usual, 0.02) / 0.02) ** -0.5)
+        weak = 0.3 * np.diag((np.maximum(np.abs(solution - typical) / typical, 0.02) / 0.02) ** -0.5)
         solution, _ = optimize.nnls(
-            np.vstack([sums, weak]), np.concatenate([variance, weak @ np.full(links + 1, usual)])
+            np.vstack([sums, weak]), np.concatenate([variance, weak @ np.full(links + 1, typical)])
         )
     return np.sqrt(solution)
 
 
 def simulate_derived_sequence(samples: int, rng: np.random.Generator) -> xr.Dataset:
-    """Repeat the paper's Monte Carlo of equations (7) to (10): differences of successive normal values.
+    """Repeat the Monte Carlo of equations (7) to (10): differences of successive normal values.
+
+    Parameters
+    ----------
+    samples : int
+        Length of the source sequence.
+    rng : numpy.random.Generator
 
     Returns
     -------
     xarray.Dataset
-        source (sample) and derived (sample - 1) sequences of unit variance, and ratio, s_b / s_a, which tends to
-        sqrt 2 (the paper found 1.4076 with 1,000 samples).
+        ``source`` (sample), standard normal; ``derived`` (derived_sample), its successive differences; ``ratio`` s_b / s_a of their
+        standard deviations, which tends to sqrt 2 (1.4076 in the paper, with 1,000 samples).
     """
     source = rng.standard_normal(samples)
     derived = source[:-1] - source[1:]
@@ -283,7 +348,7 @@ def _along_axis(deviations: xr.Dataset) -> xr.DataArray:
 
 
 def _standard_deviation(x: xr.DataArray, dim: str) -> xr.DataArray:
-    """Return the sample standard deviation; NaN, without a warning, where fewer than two values are."""
+    """Return the sample standard deviation; NaN, without a warning, where there are fewer than two values."""
     count = x.count(dim)
     squares = ((x - x.mean(dim)) ** 2).sum(dim)
     spread: xr.DataArray = (squares / (count - 1).where(count > 1)) ** 0.5

@@ -19,13 +19,13 @@ from fusion.campaign.quantities import QuantityError, conversion, unit_name
 from fusion.errors import FusionError
 from interferometry.io.delimited import (
     BadReading,
-    Rejected,
+    RejectedLine,
     delimiter_of,
     find_header,
     parse_time,
+    raise_if_mostly_invalid,
     read_table,
     read_timed_rows,
-    refuse_hopeless,
 )
 
 #: What pandas says of a line that has more fields than the header.
@@ -158,9 +158,9 @@ def read_record(campaign: Campaign) -> xr.Dataset:
     )
 
 
-def _read_frame(path: Path, record: RecordTable) -> tuple[pd.DataFrame, list[Rejected]]:
+def _read_frame(path: Path, record: RecordTable) -> tuple[pd.DataFrame, list[RejectedLine]]:
     """Return the whole table as text and numbers, whatever the file's kind, and the lines that do not fit its header."""
-    left_out: list[Rejected] = []
+    left_out: list[RejectedLine] = []
     try:
         if path.suffix.lower() in {".xlsx", ".xlsm"}:
             frame = pd.read_excel(path, sheet_name=record.sheet or 0)
@@ -171,7 +171,7 @@ def _read_frame(path: Path, record: RecordTable) -> tuple[pd.DataFrame, list[Rej
     return frame.rename(columns=lambda name: str(name).strip()), left_out
 
 
-def _read_text(path: Path) -> tuple[pd.DataFrame, list[Rejected]]:
+def _read_text(path: Path) -> tuple[pd.DataFrame, list[RejectedLine]]:
     """Read delimited text with the dialect that its header line shows."""
     with path.open(encoding="utf-8-sig") as file:
         before, header = find_header(file)
@@ -195,14 +195,14 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, list[Rejected]]:
     frame.index += before
     skipped = [found for one in told for found in _SKIPPED.findall(str(one.message))]
     return frame, [
-        Rejected(path.name, int(line), f"{saw} fields", f"{due} were expected") for line, due, saw in skipped
+        RejectedLine(path.name, int(line), f"{saw} fields", f"{due} were expected") for line, due, saw in skipped
     ]
 
 
-def _times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarray, list[Rejected]]:
+def _times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarray, list[RejectedLine]]:
     """Return UTC times, NaT where a row has none, and the list of those rows."""
     seconds = pd.to_numeric(column, errors="coerce")
-    left_out: list[Rejected] = []
+    left_out: list[RejectedLine] = []
     if seconds.notna().mean() > 0.5:
         _, unit = split_heading(path, record.time)
         factor = _converted(path, record.time, unit, "s")(np.array([0.0, 1.0]))
@@ -218,8 +218,8 @@ def _times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarr
             except BadReading:
                 continue
     for at in np.flatnonzero(np.isnat(time)):
-        left_out.append(Rejected(path.name, int(column.index[at]) + 2, str(column.iloc[at]), "is not a time"))
-    refuse_hopeless(path, int((~np.isnat(time)).sum()), left_out)
+        left_out.append(RejectedLine(path.name, int(column.index[at]) + 2, str(column.iloc[at]), "is not a time"))
+    raise_if_mostly_invalid(path, int((~np.isnat(time)).sum()), left_out)
     return time, left_out
 
 

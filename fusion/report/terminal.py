@@ -109,7 +109,7 @@ def iso230_tables(path: Path, cycles: str | None) -> list[Table]:
     deviations = read_deviations(path)
     window = None if cycles is None else read_window(cycles, deviations)
     try:
-        result = iso230.evaluate(deviations, cycles=window)
+        result = iso230.evaluate_iso230(deviations, cycles=window)
     except ValueError as error:
         raise CampaignError(f"{path}: {error}") from None
     axis = Table(title=f"{path.name}, {result.attrs['window']}", title_justify="left")

@@ -1,1 +1,1 @@
-"""Profile and drift of the axis estimated together in real time (level 3), and the number of cycles that a test needs."""
+"""Profile and thermal drift of an axis estimated together in real time, and the number of cycles that a test needs."""

@@ -7,17 +7,15 @@ integrated random walk, which enter every reading with a known loading::
 
 For a positioning test the components are a common shift (loading 1) and a stretch (loading = position); for a record of several
 displacement channels there is one component per channel. All components start at zero: their start is a fixed effect, and
-:func:`start_columns` gives the columns that a design must span for that. Filtering costs O(n) in the number of readings.
+:func:`~interferometry.drift.state_space.start_columns` gives the columns that a design must span for that. The variances of the
+drift are estimated by restricted maximum likelihood; one likelihood costs O(n) in the number of readings.
+
+In this order: the fit under given variances; the search for the variances; the average of a drift over its readings, with its
+covariance; a test of serial dependence.
 
 Sources: Harvey (1989), *Forecasting, structural time series models and the Kalman filter*; Durbin and Koopman (2012), *Time series
-analysis by state space methods*, sections 4.4-4.5 (smoothing and disturbances) and 7.2 (restricted likelihood).
-
-A weighted average of the drift over its readings, with its exact covariance, in two passes.
-
-Averages over time need the covariance between different times, which a smoother does not give. The state is therefore
-augmented with the running average itself (an accumulator): after the last reading the filter knows it as well as
-smoothing would, and a backward pass gives its covariance with the drift at every reading (Durbin and Koopman, Time
-series analysis by state space methods, 2012, section 4.7 on covariances of smoothed states).
+analysis by state space methods*, 2nd ed., chapter 4 (filter and smoother) and section 7.2 (likelihood); Patterson and Thompson (1971),
+Biometrika 58, 545 (restricted likelihood).
 """
 
 from __future__ import annotations
@@ -27,42 +25,36 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy import optimize
+from scipy import optimize, stats
 
 from interferometry._typing import Array
 from interferometry.drift import kalman
 from interferometry.drift.state_space import DriftModelError, DriftSystem, Order, drift_system, start_columns
 
-__all__ = [
-    "Array",
-    "DriftFit",
-    "DriftModelError",
-    "DriftSystem",
-    "Order",
-    "drift_system",
-    "estimate",
-    "fit_fixed_effects",
-    "start_columns",
-]
-
-#: Search limits of log10(drift variance ratio): from a drift that nobody can see to one that hides everything else.
+#: Search limits of log10(process noise over reading variance), in units that make the drift of one hour comparable to the noise of
+#: one reading: from a drift far below the noise to one that hides everything else.
 _LOG_RATIO_LIMITS = (-14.0, 4.0)
+#: Edge of the first simplex, decades.
 _FIRST_STEP = 1.5
-#: A reading whose deletion residual exceeds this many standard deviations is given a larger variance (robust fit).
+#: A reading whose deletion residual exceeds this many standard deviations is down-weighted (robust fit).
 _OUTLIER_LIMIT = 3.0
-#: A whitened column of which less than this share is not explained by the others counts as dependent.
+#: A whitened column is collinear with those before it where they leave less than this share of its squared length unexplained.
 _DEPENDENCE_TOLERANCE = 1e-10
-#: A drift is called smooth (integrated walk) only on this much more restricted log-likelihood: where both fit, the rougher one is
-#: the safer nuisance, because it claims less of what lies ahead.
+#: The drift is taken as an integrated random walk only if that raises the restricted log-likelihood by this much: where both fit,
+#: the random walk is the safer nuisance, because it extrapolates less.
 _SMOOTH_MARGIN = 2.0
-#: A drift that settles has two parameters more; by the Bayesian information criterion they have to raise the log-likelihood of some
-#: thousand readings by 8.
+#: Process noise that settles has two parameters more; by the Bayesian information criterion they have to raise the log-likelihood of
+#: some thousand readings by 8.
 _SETTLING_MARGIN = 8.0
-#: First guess of its time as a share of the test, and search limits: below a hundredth it concerns a cycle or two.
+#: First guess of the settling time as a share of the test, and its search limits: less than a hundredth concerns a cycle or two.
 _SETTLING_SHARE, _SETTLING_LIMITS = 1.0 / 15.0, (1.0 / 100.0, 1.0)
+#: Largest exponent of the settling.
 _FASTEST_SETTLING = 6.0
+#: Searches of the variances after the first one, and re-weightings before each, of a robust fit.
 _ROBUST_ROUNDS = 2
 _ROBUST_PASSES = 3
+#: Shortest series whose von Neumann ratio may be taken as normally distributed.
+_SHORTEST_SERIES = 8
 
 
 @dataclass(frozen=True)
@@ -71,12 +63,22 @@ class DriftFit:
 
     Attributes
     ----------
-    system : the drift system, with the estimated variance ratios
-    design : (n, p) columns; those the caller gave come first, start columns of an integrated walk follow
-    coefficients, covariance : (p,) and (p, p)
-    sigma : standard deviation of one ordinary reading
-    log_likelihood : restricted log-likelihood (comparable only between fits with the same design)
-    rss : whitened residual sum of squares
+    system : DriftSystem
+        With the estimated variance ratios, and the variances of down-weighted readings.
+    response : (n,) ndarray
+        Readings, in the order of time.
+    design : (n, p) ndarray
+        The caller's columns, then the rate columns of an integrated random walk.
+    coefficients : (p,) ndarray
+        In the response's unit per unit of the column.
+    covariance : (p, p) ndarray
+        Of the coefficients.
+    sigma : float
+        Standard deviation of one ordinary reading (relative variance 1), in the response's unit.
+    log_likelihood : float
+        Restricted log-likelihood; comparable only between fits with the same design.
+    rss : float
+        Whitened residual sum of squares.
     """
 
     system: DriftSystem
@@ -101,7 +103,7 @@ class DriftFit:
         return self.sigma * np.sqrt(self.system.ratios * scale * 3600.0**power)
 
     def residual(self) -> Array:
-        """Response minus fixed effects, drift left in, (n,)."""
+        """Response minus fixed effects, drift included, (n,)."""
         return self.response - self.design @ self.coefficients
 
     def drift(self) -> tuple[Array, Array]:
@@ -109,43 +111,54 @@ class DriftFit:
 
         The covariance holds the smoother's share and that of the estimated coefficients.
         """
-        columns = np.column_stack([self.response, self.design])
-        levels, covariance, _, _ = self.system.smooth(columns)
-        through = levels[:, :, 1:]
-        drift = levels[:, :, 0] - through @ self.coefficients
-        return drift, self.sigma**2 * covariance + through @ self.covariance @ through.transpose(0, 2, 1)
+        smoothed = self.system.smooth(np.column_stack([self.response, self.design]))
+        per_coefficient = smoothed.levels[:, :, 1:]
+        levels = smoothed.levels[:, :, 0] - per_coefficient @ self.coefficients
+        covariance = self.sigma**2 * smoothed.level_covariance
+        return levels, covariance + per_coefficient @ self.covariance @ per_coefficient.transpose(0, 2, 1)
 
     def noise(self) -> tuple[Array, Array]:
-        """Each reading's estimated noise (n,) and its relative variance (n,), which sum(noise^2) / sum(variance) makes a variance."""
-        _, _, u, d = self.system.smooth(self.residual()[:, None])
-        return self.system.variance * u[:, 0], self.system.variance**2 * d
+        """Each reading's estimated noise (n,) and its relative variance (n,): sum(noise^2) / sum(variance) estimates sigma^2."""
+        smoothed = self.system.smooth(self.residual()[:, None])
+        return self.system.variance * smoothed.u[:, 0], self.system.variance**2 * smoothed.D
 
     def deletion_residuals(self) -> Array:
-        """Each reading against its prediction from all others, in standard deviations of an ordinary reading (n,)."""
-        _, _, u, d = self.system.smooth(self.residual()[:, None])
+        """Each reading minus its prediction from all others, in standard deviations of an ordinary reading (n,); NaN if not observed."""
+        smoothed = self.system.smooth(self.residual()[:, None])
         with np.errstate(divide="ignore", invalid="ignore"):
-            ordinary = 1.0 / d - self.system.variance + 1.0
-            standardised = (u[:, 0] / d) / (self.sigma * np.sqrt(ordinary))
-        return np.where(d > 0, standardised, np.nan)
+            ordinary = 1.0 / smoothed.D - self.system.variance + 1.0
+            standardised = (smoothed.u[:, 0] / smoothed.D) / (self.sigma * np.sqrt(ordinary))
+        return np.where(smoothed.D > 0, standardised, np.nan)
 
 
 def fit_fixed_effects(system: DriftSystem, response: Array, design: Array) -> DriftFit:
-    """Generalised least squares of response (n,) on design (n, p) with the system's drift variances as given.
+    """Fit fixed effects by generalised least squares, the system's variance ratios as given.
+
+    Parameters
+    ----------
+    system : DriftSystem
+        Of n readings.
+    response : (n,) ndarray
+        Readings, in any unit; those that are not observed do not enter, but must be finite.
+    design : (n, p) ndarray
+        Columns of the fixed effects; they must span the loadings, because the drift starts at zero.
+
+    Returns
+    -------
+    DriftFit
+        sigma^2 is the whitened residual sum of squares over the degrees of freedom.
 
     Raises
     ------
     DriftModelError
-        if a value is not finite, or if the columns are linearly dependent after whitening.
+        A value is not finite, a column vanishes or is collinear with those before it, or there are too few readings.
     """
     return _solve(system, _Problem.of(response, design))
 
 
 @dataclass(frozen=True)
 class _Problem:
-    """What every fit of a search has in common.
-
-    columns (n, 1 + p) holds response and design side by side; least (p,) is the whitened size under which a column vanishes.
-    """
+    """Response and design of a search, checked once; ``columns`` holds both, ``least`` (p,) the whitened length of a vanishing column."""
 
     response: Array
     design: Array
@@ -163,6 +176,7 @@ class _Problem:
 
 
 def _solve(system: DriftSystem, problem: _Problem) -> DriftFit:
+    """Least squares on the swept Gram matrix, and the restricted log-likelihood with sigma^2 concentrated out."""
     gram, log_determinant = system.normal_equations(problem.columns)
     scale = np.sqrt(np.diag(gram)[1:])
     vanishing = np.flatnonzero(scale < problem.least)
@@ -211,7 +225,7 @@ def _maximise(system: DriftSystem, response: Array, design: Array, start: Array 
     # Steps that would leave the limits go the other way: clipped, they would leave the simplex without volume.
     step = np.where(guess + _FIRST_STEP > high, -_FIRST_STEP, _FIRST_STEP)
     simplex = np.vstack([guess, guess + np.diag(step)])
-    found = optimize.minimize(
+    optimum = optimize.minimize(
         lambda log_ratio: -fitted(log_ratio).log_likelihood,
         guess,
         method="Nelder-Mead",
@@ -223,41 +237,54 @@ def _maximise(system: DriftSystem, response: Array, design: Array, start: Array 
             "maxfev": 120 * components,
         },
     )
-    return fitted(found.x)
+    return fitted(optimum.x)
 
 
-def settling_pace(seconds: Array, time_s: float, exponent: float) -> Array:
-    """Factor (n,) on the drift's variance that starts at 1 and falls as a power of the time since the first reading.
+def settling_noise_scale(seconds: Array, time_s: float, exponent: float) -> Array:
+    """Return a process-noise scale that falls from 1 as a power of the time since the first reading, as in a warm-up.
 
-    A warm-up is a sum of exponentials from fast to slow, whose curvature falls about like that. With one constant variance the
-    drift is taken to be as calm at the start as it is later: it is then smoothed too much there, and its bands are too narrow.
+    A warm-up is a sum of exponentials from fast to slow, whose curvature falls about like that. One constant process noise would be
+    too small at the start: the drift would be smoothed too much there, and its uncertainty stated too small.
+
+    Parameters
+    ----------
+    seconds : (n,) ndarray
+        Time of each reading, s.
+    time_s : float
+        Settling time, s: after it the scale is 2 to the power of -exponent.
+    exponent : float
+
+    Returns
+    -------
+    (n,) ndarray
+        ``(1 + (t - t_0) / time_s) ** -exponent``.
     """
     return (1.0 + (seconds - seconds[0]) / time_s) ** -exponent
 
 
-def _settle(fit: DriftFit) -> DriftFit:
-    """Return the fit with a livelier drift at the start, where the readings clearly say that it settles; else the fit as it was.
+def _fit_settling(fit: DriftFit) -> DriftFit:
+    """Return the fit with larger process noise at the start, if that raises the restricted log-likelihood by at least 8.
 
-    Later on the drift keeps the variance of the fit, though the likelihood would lower it: the rougher drift claims less.
+    Later on the process noise stays what it was, though the likelihood would lower it: the rougher drift extrapolates less.
     """
     system, problem = fit.system, _Problem.of(fit.response, fit.design)
     span = float(system.seconds[-1] - system.seconds[0])
-    first = _SETTLING_SHARE * span
+    first_s = _SETTLING_SHARE * span
 
     def fitted(log_ratio: Array, time_s: float, exponent: float) -> DriftFit:
-        pace = settling_pace(system.seconds, time_s, exponent)
-        return _solve(replace(system, ratios=10.0**log_ratio, pace=pace), problem)
+        scale = settling_noise_scale(system.seconds, time_s, exponent)
+        return _solve(replace(system, ratios=10.0**log_ratio, process_noise_scale=scale), problem)
 
-    def scaled(exponent: float) -> Array:
-        return np.log10(system.ratios / settling_pace(system.seconds, first, exponent).mean())
+    def with_same_mean(exponent: float) -> Array:
+        return np.log10(system.ratios / settling_noise_scale(system.seconds, first_s, exponent).mean())
 
-    likely = max((1.0, 2.0), key=lambda exponent: fitted(scaled(exponent), first, exponent).log_likelihood)
-    if fitted(scaled(likely), first, likely).log_likelihood < fit.log_likelihood:
+    likely = max((1.0, 2.0), key=lambda exponent: fitted(with_same_mean(exponent), first_s, exponent).log_likelihood)
+    if fitted(with_same_mean(likely), first_s, likely).log_likelihood < fit.log_likelihood:
         return fit
     components = system.ratios.size
-    guess = np.r_[scaled(likely), np.log10(first), likely]
+    guess = np.r_[with_same_mean(likely), np.log10(first_s), likely]
     limits = np.log10(span * np.array(_SETTLING_LIMITS))
-    found = optimize.minimize(
+    optimum = optimize.minimize(
         lambda x: -fitted(x[:components], 10.0 ** x[-2], x[-1]).log_likelihood,
         guess,
         method="Nelder-Mead",
@@ -269,15 +296,16 @@ def _settle(fit: DriftFit) -> DriftFit:
             "maxfev": 80 * guess.size,
         },
     )
-    settled = fitted(found.x[:components], 10.0 ** found.x[-2], found.x[-1]).system
-    if -found.fun < fit.log_likelihood + _SETTLING_MARGIN:
+    settled = fitted(optimum.x[:components], 10.0 ** optimum.x[-2], optimum.x[-1]).system
+    if -optimum.fun < fit.log_likelihood + _SETTLING_MARGIN:
         return fit
-    livelier = float(np.exp(np.log(settled.ratios / system.ratios).mean()))
-    return _solve(replace(system, pace=np.maximum(1.0, livelier * settled.paces)), problem)
+    start_scale = float(np.exp(np.log(settled.ratios / system.ratios).mean()))
+    scale = np.maximum(1.0, start_scale * settled.step_scales)
+    return _solve(replace(system, process_noise_scale=scale), problem)
 
 
 def _downweight(fit: DriftFit) -> Array:
-    """Relative variances (n,) under which a reading far from all others stops to pull, with a redescending influence."""
+    """Relative variances (n,) under which a reading far from the others is down-weighted (redescending weight function)."""
     excess = np.abs(np.nan_to_num(fit.deletion_residuals())) / _OUTLIER_LIMIT
     return np.where(excess > 1.0, excess**2, 1.0)
 
@@ -295,26 +323,40 @@ def estimate(
     observed: NDArray[np.bool_] | None = None,
     variance: Array | None = None,
 ) -> DriftFit:
-    """Fit fixed effects and the drift's variances together by restricted maximum likelihood.
+    """Fit fixed effects and the variances of the drift together by restricted maximum likelihood.
 
     Parameters
     ----------
-    seconds, loadings, response, design : (n,), (n, components), (n,), (n, p)
-        Readings sorted by time. The design must span the loadings (a drift starts at zero).
-    order : 1, 2 or None
-        None chooses between both by the restricted likelihood with identical fixed effects (statistics study, section 1.2).
+    seconds : (n,) ndarray
+        Time of each reading, s, not decreasing.
+    loadings : (n, components) ndarray
+        How each drift component enters each reading.
+    response : (n,) ndarray
+        Readings, in any unit; all results are in that unit.
+    design : (n, p) ndarray
+        Columns of the fixed effects; they must span the loadings, because the drift starts at zero.
+    order : {1, 2}, optional
+        1 random walk, 2 integrated random walk; None: chosen by the restricted likelihood with identical fixed effects.
     robust : bool
-        Give readings whose deletion residual exceeds 3 standard deviations a larger variance, and repeat.
+        Down-weight readings whose deletion residual exceeds 3 standard deviations, and repeat.
     settling : bool
-        Let the drift's variance be larger at the start where the restricted likelihood clearly asks for it, as in a warm-up.
-    start : (components,) variance ratios to start from.
-    observed : (n,) readings that may inform the fit; the others are predicted in open loop.
-    variance : (n,) relative variances of the readings.
+        Allow larger process noise at the start, as in a warm-up, where the restricted likelihood clearly asks for it.
+    start : (components,) ndarray, optional
+        Variance ratios to start the search from, per s (order 1) or per s^3 (order 2); used with a given order only.
+    observed : (n,) ndarray of bool, optional
+        Readings that inform the fit; the others are predicted in open loop. None: all.
+    variance : (n,) ndarray, optional
+        Relative variances of the readings; None: 1 for all.
 
     Returns
     -------
     DriftFit
-        The start rates of an integrated walk are appended to the design, after the caller's columns.
+        The start rates of an integrated random walk, per hour, are appended to the design after the caller's columns.
+
+    Raises
+    ------
+    DriftModelError
+        As `drift_system` and `fit_fixed_effects`.
     """
     trends = start_columns(seconds, loadings, 2)[:, loadings.shape[1] :]
     with_trends = np.column_stack([design, trends])
@@ -337,41 +379,87 @@ def estimate(
             if (fit.system.variance == 1.0).all():
                 break
             fit = _maximise(fit.system, response, columns, fit.system.ratios)
-    return _settle(fit) if settling else fit
+    return _fit_settling(fit) if settling else fit
+
+
+def average_drift(system: DriftSystem, weights: Array, columns: Array) -> tuple[Array, Array, Array]:
+    """Average the drift that columns imply over the readings, with the exact covariance of the average, in two passes.
+
+    Averages over time need the covariance between different times, which a smoother does not give. The state is therefore augmented
+    with the running average itself (an accumulator): after the last reading the filter knows it as well as smoothing would, and a
+    backward pass gives its covariance with the drift at every reading (Durbin and Koopman 2012, section 4.7).
+
+    Parameters
+    ----------
+    system : DriftSystem
+        Of n readings.
+    weights : (n,) ndarray
+        Weight of each reading in the average.
+    columns : (n, p) ndarray
+        Response and design, or any columns to be filtered.
+
+    Returns
+    -------
+    average : (components, p) ndarray
+        Weighted sum of the smoothed drift of each column, in the units of the columns.
+    covariance : (components, components) ndarray
+        Of the average's error, the coefficients being known, in units of sigma^2.
+    with_drift : (n, components, components) ndarray
+        Covariance of the error of each reading's drift (second axis) with that of the average (third), likewise.
+    """
+    weights = np.ascontiguousarray(weights, float)
+    state, covariance, predicted, gains = _filter_with_average(
+        system.seconds,
+        system.loadings,
+        system.order,
+        system.ratios,
+        system.step_scales,
+        system.variance,
+        system.observed,
+        weights,
+        np.ascontiguousarray(columns, float),
+    )
+    m = system.loadings.shape[1] * system.order
+    with_drift = _covariance_with_average(system.seconds, system.loadings, system.order, weights, predicted, gains)
+    return state[m:], covariance[m:, m:], with_drift
 
 
 @njit(cache=True)
-def _filter(
+def _filter_with_average(
     seconds: Array,
     loadings: Array,
     order: int,
     ratios: Array,
-    pace: Array,
+    process_noise_scale: Array,
     variance: Array,
     observed: NDArray[np.bool_],
     weights: Array,
     columns: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Filter with the average as part of the state: last state (size, p) and covariance (size, size), predicted covariances, gains."""
+    """Filter with the average as part of the state.
+
+    Returns the last state (size, p) and its covariance (size, size), the predicted covariances (n, size, size) and the gains
+    (n, size), size being order * components of the drift and components of the average.
+    """
     n, components = loadings.shape
     m = components * order
     size = m + components
     state = np.zeros((size, columns.shape[1]))
     covariance = np.zeros((size, size))
-    seen, error = np.zeros(size), np.empty(columns.shape[1])
+    cross_covariance, innovation = np.zeros(size), np.empty(columns.shape[1])
     predicted = np.zeros((n, size, size))
     gains = np.zeros((n, size))
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        kalman.advance(state[:m], order, step)
-        kalman.predict(covariance, order, ratios, pace[k], step)
+        kalman.predict_state(state[:m], order, step)
+        kalman.predict_covariance(covariance, order, ratios, process_noise_scale[k], step)
         predicted[k] = covariance
         if observed[k]:
-            spread = kalman.look(covariance, order, loadings, k, variance[k], seen)
-            kalman.learn(covariance, seen, spread)
-            kalman.correct(state, order, loadings, k, columns[k], seen, spread, error)
+            total = kalman.innovation_variance(covariance, order, loadings, k, variance[k], cross_covariance)
+            kalman.update_covariance(covariance, cross_covariance, total)
+            kalman.update_state(state, order, loadings, k, columns[k], cross_covariance, total, innovation)
             for i in range(size):
-                gains[k, i] = seen[i] / spread
+                gains[k, i] = cross_covariance[i] / total
         if weights[k] != 0.0:
             for c in range(components):
                 state[m + c] += weights[k] * state[c * order]
@@ -381,8 +469,14 @@ def _filter(
 
 
 @njit(cache=True)
-def _carry_back(seconds: Array, loadings: Array, order: int, weights: Array, predicted: Array, gains: Array) -> Array:
-    """Covariance (n, components, components) of the drift at every reading with the average, in units of sigma^2."""
+def _covariance_with_average(
+    seconds: Array, loadings: Array, order: int, weights: Array, predicted: Array, gains: Array
+) -> Array:
+    """Covariance (n, components, components) of the drift at every reading with the average, in units of sigma^2.
+
+    Going back from the last reading, ``onward`` is the product of the transitions, updates and averaging steps that lead from the
+    predicted state of a reading to the final average; the covariance is the predicted one times its transpose.
+    """
     n, components = loadings.shape
     m = components * order
     size = m + components
@@ -397,13 +491,13 @@ def _carry_back(seconds: Array, loadings: Array, order: int, weights: Array, pre
                 for i in range(components):
                     onward[i, 2 * c + 1] += step * onward[i, 2 * c]
         for i in range(components):
-            pulled = 0.0
+            effect_of_innovation = 0.0
             for c in range(components):
                 onward[i, c * order] += weights[k] * onward[i, m + c]
             for j in range(size):
-                pulled += onward[i, j] * gains[k, j]
+                effect_of_innovation += onward[i, j] * gains[k, j]
             for c in range(components):
-                onward[i, c * order] -= pulled * loadings[k, c]
+                onward[i, c * order] -= effect_of_innovation * loadings[k, c]
         for c in range(components):
             for i in range(components):
                 for j in range(size):
@@ -411,38 +505,36 @@ def _carry_back(seconds: Array, loadings: Array, order: int, weights: Array, pre
     return with_drift
 
 
-def average_drift(system: DriftSystem, weights: Array, columns: Array) -> tuple[Array, Array, Array]:
-    """Average the drift that columns imply over the readings.
+def von_neumann_p_value(series: Array) -> float:
+    """Return the one-sided p-value of positive serial dependence by the von Neumann ratio.
 
     Parameters
     ----------
-    system : DriftSystem
-    weights : (n,) ndarray
-        One per reading.
-    columns : (n, p) ndarray
-        Response and design, or any columns to be filtered.
+    series : (n,) ndarray
+        Values at successive times, in any unit.
 
     Returns
     -------
-    average : (components, p) ndarray
-        Weighted sum of the smoothed drift of each column.
-    covariance : (components, components) ndarray
-        Of the average's error, the coefficients being known, in units of sigma^2.
-    with_drift : (n, components, components) ndarray
-        Covariance of the error of each reading's drift (second axis) with that of the average (third), likewise.
+    float
+        Probability, under independence, of a ratio as small or smaller; 1 for a constant series or fewer than eight values.
+
+    Notes
+    -----
+    The ratio is the sum of the squared successive differences over the sum of squares about the mean. Under independence its
+    expectation is 2 and its variance 4 (n - 2) / (n^2 - 1) (von Neumann 1941, Ann. Math. Stat. 12, 367); a normal distribution is used.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> f"{von_neumann_p_value(np.arange(8.0)):.5f}"
+    '0.00149'
+    >>> f"{von_neumann_p_value(np.tile([1.0, -1.0], 4)):.5f}"
+    '0.99246'
     """
-    weights = np.ascontiguousarray(weights, float)
-    state, covariance, predicted, gains = _filter(
-        system.seconds,
-        system.loadings,
-        system.order,
-        system.ratios,
-        system.paces,
-        system.variance,
-        system.observed,
-        weights,
-        np.ascontiguousarray(columns, float),
-    )
-    m = system.loadings.shape[1] * system.order
-    with_drift = _carry_back(system.seconds, system.loadings, system.order, weights, predicted, gains)
-    return state[m:], covariance[m:, m:], with_drift
+    n = series.size
+    if n < _SHORTEST_SERIES or np.ptp(series) == 0:
+        return 1.0
+    centred = series - series.mean()
+    ratio = float((np.diff(series) ** 2).sum() / (centred**2).sum())
+    deviation = np.sqrt(4.0 * (n - 2.0) / (n**2 - 1.0))
+    return float(stats.norm.cdf((ratio - 2.0) / deviation))

@@ -1,7 +1,15 @@
-"""The recursions behind the drift estimate, compiled: gains, prediction errors, smoothing, and least squares by sweeping.
+"""Kalman filter, fixed-interval smoother and least squares by sweeping: the compiled recursions behind the drift estimate.
 
-The state holds one level per drift component (order 1) or level and rate (order 2); readings come at irregular times. Equations:
-Durbin and Koopman (2012), sections 4.3-4.5.
+Notation of Durbin and Koopman (2012), *Time series analysis by state space methods*, 2nd ed., chapter 4, for one reading at a time::
+
+    y_k = Z_k alpha_k + e_k                    e_k ~ N(0, sigma^2 v_k)
+    alpha_k+1 = T_k alpha_k + eta_k            eta_k ~ N(0, sigma^2 Q_k)
+
+The state alpha holds one level per drift component (order 1: random walk, T = 1) or level and rate (order 2: integrated random walk,
+T = [[1, h], [0, 1]] over a step of h seconds). Z holds the loadings, at the levels. All variances are in units of sigma^2. The book writes
+the gain K = T P Z' / F, transition included; here the gain is M = P Z' / F and the transition is a step of its own.
+
+Arrays share these shapes: n readings, p columns that are filtered alike (response and design), c components, m = c * order states.
 """
 
 from __future__ import annotations
@@ -14,11 +22,24 @@ from interferometry._typing import Array
 
 
 @njit(cache=True)
-def predict(covariance: Array, order: int, ratios: Array, pace: float, step: float) -> None:
-    """Carry the state's covariance over a step in s, in place; pace multiplies the ratios during it."""
+def predict_covariance(covariance: Array, order: int, ratios: Array, process_noise_scale: float, step: float) -> None:
+    """Prediction step of the state covariance, in place: P = T P T' + Q (Durbin and Koopman 2012, eq. 4.24).
+
+    Parameters
+    ----------
+    covariance : (m, m) ndarray
+        P, in units of sigma^2; a leading block of a larger matrix moves with the rest of it.
+    order : {1, 2}
+    ratios : (c,) ndarray
+        Process noise over reading variance, per s (order 1) or s^3 (order 2).
+    process_noise_scale : float
+        Factor on the ratios during this step.
+    step : float
+        Time since the reading before, s.
+    """
     m = covariance.shape[0]
     for c in range(ratios.size):
-        level, ratio = c * order, ratios[c] * pace
+        level, ratio = c * order, ratios[c] * process_noise_scale
         if order == 2:
             rate = level + 1
             for j in range(m):
@@ -34,32 +55,72 @@ def predict(covariance: Array, order: int, ratios: Array, pace: float, step: flo
 
 
 @njit(cache=True)
-def look(covariance: Array, order: int, loadings: Array, k: int, variance: float, seen: Array) -> float:
-    """Innovation variance of reading k in units of sigma^2; its covariance with the state is left in `seen`."""
+def innovation_variance(
+    covariance: Array, order: int, loadings: Array, k: int, variance: float, cross_covariance: Array
+) -> float:
+    """Innovation variance of one reading, F = Z P Z' + v (Durbin and Koopman 2012, eq. 4.24).
+
+    Parameters
+    ----------
+    covariance : (m, m) ndarray
+        P, predicted, in units of sigma^2.
+    order : {1, 2}
+    loadings : (n, c) ndarray
+    k : int
+        Index of the reading.
+    variance : float
+        Relative variance v of the reading.
+    cross_covariance : (m,) ndarray
+        Overwritten with P Z', the covariance of the state with the reading.
+
+    Returns
+    -------
+    float
+        F, in units of sigma^2.
+    """
     components = loadings.shape[1]
     for i in range(covariance.shape[0]):
-        seen[i] = 0.0
+        cross_covariance[i] = 0.0
         for c in range(components):
-            seen[i] += covariance[i, c * order] * loadings[k, c]
-    spread = variance
+            cross_covariance[i] += covariance[i, c * order] * loadings[k, c]
+    total = variance
     for c in range(components):
-        spread += loadings[k, c] * seen[c * order]
-    return spread
+        total += loadings[k, c] * cross_covariance[c * order]
+    return total
 
 
 @njit(cache=True)
-def learn(covariance: Array, seen: Array, spread: float) -> None:
-    """Take from the state's covariance what a reading tells, in place."""
+def update_covariance(covariance: Array, cross_covariance: Array, innovation_variance: float) -> None:
+    """Measurement update of the state covariance, in place: P = P - P Z' Z P / F (Durbin and Koopman 2012, eq. 4.24).
+
+    Parameters
+    ----------
+    covariance : (m, m) ndarray
+        P, in units of sigma^2.
+    cross_covariance : (m,) ndarray
+        P Z' of the reading, from `innovation_variance`.
+    innovation_variance : float
+        F of the reading, in units of sigma^2.
+    """
     m = covariance.shape[0]
-    precision = 1.0 / spread
+    precision = 1.0 / innovation_variance
     for i in range(m):
         for j in range(m):
-            covariance[i, j] -= seen[i] * seen[j] * precision
+            covariance[i, j] -= cross_covariance[i] * cross_covariance[j] * precision
 
 
 @njit(cache=True)
-def advance(state: Array, order: int, step: float) -> None:
-    """Carry the expected state (m, p) of every column over a step in s, in place."""
+def predict_state(state: Array, order: int, step: float) -> None:
+    """Prediction step of the expected state of every column, in place: a = T a (Durbin and Koopman 2012, eq. 4.24).
+
+    Parameters
+    ----------
+    state : (m, p) ndarray
+        In the units of the columns; rates per s.
+    order : {1, 2}
+    step : float
+        Time since the reading before, s.
+    """
     if order == 2:
         for c in range(state.shape[0] // 2):
             level, rate = state[2 * c], state[2 * c + 1]
@@ -68,81 +129,153 @@ def advance(state: Array, order: int, step: float) -> None:
 
 
 @njit(cache=True)
-def correct(
-    state: Array, order: int, loadings: Array, k: int, reading: Array, seen: Array, spread: float, error: Array
+def update_state(
+    state: Array,
+    order: int,
+    loadings: Array,
+    k: int,
+    reading: Array,
+    cross_covariance: Array,
+    innovation_variance: float,
+    innovation: Array,
 ) -> None:
-    """Leave the prediction errors (p,) of reading k in `error`, and move the expected state (m, p) by them, in place."""
-    for j in range(error.size):
-        error[j] = reading[j]
+    """Measurement update of the expected state of every column, in place: a = a + P Z' (y - Z a) / F (eq. 4.24).
+
+    Parameters
+    ----------
+    state : (m, p) ndarray
+    order : {1, 2}
+    loadings : (n, c) ndarray
+    k : int
+        Index of the reading.
+    reading : (p,) ndarray
+        Row k of the columns.
+    cross_covariance : (m,) ndarray
+        P Z' of the reading, from `innovation_variance`.
+    innovation_variance : float
+        F of the reading, in units of sigma^2.
+    innovation : (p,) ndarray
+        Overwritten with y - Z a, the one-step prediction error of every column.
+    """
+    for j in range(innovation.size):
+        innovation[j] = reading[j]
     for c in range(loadings.shape[1]):
         level, loading = state[c * order], loadings[k, c]
-        for j in range(error.size):
-            error[j] -= loading * level[j]
-    for i in range(seen.size):
-        gain, one = seen[i] / spread, state[i]
-        for j in range(error.size):
-            one[j] += gain * error[j]
+        for j in range(innovation.size):
+            innovation[j] -= loading * level[j]
+    for i in range(cross_covariance.size):
+        gain, expected = cross_covariance[i] / innovation_variance, state[i]
+        for j in range(innovation.size):
+            expected[j] += gain * innovation[j]
 
 
 @njit(cache=True)
-def gains(
+def filter_covariance(
     seconds: Array,
     loadings: Array,
     order: int,
     ratios: Array,
-    pace: Array,
+    process_noise_scale: Array,
     variance: Array,
     observed: NDArray[np.bool_],
     keep: bool,
 ) -> tuple[Array, Array, Array]:
-    """Kalman gains (n, m), innovation variances (n,) in units of sigma^2, and predicted covariances (n, m, m) if kept."""
+    """Run the covariance half of the filter over all readings (Durbin and Koopman 2012, section 4.3); it does not need their values.
+
+    Parameters
+    ----------
+    seconds : (n,) ndarray
+        Time of each reading, s, not decreasing.
+    loadings : (n, c) ndarray
+    order : {1, 2}
+    ratios : (c,) ndarray
+        Process noise over reading variance, per s (order 1) or s^3 (order 2).
+    process_noise_scale : (n,) ndarray
+        Factor on the ratios in the step before each reading.
+    variance : (n,) ndarray
+        Relative variance of each reading.
+    observed : (n,) ndarray of bool
+        Readings that update the state.
+    keep : bool
+        Whether the predicted covariances are needed, for the smoother.
+
+    Returns
+    -------
+    gains : (n, m) ndarray
+        M = P Z' / F; zero for a reading that is not observed.
+    innovation_variances : (n,) ndarray
+        F, in units of sigma^2.
+    covariances : (n, m, m) ndarray
+        Predicted P of every reading; (1, m, m) and empty of meaning without `keep`.
+    """
     n, components = loadings.shape
     m = components * order
     gains = np.zeros((n, m))
-    spread = np.empty(n)
-    kept = np.zeros((n if keep else 1, m, m))
+    innovation_variances = np.empty(n)
+    covariances = np.zeros((n if keep else 1, m, m))
     covariance = np.zeros((m, m))
-    seen = np.zeros(m)
+    cross_covariance = np.zeros(m)
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        predict(covariance, order, ratios, pace[k], step)
+        predict_covariance(covariance, order, ratios, process_noise_scale[k], step)
         if keep:
-            kept[k] = covariance
-        spread[k] = look(covariance, order, loadings, k, variance[k], seen)
+            covariances[k] = covariance
+        innovation_variances[k] = innovation_variance(covariance, order, loadings, k, variance[k], cross_covariance)
         if observed[k]:
             for i in range(m):
-                gains[k, i] = seen[i] / spread[k]
-            learn(covariance, seen, spread[k])
-    return gains, spread, kept
+                gains[k, i] = cross_covariance[i] / innovation_variances[k]
+            update_covariance(covariance, cross_covariance, innovation_variances[k])
+    return gains, innovation_variances, covariances
 
 
 @njit(cache=True)
-def innovations(
+def filter_columns(
     seconds: Array, loadings: Array, order: int, gains: Array, columns: Array, keep: bool
 ) -> tuple[Array, Array]:
-    """One-step prediction errors (n, p) of every column under the same gains, and predicted states (n, m, p) if kept."""
+    """Run the state half of the filter: the innovations of every column under the same gains.
+
+    Parameters
+    ----------
+    seconds : (n,) ndarray
+        Time of each reading, s, not decreasing.
+    loadings : (n, c) ndarray
+    order : {1, 2}
+    gains : (n, m) ndarray
+        From `filter_covariance`.
+    columns : (n, p) ndarray
+        Response and design columns.
+    keep : bool
+        Whether the predicted states are needed, for the smoother.
+
+    Returns
+    -------
+    innovations : (n, p) ndarray
+        One-step prediction errors, in the units of the columns.
+    states : (n, m, p) ndarray
+        Predicted states a; (1, m, p) and empty of meaning without `keep`.
+    """
     n, components = loadings.shape
     m = gains.shape[1]
     p = columns.shape[1]
-    errors = np.empty((n, p))
-    kept = np.zeros((n if keep else 1, m, p))
+    innovations = np.empty((n, p))
+    states = np.zeros((n if keep else 1, m, p))
     state = np.zeros((m, p))
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        advance(state, order, step)
+        predict_state(state, order, step)
         if keep:
-            kept[k] = state
+            states[k] = state
         for j in range(p):
             predicted = 0.0
             for c in range(components):
                 predicted += loadings[k, c] * state[c * order, j]
-            errors[k, j] = columns[k, j] - predicted
+            innovations[k, j] = columns[k, j] - predicted
         for i in range(m):
             gain = gains[k, i]
             if gain != 0.0:
                 for j in range(p):
-                    state[i, j] += gain * errors[k, j]
-    return errors, kept
+                    state[i, j] += gain * innovations[k, j]
+    return innovations, states
 
 
 @njit(cache=True)
@@ -151,23 +284,59 @@ def smooth(
     loadings: Array,
     order: int,
     gains: Array,
-    spread: Array,
+    innovation_variances: Array,
     observed: NDArray[np.bool_],
-    errors: Array,
+    innovations: Array,
     states: Array,
     covariances: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Backward pass: smoothed levels (n, components, p), their covariances (n, components, components), u (n, p) and D (n,)."""
+    """Fixed-interval smoother of the levels and of the observation disturbances, in one backward pass.
+
+    Parameters
+    ----------
+    seconds : (n,) ndarray
+        Time of each reading, s, not decreasing.
+    loadings : (n, c) ndarray
+    order : {1, 2}
+    gains, innovation_variances, covariances : (n, m), (n,), (n, m, m) ndarray
+        From `filter_covariance` with ``keep``.
+    observed : (n,) ndarray of bool
+    innovations, states : (n, p), (n, m, p) ndarray
+        From `filter_columns` with ``keep``.
+
+    Returns
+    -------
+    levels : (n, c, p) ndarray
+        Smoothed levels, in the units of the columns.
+    level_covariance : (n, c, c) ndarray
+        Their covariance, in units of sigma^2.
+    u : (n, p) ndarray
+        Smoothing errors; ``v u`` is the estimated noise of a reading, ``u / D`` its deletion residual.
+    D : (n,) ndarray
+        Variance of u, in units of 1 / sigma^2; ``1 / D`` is the variance of the deletion residual. Zero where not observed.
+
+    Notes
+    -----
+    Disturbance smoothing, Durbin and Koopman (2012), section 4.5, eq. 4.69, from the last reading to the first, starting at r = 0
+    and N = 0; i is the innovation, because v is the reading's variance here::
+
+        r = T' r                                   N = T' N T
+        u = i / F - M' r                           D = 1 / F + M' N M
+        r = r + Z' u                               N = N + Z' D Z - Z' M' N - N M Z
+
+    State smoothing, section 4.4, eq. 4.44: level = a + P r, covariance = P - P N P. The deletion residual is that of
+    de Jong (1988), J. R. Stat. Soc. B 50, 143.
+    """
     n, components = loadings.shape
     m = gains.shape[1]
-    p = errors.shape[1]
+    p = innovations.shape[1]
     levels = np.empty((n, components, p))
     level_covariance = np.empty((n, components, components))
     u = np.zeros((n, p))
-    d = np.zeros(n)
+    D = np.zeros(n)
     r = np.zeros((m, p))
-    big_n = np.zeros((m, m))
-    nk = np.zeros(m)
+    N = np.zeros((m, m))
+    NM = np.zeros(m)
     for k in range(n - 1, -1, -1):
         if k < n - 1 and order == 2:
             step = seconds[k + 1] - seconds[k]
@@ -175,18 +344,18 @@ def smooth(
                 for j in range(p):
                     r[2 * c + 1, j] += step * r[2 * c, j]
                 for j in range(m):
-                    big_n[2 * c + 1, j] += step * big_n[2 * c, j]
+                    N[2 * c + 1, j] += step * N[2 * c, j]
                 for j in range(m):
-                    big_n[j, 2 * c + 1] += step * big_n[j, 2 * c]
+                    N[j, 2 * c + 1] += step * N[j, 2 * c]
         if observed[k]:
-            d[k] = 1.0 / spread[k]
+            D[k] = 1.0 / innovation_variances[k]
             for i in range(m):
-                nk[i] = 0.0
+                NM[i] = 0.0
                 for j in range(m):
-                    nk[i] += big_n[i, j] * gains[k, j]
-                d[k] += gains[k, i] * nk[i]
+                    NM[i] += N[i, j] * gains[k, j]
+                D[k] += gains[k, i] * NM[i]
             for j in range(p):
-                u[k, j] = errors[k, j] / spread[k]
+                u[k, j] = innovations[k, j] / innovation_variances[k]
             for i in range(m):
                 for j in range(p):
                     u[k, j] -= gains[k, i] * r[i, j]
@@ -195,34 +364,34 @@ def smooth(
                 for j in range(p):
                     r[level, j] += loading * u[k, j]
                 for j in range(m):
-                    big_n[level, j] -= loading * nk[j]
-                    big_n[j, level] -= loading * nk[j]
+                    N[level, j] -= loading * NM[j]
+                    N[j, level] -= loading * NM[j]
                 for e in range(components):
-                    big_n[level, e * order] += loading * loadings[k, e] * d[k]
-        smooth_levels(order, covariances[k], states[k], r, big_n, levels[k], level_covariance[k])
-    return levels, level_covariance, u, d
+                    N[level, e * order] += loading * loadings[k, e] * D[k]
+        _smooth_levels(order, covariances[k], states[k], r, N, levels[k], level_covariance[k])
+    return levels, level_covariance, u, D
 
 
 @njit(cache=True)
-def smooth_levels(
-    order: int, predicted: Array, state: Array, r: Array, big_n: Array, levels: Array, level_covariance: Array
+def _smooth_levels(
+    order: int, covariance: Array, state: Array, r: Array, N: Array, levels: Array, level_covariance: Array
 ) -> None:
-    """Leave the smoothed levels (components, p) and their covariance (components, components) of one reading in the last two."""
+    """Write a + P r and P - P N P of one reading, at the levels, into the last two arguments (eq. 4.44)."""
     components, p = levels.shape
-    m = predicted.shape[0]
+    m = covariance.shape[0]
     for c in range(components):
-        own = predicted[c * order]
+        row = covariance[c * order]
         for j in range(p):
             levels[c, j] = state[c * order, j]
         for i in range(m):
             for j in range(p):
-                levels[c, j] += own[i] * r[i, j]
+                levels[c, j] += row[i] * r[i, j]
         for e in range(components):
-            other = predicted[e * order]
-            level_covariance[c, e] = own[e * order]
+            other = covariance[e * order]
+            level_covariance[c, e] = row[e * order]
             for i in range(m):
                 for j in range(m):
-                    level_covariance[c, e] -= own[i] * big_n[i, j] * other[j]
+                    level_covariance[c, e] -= row[i] * N[i, j] * other[j]
 
 
 @njit(cache=True)
@@ -231,41 +400,64 @@ def normal_equations(
     loadings: Array,
     order: int,
     ratios: Array,
-    pace: Array,
+    process_noise_scale: Array,
     variance: Array,
     observed: NDArray[np.bool_],
     columns: Array,
 ) -> tuple[Array, float]:
-    """Gram matrix (p, p) of the columns' standardised prediction errors, and the log-determinant of the readings' covariance.
+    """Gram matrix of the standardised innovations of the observed readings, in one pass over the readings.
 
-    One pass over the readings, of which only the state and the errors of the last four are kept: a likelihood then costs its
-    arithmetic, where a long test would otherwise wait for memory.
+    Only the state and the innovations of the last four readings are kept: a likelihood then costs its arithmetic, where a long
+    test would otherwise wait for memory.
+
+    Parameters
+    ----------
+    seconds : (n,) ndarray
+        Time of each reading, s, not decreasing.
+    loadings : (n, c) ndarray
+    order : {1, 2}
+    ratios : (c,) ndarray
+        Process noise over reading variance, per s (order 1) or s^3 (order 2).
+    process_noise_scale : (n,) ndarray
+        Factor on the ratios in the step before each reading.
+    variance : (n,) ndarray
+        Relative variance of each reading.
+    observed : (n,) ndarray of bool
+    columns : (n, p) ndarray
+        Response and design columns.
+
+    Returns
+    -------
+    gram : (p, p) ndarray
+        Sum over the readings of innovation' innovation / F.
+    log_determinant : float
+        Logarithm of the determinant of the readings' covariance over sigma^2, sum of log F.
     """
     n, components = loadings.shape
     p = columns.shape[1]
     covariance = np.zeros((components * order, components * order))
-    seen = np.zeros(components * order)
+    cross_covariance = np.zeros(components * order)
     state = np.zeros((components * order, p))
-    errors, precision, held = np.zeros((4, p)), np.zeros(4), 0
+    innovations, precision, held = np.zeros((4, p)), np.zeros(4), 0
     gram = np.zeros((p, p))
     log_determinant = 0.0
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        predict(covariance, order, ratios, pace[k], step)
-        advance(state, order, step)
+        predict_covariance(covariance, order, ratios, process_noise_scale[k], step)
+        predict_state(state, order, step)
         if not observed[k]:
             continue
-        spread = look(covariance, order, loadings, k, variance[k], seen)
-        learn(covariance, seen, spread)
-        correct(state, order, loadings, k, columns[k], seen, spread, errors[held])
-        log_determinant += np.log(spread)
-        precision[held] = 1.0 / spread
+        total = innovation_variance(covariance, order, loadings, k, variance[k], cross_covariance)
+        update_covariance(covariance, cross_covariance, total)
+        update_state(state, order, loadings, k, columns[k], cross_covariance, total, innovations[held])
+        log_determinant += np.log(total)
+        precision[held] = 1.0 / total
         held += 1
         if held == 4:
-            _add_products(gram, errors, precision)
+            _add_products(gram, innovations, precision)
             held = 0
     precision[held:] = 0.0
-    _add_products(gram, errors, precision)
+    _add_products(gram, innovations, precision)
     for i in range(p):
         for j in range(i):
             gram[j, i] = gram[i, j]
@@ -273,9 +465,9 @@ def normal_equations(
 
 
 @njit(cache=True)
-def _add_products(gram: Array, errors: Array, precision: Array) -> None:
+def _add_products(gram: Array, innovations: Array, precision: Array) -> None:
     """Add the weighted outer products of four rows to the lower triangle; four at a time load and store it a quarter as often."""
-    a, b, c, d = errors[0], errors[1], errors[2], errors[3]
+    a, b, c, d = innovations[0], innovations[1], innovations[2], innovations[3]
     for i in range(a.size):
         wa, wb, wc, wd = precision[0] * a[i], precision[1] * b[i], precision[2] * c[i], precision[3] * d[i]
         row = gram[i]
@@ -285,10 +477,27 @@ def _add_products(gram: Array, errors: Array, precision: Array) -> None:
 
 @njit(cache=True)
 def sweep(matrix: Array, tolerance: float) -> tuple[Array, float, int]:
-    """Sweep a scaled Gram matrix (response first) on every design column (Goodnight 1979, The American Statistician 33, 149).
+    """Sweep a Gram matrix on every design column: least squares, its inverse and its determinant in one go.
 
-    Returns the swept matrix (residual sum of squares, coefficients, inverse), the log-determinant of the design's block,
-    and the first column that depends on those before it, or -1.
+    Parameters
+    ----------
+    matrix : (1 + q, 1 + q) ndarray
+        Gram matrix of response (first) and q design columns, each design column scaled to unit length.
+    tolerance : float
+        Share of a column's squared length below which what the columns before it leave unexplained counts as nothing.
+
+    Returns
+    -------
+    swept : (1 + q, 1 + q) ndarray
+        Residual sum of squares at [0, 0], coefficients in column 0, inverse of the design's block.
+    log_determinant : float
+        Of the design's block.
+    dependent : int
+        First design column that depends linearly on those before it; -1 where none does.
+
+    References
+    ----------
+    Goodnight (1979), A tutorial on the SWEEP operator, The American Statistician 33, 149.
     """
     swept = matrix.copy()
     size = swept.shape[0]

@@ -1,4 +1,4 @@
-"""How long to measure: cycles for a wanted uncertainty, time until thermally stable, spacing against the lead."""
+"""Planning of a positioning test from a trial: cycles for a wanted uncertainty, target spacing, time until thermally stable."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import xarray as xr
 from scipy import optimize, stats
 
 from interferometry._typing import Array
-from interferometry.drift.estimate import loadings_of
+from interferometry.drift.estimate import component_loadings
 from interferometry.errors import InterferometryError
 
 #: Shares of the final drift whose times are named t63 and t95.
@@ -24,16 +24,18 @@ SETTLING_LEVEL = 1e-3
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What a measurement has to be for a wanted uncertainty.
+class MeasurementPlan:
+    """Length of a positioning test for a wanted uncertainty.
 
     Attributes
     ----------
     cycles : int
     duration_s : float
+        Time of these cycles at the pace of the trial, s.
     u_um : float
-        Standard uncertainty of a position against the first one that these cycles reach.
+        Standard uncertainty of a position against the first one that these cycles reach, um.
     warnings : tuple of str
+        About the target spacing; empty where there is nothing to warn about, or no lead was given.
     """
 
     cycles: int
@@ -44,16 +46,18 @@ class Plan:
 
 @dataclass(frozen=True)
 class Settling:
-    """When an exponential drift has gone 63 % and 95 % of its way, in s since the first reading.
+    """Time after which an exponential drift component has reached 63 % and 95 % of its final value.
 
     Attributes
     ----------
     component : str
+        Name of the drift component.
     t63_s, t95_s : float
+        Since the first reading, s.
     t63_low_s, t63_high_s, t95_low_s, t95_high_s : float
-        95 % bands; infinite where the test is too short to see the end.
+        Limits of the 95 % confidence intervals, s; infinite where the test is too short to show the end.
     amplitude_um : float
-        Final drift at the component's full share.
+        Final drift where the component's loading is 1, um.
     """
 
     component: str
@@ -72,54 +76,95 @@ def plan_cycles(
     *,
     wanted_u_um: float,
     lead_mm: float | None = None,
-) -> Plan:
-    """Return the cycles needed for a wanted standard uncertainty, on the machine that a test has shown.
-
-    The uncertainty of a position against the first one, both directions together, falls with the root of the number of
-    readings once the joint estimate has taken the drift out.
+) -> MeasurementPlan:
+    """Return the number of cycles that a wanted standard uncertainty needs, on the machine of a trial.
 
     Parameters
     ----------
     estimated : xarray.Dataset
-        What `drift.estimate_drift` returns for a trial on this machine.
+        What `estimate_drift` returns for the trial.
     deviations : xarray.Dataset
-        The trial itself: its targets, and its cycle's duration.
+        The trial itself (keeps ``contract.DEVIATIONS``): its targets, and the duration of its cycle.
     wanted_u_um : float
+        Standard uncertainty of every position against the first one, mean of both directions, um.
     lead_mm : float, optional
-        Lead of the screw, for the warning about spacing.
+        Lead of the screw, mm, for the warning about the target spacing; None: no warning.
+
+    Returns
+    -------
+    MeasurementPlan
 
     Raises
     ------
     InterferometryError
-        ``wanted_u_um`` is not above 0, or needs more than 100,000 cycles.
+        ``wanted_u_um`` or ``lead_mm`` is not above 0, more than 100,000 cycles would be needed, or no direction of the trial holds
+        every target.
+
+    Notes
+    -----
+    Once the joint estimate has removed the drift, the uncertainty falls with the root of the number of readings (GUM, JCGM 100:2008,
+    4.2.3): n = n_trial (u_trial / u_wanted)^2, at least 2.
+
+    Examples
+    --------
+    A trial of ten cycles over three targets, 60 s each, whose readings scatter by 0.5 um:
+
+    >>> import numpy as np
+    >>> from interferometry.deviations import build_deviations
+    >>> from interferometry.drift.estimate import estimate_drift
+    >>> seconds = 10.0 * np.arange(60.0).reshape(10, 2, 3)
+    >>> noise = np.random.default_rng(0).normal(0, 0.5, (10, 2, 3))
+    >>> time = np.datetime64("2026-03-09T06:30") + (1e9 * seconds).astype("timedelta64[ns]")
+    >>> trial = build_deviations(range(1, 11), [1, 2, 3], np.array([0.0, 150.0, 300.0]), noise, time)
+    >>> plan = plan_cycles(estimate_drift(trial), trial, wanted_u_um=0.05, lead_mm=10.0)
+    >>> plan.u_um <= 0.05, round(plan.duration_s / plan.cycles)
+    (True, 60)
+    >>> plan.warnings[0].split(":")[0]
+    'every target spacing is a whole number of leads (10 mm)'
     """
     if not wanted_u_um > 0:
         raise InterferometryError(f"wanted_u_um={wanted_u_um} is not above 0")
     measured = int(np.isfinite(deviations["deviation"].values).any(axis=(1, 2)).sum())
-    worst = _relative_u_both_directions(estimated)
-    cycles = max(2, math.ceil(measured * (worst / wanted_u_um) ** 2))
+    largest_u = _largest_relative_u(estimated)
+    cycles = max(2, math.ceil(measured * (largest_u / wanted_u_um) ** 2))
     if cycles > LONGEST_SEARCH_CYCLES:
         raise InterferometryError(
             f"wanted_u_um={wanted_u_um} would need {cycles} cycles with this scatter; ask for more"
         )
     period = _cycle_period_s(deviations)
     warnings = [] if lead_mm is None else spacing_warnings(deviations["position"].values, lead_mm=lead_mm)
-    return Plan(cycles, cycles * period, worst * math.sqrt(measured / cycles), tuple(warnings))
+    return MeasurementPlan(cycles, cycles * period, largest_u * math.sqrt(measured / cycles), tuple(warnings))
 
 
 def spacing_warnings(position_mm: Array, *, lead_mm: float) -> list[str]:
-    """Return warnings where target spacings hide the screw's periodic error.
+    """Return a warning where the target spacing hides the periodic error of the screw.
 
     Parameters
     ----------
     position_mm : (target,) ndarray
+        Target positions, mm, in any order.
     lead_mm : float
+        Lead of the screw, mm.
+
+    Returns
+    -------
+    list of str
+        One warning where every spacing is a whole number of leads within 2 %, else empty.
+
+    Raises
+    ------
+    InterferometryError
+        ``lead_mm`` is not above 0.
+
+    Notes
+    -----
+    ISO 230-2 asks for target positions P_i = (i - 1) p + r, with r a random part within the period of the expected error.
     """
     if not lead_mm > 0:
         raise InterferometryError(f"lead_mm={lead_mm} is not above 0")
     leads = np.diff(np.sort(position_mm)) / lead_mm
-    whole = np.abs(leads - np.round(leads)) < SPACING_TOLERANCE
-    if whole.all() and np.all(np.round(leads) >= 1):
+    is_whole = np.abs(leads - np.round(leads)) < SPACING_TOLERANCE
+    if is_whole.all() and np.all(np.round(leads) >= 1):
         return [
             f"every target spacing is a whole number of leads ({lead_mm:g} mm): a periodic screw error looks constant; "
             "add a random part to each position (equation 1)"
@@ -127,8 +172,8 @@ def spacing_warnings(position_mm: Array, *, lead_mm: float) -> list[str]:
     return []
 
 
-def _relative_u_both_directions(estimated: xr.Dataset) -> float:
-    """Return the largest standard uncertainty of (position - first position), the mean of both directions."""
+def _largest_relative_u(estimated: xr.Dataset) -> float:
+    """Return the largest standard uncertainty (um) of a position against the first one, mean of both directions."""
     covariance = estimated["covariance"].values
     directions, targets = covariance.shape[:2]
     measured = [d for d in range(directions) if np.isfinite(covariance[d, :, d, :]).all()]
@@ -141,47 +186,53 @@ def _relative_u_both_directions(estimated: xr.Dataset) -> float:
 
 def _cycle_period_s(deviations: xr.Dataset) -> float:
     time = deviations["time"].values.astype("datetime64[ns]")
-    starts = np.array([cycle[~np.isnat(cycle)].min() for cycle in time if (~np.isnat(cycle)).any()])
-    numbers = deviations["cycle"].values[[bool((~np.isnat(cycle)).any()) for cycle in time]]
+    has_times = (~np.isnat(time)).any(axis=(1, 2))
+    starts = np.array([cycle[~np.isnat(cycle)].min() for cycle in time[has_times]])
+    numbers = deviations["cycle"].values[has_times]
     return float(np.median(np.diff(starts).astype("f8") * 1e-9 / np.diff(numbers)))
 
 
 def estimate_settling(estimated: xr.Dataset, deviations: xr.Dataset) -> list[Settling]:
-    """Fit one exponential to each drift component and say when it is 63 % and 95 % through.
-
-    Bands come from the profile of the sum of squares over the time constant, with as many independent residuals as the
-    serial correlation of the residual leaves.
+    """Fit one exponential to each drift component: the time until it has reached 63 % and 95 % of its final value.
 
     Parameters
     ----------
     estimated : xarray.Dataset
-        What `drift.estimate_drift` returns.
+        What `estimate_drift` returns.
     deviations : xarray.Dataset
+        The deviations that it was estimated from.
 
     Returns
     -------
     list of Settling
-        One per drift component that settles; none for a stable machine.
+        One per drift component that settles; empty for a stable machine, or a test of fewer than ten cycles.
+
+    Notes
+    -----
+    Least squares over the components of each cycle. Confidence intervals are those of the profile of the sum of squares over the
+    time constant (Bates and Watts 1988, *Nonlinear regression analysis and its applications*, chapter 6), with as many
+    independent residuals as their serial correlation leaves: n (1 - r_1) / (1 + r_1).
     """
     seconds, series = _cycle_components(estimated, deviations)
     if seconds.size < SHORTEST_TEST_CYCLES:
         return []
     names = [str(name) for name in estimated["component"].values]
-    fitted = [_fit_exponential(name, seconds, series[:, at]) for at, name in enumerate(names)]
-    return [one for one in fitted if one is not None]
+    fitted = [_fit_exponential(name, seconds, series[:, column]) for column, name in enumerate(names)]
+    return [settling for settling in fitted if settling is not None]
 
 
 def _cycle_components(estimated: xr.Dataset, deviations: xr.Dataset) -> tuple[Array, Array]:
     """Return the middle of each measured cycle (s since the first reading) and its drift components, not smoothed in time."""
     time = deviations["time"].values.astype("datetime64[ns]")
     first = time[~np.isnat(time)].min()
-    left = (deviations["deviation"] - estimated["profile"]).transpose(*deviations["deviation"].dims).values
-    sign = np.where(deviations["direction"].values == "positive", 1.0, -1.0)[:, None] * np.ones(left.shape[2])
-    position = np.broadcast_to(deviations["position"].values, left.shape[1:])
+    drift = (deviations["deviation"] - estimated["profile"]).transpose(*deviations["deviation"].dims).values
+    sign = np.where(deviations["direction"].values == "positive", 1.0, -1.0)[:, None] * np.ones(drift.shape[2])
+    position = np.broadcast_to(deviations["position"].values, drift.shape[1:])
     span = float(deviations["position"].min()), float(deviations["position"].max())
-    loadings = loadings_of(sign.ravel(), position.ravel(), estimated["component"].values.tolist(), span)
+    components = estimated["component"].values.tolist()
+    loadings = component_loadings(sign.ravel(), position.ravel(), components=components, span_mm=span)
     seconds, rows = [], []
-    for cycle, values in zip(time, left, strict=True):
+    for cycle, values in zip(time, drift, strict=True):
         present = np.isfinite(values.ravel())
         if not present.any() or np.linalg.matrix_rank(loadings[present]) < loadings.shape[1]:
             continue
@@ -191,44 +242,47 @@ def _cycle_components(estimated: xr.Dataset, deviations: xr.Dataset) -> tuple[Ar
 
 
 def _fit_exponential(name: str, seconds: Array, series: Array) -> Settling | None:
+    """Return the settling of a component (um), None where an exponential explains it no better than a constant."""
     length = float(seconds[-1] - seconds[0])
 
     def solve(log_tau: float) -> tuple[float, Array, Array]:
         basis = np.column_stack([np.ones(seconds.size), 1 - np.exp(-seconds / math.exp(log_tau))])
         coefficients = np.linalg.lstsq(basis, series, rcond=None)[0]
-        left = series - basis @ coefficients
-        return float(left @ left), coefficients, left
+        residual = series - basis @ coefficients
+        return float(residual @ residual), coefficients, residual
+
+    def sum_of_squares(log_tau: float) -> float:
+        return solve(log_tau)[0]
 
     grid = np.linspace(math.log(length / 100), math.log(length * 20), 120)
-    sums = np.array([solve(one)[0] for one in grid])
-    near = grid[int(np.argmin(sums))]
+    nearest = grid[int(np.argmin([sum_of_squares(log_tau) for log_tau in grid]))]
     step = grid[1] - grid[0]
-    best = optimize.minimize_scalar(lambda one: solve(one)[0], bounds=(near - step, near + step), method="bounded")
-    lowest, coefficients, left = solve(float(best.x))
-    lag = float((left[1:] * left[:-1]).sum() / max(float((left**2).sum()), 1e-300))
-    independent = max(seconds.size * (1 - max(lag, 0.0)) / (1 + max(lag, 0.0)), 5.0)
-    gain = (float(((series - series.mean()) ** 2).sum()) - lowest) / 2 / max(lowest / (independent - 3), 1e-300)
-    if stats.f.sf(gain, 2, independent - 3) > SETTLING_LEVEL:
+    best = optimize.minimize_scalar(sum_of_squares, bounds=(nearest - step, nearest + step), method="bounded")
+    lowest, coefficients, residual = solve(float(best.x))
+    correlation = float((residual[1:] * residual[:-1]).sum() / max(float((residual**2).sum()), 1e-300))
+    independent = max(seconds.size * (1 - max(correlation, 0.0)) / (1 + max(correlation, 0.0)), 5.0)
+    f_ratio = (float(((series - series.mean()) ** 2).sum()) - lowest) / 2 / max(lowest / (independent - 3), 1e-300)
+    if stats.f.sf(f_ratio, 2, independent - 3) > SETTLING_LEVEL:
         return None
     limit = max(lowest, 1e-12) * (1 + 3.84 / (independent - 3))
 
-    def side(end: float) -> float:
+    def confidence_limit(end: float) -> float:
         """Return where the sum of squares crosses the limit between the best time constant and an end of the search."""
-        if solve(end)[0] <= limit:
+        if sum_of_squares(end) <= limit:
             return end
-        return float(optimize.brentq(lambda one: solve(one)[0] - limit, float(best.x), end))
+        return float(optimize.brentq(lambda log_tau: sum_of_squares(log_tau) - limit, float(best.x), end))
 
-    low, top = math.exp(side(grid[0])), side(grid[-1])
+    low, top = math.exp(confidence_limit(grid[0])), confidence_limit(grid[-1])
     high = math.inf if top == grid[-1] else math.exp(top)
     tau = math.exp(float(best.x))
-    until = {key: -math.log(1 - share) for key, share in SHARES.items()}
+    time_constants = {key: -math.log(1 - share) for key, share in SHARES.items()}
     return Settling(
         component=name,
-        t63_s=tau * until["t63"],
-        t63_low_s=low * until["t63"],
-        t63_high_s=high * until["t63"],
-        t95_s=tau * until["t95"],
-        t95_low_s=low * until["t95"],
-        t95_high_s=high * until["t95"],
+        t63_s=tau * time_constants["t63"],
+        t63_low_s=low * time_constants["t63"],
+        t63_high_s=high * time_constants["t63"],
+        t95_s=tau * time_constants["t95"],
+        t95_low_s=low * time_constants["t95"],
+        t95_high_s=high * time_constants["t95"],
         amplitude_um=float(coefficients[1]),
     )

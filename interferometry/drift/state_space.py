@@ -1,13 +1,13 @@
-"""Drift components that wander in time: the system of equations behind the drift estimate, and what its filter returns.
+"""Linear drift model in state-space form: readings' times, loadings and variances, with its filter and smoother.
 
-Each component is a random walk or an integrated random walk from zero, and enters every reading with a known loading; equations
-and sources in :mod:`interferometry.drift.gls`.
+Each drift component is a random walk or an integrated random walk that starts at zero, and enters every reading with a known loading.
+The model is stated in :mod:`interferometry.drift.gls`, the recursions are in :mod:`interferometry.drift.kalman`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,19 +23,48 @@ class DriftModelError(InterferometryError):
     """The readings or columns cannot be fitted; the message names what is wrong and what to do."""
 
 
-@dataclass(frozen=True)
-class DriftSystem:
-    """Readings' times and loadings with the variances of their drift.
+class Smoothed(NamedTuple):
+    """What the smoother returns for p columns filtered alike; variances in units of sigma^2.
 
     Attributes
     ----------
-    seconds : (n,) time of each reading in s, not decreasing
-    loadings : (n, components) how each drift component enters each reading
-    order : 1 random walk, 2 integrated random walk
-    ratios : (components,) drift variance over reading variance, per s (order 1) or per s^3 (order 2)
-    variance : (n,) relative variance of each reading, 1 for an ordinary one
-    observed : (n,) False for a reading that must not update the drift (held out: predicted in open loop)
-    pace : (n,) factor on the ratios in the step before each reading; None for a drift of constant liveliness
+    levels : (n, components, p) ndarray
+        Smoothed drift levels, in the units of the columns.
+    level_covariance : (n, components, components) ndarray
+        Covariance of the levels, the columns' coefficients being known.
+    u : (n, p) ndarray
+        Smoothing errors (Durbin and Koopman 2012, eq. 4.69): ``variance * u`` is the estimated noise of each reading, ``u / D`` its
+        deletion residual, the reading minus its prediction from all others.
+    D : (n,) ndarray
+        Variance of u; ``1 / D`` is the variance of the deletion residual. Zero where the reading is not observed.
+    """
+
+    levels: Array
+    level_covariance: Array
+    u: Array
+    D: Array
+
+
+@dataclass(frozen=True)
+class DriftSystem:
+    """Times, loadings and relative variances of n readings, with the process noise of their drift.
+
+    Attributes
+    ----------
+    seconds : (n,) ndarray
+        Time of each reading, s, not decreasing.
+    loadings : (n, components) ndarray
+        How each drift component enters each reading.
+    order : {1, 2}
+        1 random walk, 2 integrated random walk.
+    ratios : (components,) ndarray
+        Process noise over reading variance, per s (order 1) or per s^3 (order 2).
+    variance : (n,) ndarray
+        Relative variance of each reading, 1 for an ordinary one.
+    observed : (n,) ndarray of bool
+        False for a held-out reading: it does not update the drift and is predicted in open loop.
+    process_noise_scale : (n,) ndarray or None
+        Factor on the ratios in the step before each reading; None where the process noise is constant.
     """
 
     seconds: Array
@@ -44,25 +73,25 @@ class DriftSystem:
     ratios: Array
     variance: Array
     observed: NDArray[np.bool_]
-    pace: Array | None = None
+    process_noise_scale: Array | None = None
 
     @property
-    def paces(self) -> Array:
-        """Factor on the ratios in the step before each reading, (n,)."""
-        return np.ones(self.seconds.size) if self.pace is None else self.pace
+    def step_scales(self) -> Array:
+        """Factor on the ratios in the step before each reading, (n,); ones where the process noise is constant."""
+        return np.ones(self.seconds.size) if self.process_noise_scale is None else self.process_noise_scale
 
-    def _filter(self, keep: bool) -> tuple[Array, Array, Array]:
-        return kalman.gains(
-            self.seconds, self.loadings, self.order, self.ratios, self.paces, self.variance, self.observed, keep
+    def _filter_covariance(self, keep: bool) -> tuple[Array, Array, Array]:
+        return kalman.filter_covariance(
+            self.seconds, self.loadings, self.order, self.ratios, self.step_scales, self.variance, self.observed, keep
         )
 
     def innovations(self, columns: Array) -> tuple[Array, Array]:
-        """Prediction errors (n, p) of columns (n, p), and their variances (n,) in units of sigma^2."""
-        gains, spread, _ = self._filter(False)
-        errors, _ = kalman.innovations(
+        """One-step prediction errors (n, p) of columns (n, p), and their variances (n,) in units of sigma^2."""
+        gains, innovation_variances, _ = self._filter_covariance(False)
+        innovations, _ = kalman.filter_columns(
             self.seconds, self.loadings, self.order, gains, np.ascontiguousarray(columns), False
         )
-        return errors, spread
+        return innovations, innovation_variances
 
     def normal_equations(self, columns: Array) -> tuple[Array, float]:
         """Gram matrix (p, p) of the whitened columns (n, p) of the observed readings, and the log-determinant of their covariance."""
@@ -71,35 +100,54 @@ class DriftSystem:
             self.loadings,
             self.order,
             self.ratios,
-            self.paces,
+            self.step_scales,
             self.variance,
             self.observed,
             np.ascontiguousarray(columns),
         )
 
     def whiten(self, columns: Array) -> tuple[Array, float]:
-        """Standardised prediction errors of the observed readings (n_observed, p), and the log-determinant of their covariance."""
-        errors, spread = self.innovations(columns)
-        kept = spread[self.observed]
-        return errors[self.observed] / np.sqrt(kept)[:, None], float(np.log(kept).sum())
+        """Standardised innovations of the observed readings (n_observed, p), and the log-determinant of their covariance."""
+        innovations, innovation_variances = self.innovations(columns)
+        kept = innovation_variances[self.observed]
+        return innovations[self.observed] / np.sqrt(kept)[:, None], float(np.log(kept).sum())
 
-    def smooth(self, columns: Array) -> tuple[Array, Array, Array, Array]:
-        """Smoothed drift levels (n, components, p) of columns (n, p), covariance (n, components, components), u (n, p) and D (n,).
-
-        ``u / D`` is each observed reading's deletion residual, ``1 / D`` its variance, ``variance * u`` its estimated noise
-        (Durbin and Koopman, 4.69).
-        """
-        gains, spread, covariances = self._filter(True)
-        errors, states = kalman.innovations(
+    def smooth(self, columns: Array) -> Smoothed:
+        """Smooth the drift that columns (n, p) imply, and the noise of every reading."""
+        gains, innovation_variances, covariances = self._filter_covariance(True)
+        innovations, states = kalman.filter_columns(
             self.seconds, self.loadings, self.order, gains, np.ascontiguousarray(columns), True
         )
-        return kalman.smooth(
-            self.seconds, self.loadings, self.order, gains, spread, self.observed, errors, states, covariances
+        return Smoothed(
+            *kalman.smooth(
+                self.seconds,
+                self.loadings,
+                self.order,
+                gains,
+                innovation_variances,
+                self.observed,
+                innovations,
+                states,
+                covariances,
+            )
         )
 
 
 def start_columns(seconds: Array, loadings: Array, order: Order) -> Array:
-    """Fixed effects of the drift's start: levels, and for an integrated walk also rates per hour, (n, components * order)."""
+    """Return the fixed effects of the drift's start: its levels, and for an integrated random walk also its rates.
+
+    Parameters
+    ----------
+    seconds : (n,) ndarray
+        Time of each reading, s.
+    loadings : (n, components) ndarray
+    order : {1, 2}
+
+    Returns
+    -------
+    (n, components * order) ndarray
+        The loadings, then (order 2) the loadings times the hours, whose coefficients are rates per hour.
+    """
     if order == 1:
         return loadings
     return np.column_stack([loadings, loadings * (seconds / 3600.0)[:, None]])
@@ -113,9 +161,36 @@ def drift_system(
     ratios: Array,
     variance: Array | None = None,
     observed: NDArray[np.bool_] | None = None,
-    pace: Array | None = None,
+    process_noise_scale: Array | None = None,
 ) -> DriftSystem:
-    """Build a drift system; raises DriftModelError where times run backwards, are missing, or shapes disagree."""
+    """Build a drift system from checked, contiguous arrays.
+
+    Parameters
+    ----------
+    seconds : (n,) array_like
+        Time of each reading, s, not decreasing.
+    loadings : (n, components) array_like
+        How each drift component enters each reading.
+    order : {1, 2}
+        1 random walk, 2 integrated random walk.
+    ratios : (components,) array_like
+        Process noise over reading variance, per s (order 1) or per s^3 (order 2).
+    variance : (n,) array_like, optional
+        Relative variance of each reading; None: 1 for all.
+    observed : (n,) array_like of bool, optional
+        Readings that update the drift; None: all.
+    process_noise_scale : (n,) array_like, optional
+        Factor on the ratios in the step before each reading; None: constant process noise.
+
+    Returns
+    -------
+    DriftSystem
+
+    Raises
+    ------
+    DriftModelError
+        Times decrease or are not finite, or the loadings do not have one row per reading.
+    """
     seconds = np.ascontiguousarray(seconds, float)
     loadings = np.ascontiguousarray(loadings, float)
     n = seconds.size
@@ -130,5 +205,5 @@ def drift_system(
         np.ascontiguousarray(ratios, float),
         np.ones(n) if variance is None else np.ascontiguousarray(variance, float),
         np.ones(n, bool) if observed is None else np.ascontiguousarray(observed, bool),
-        None if pace is None else np.ascontiguousarray(pace, float),
+        None if process_noise_scale is None else np.ascontiguousarray(process_noise_scale, float),
     )

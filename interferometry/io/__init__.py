@@ -1,1 +1,1 @@
-"""Laser and environment files as recorded (level 0), read into one Dataset of deviations, and written."""
+"""Readers and writers of laser and environment files."""

@@ -1,4 +1,4 @@
-"""Delimited text with a header line: columns by name, faults by line."""
+"""Delimited text files with a header line: columns by name, unusable lines listed by number."""
 
 from __future__ import annotations
 
@@ -21,12 +21,24 @@ SENTINEL_MAGNITUDE = 1e19
 
 
 class LaserFormatError(InterferometryError):
-    """A laser or environment file that cannot be used; the message names file, place, value and remedy."""
+    """A laser or environment file that cannot be used as a whole; the message names file, place, value and remedy."""
 
 
 @dataclass(frozen=True)
-class Rejected:
-    """One line of a file that was left out: where, what stood there, why."""
+class RejectedLine:
+    """One line of a file that was left out.
+
+    Attributes
+    ----------
+    path : str
+        Name of the file.
+    line : int
+        Its number, from 1.
+    value : str
+        The text that could not be used.
+    reason : str
+        Why, as the predicate of a sentence about the value ("is not a number").
+    """
 
     path: str
     line: int
@@ -35,7 +47,15 @@ class Rejected:
 
 
 class BadReading(InterferometryError):
-    """One line that cannot be used; carries the value and the reason that the list of readings left out shows."""
+    """A line that cannot be used; it is caught by the reader, which lists the line as a `RejectedLine`.
+
+    Parameters
+    ----------
+    value : str
+        The text that could not be used.
+    reason : str
+        Why, as the predicate of a sentence about the value.
+    """
 
     def __init__(self, value: str, reason: str) -> None:
         super().__init__(f"{value!r}: {reason}")
@@ -44,7 +64,7 @@ class BadReading(InterferometryError):
 
 
 @dataclass(frozen=True)
-class Table:
+class DelimitedTable:
     """A delimited file: its column names and its rows with their line numbers.
 
     Attributes
@@ -53,9 +73,9 @@ class Table:
     columns : tuple of str
         Names of the header line, stripped.
     rows : list of (int, list of str)
-        Line number (the header is on line 1 unless comments precede it) and the fields.
+        Number of each line in the file, from 1, and its fields.
     decimal_comma : bool
-        Whether numbers may be written "0,64", as spreadsheets do where fields are parted by semicolons.
+        Whether numbers may be written "0,64", as spreadsheets do where semicolons separate the fields.
     """
 
     path: Path
@@ -69,7 +89,7 @@ class Table:
             yield line, dict(zip(self.columns, fields, strict=True)) if len(fields) == len(self.columns) else None
 
     def number(self, text: str) -> float:
-        """Return a finite number, or raise `BadReading`."""
+        """Return a finite number; raises `BadReading` where the text is none."""
         cleaned = text.strip().replace(",", ".") if self.decimal_comma else text.strip()
         try:
             value = float(cleaned)
@@ -80,15 +100,15 @@ class Table:
         return value
 
     def count(self, text: str) -> int:
-        """Return a whole number from 1, or raise `BadReading`."""
+        """Return a whole number from 1; raises `BadReading` where the text is none."""
         value = self.number(text)
         if value != int(value) or value < 1:
             raise BadReading(text, "is not a whole number from 1")
         return int(value)
 
 
-def read_table(path: Path, required: tuple[str, ...]) -> Table:
-    """Read a delimited text file and check that it has the columns it needs.
+def read_table(path: Path, required: tuple[str, ...]) -> DelimitedTable:
+    """Read a delimited text file and check that it has the required columns.
 
     Byte-order marks, CR LF line ends, empty lines, lines that start with ``#``, and commas, semicolons or tabs between the
     fields are all accepted.
@@ -97,12 +117,16 @@ def read_table(path: Path, required: tuple[str, ...]) -> Table:
     ----------
     path : pathlib.Path
     required : tuple of str
-        Names of the columns that must be there; others are allowed.
+        Names of the columns that must exist; others are allowed.
+
+    Returns
+    -------
+    DelimitedTable
 
     Raises
     ------
     LaserFormatError
-        The file is empty, is not text, or lacks a column.
+        The file is empty or not UTF-8 text, or a column is missing or repeated.
     """
     try:
         text = path.read_bytes().decode("utf-8-sig")
@@ -119,55 +143,78 @@ def read_table(path: Path, required: tuple[str, ...]) -> Table:
         if any(f.strip() for f in fields) and not fields[0].startswith("#")
     ]
     head_line, names = lines[0][0], tuple(name.strip() for name in lines[0][1])
-    absent = [name for name in required if name not in names]
-    if absent:
+    missing = [name for name in required if name not in names]
+    if missing:
         raise LaserFormatError(
-            f"{path}, line {head_line}: no column {', '.join(absent)}; the header is {','.join(names)!r}, "
+            f"{path}, line {head_line}: no column {', '.join(missing)}; the header is {','.join(names)!r}, "
             f"expected {','.join(required)!r} (names carry the unit: convert the values and rename the column)"
         )
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         raise LaserFormatError(
-            f"{path}, line {head_line}: column {', '.join(repeated)} stands there more than once; keep one"
+            f"{path}, line {head_line}: column {', '.join(repeated)} occurs more than once; keep one"
         )
-    return Table(path, names, lines[1:], delimiter == ";")
+    return DelimitedTable(path, names, lines[1:], delimiter == ";")
 
 
 def find_header(lines: Iterable[str]) -> tuple[int, str]:
-    """Return the header line and how many stand before it: the first that is neither empty nor starts with ``#``, "" where none is."""
-    return next(((at, line) for at, line in enumerate(lines) if line.strip() and not line.startswith("#")), (0, ""))
+    """Find the header: the first line that is neither empty nor starts with ``#``.
+
+    Parameters
+    ----------
+    lines : iterable of str
+        Of the file, from the first.
+
+    Returns
+    -------
+    before : int
+        Number of lines before the header.
+    header : str
+        The line; "" where there is none.
+    """
+    return next(((i, line) for i, line in enumerate(lines) if line.strip() and not line.startswith("#")), (0, ""))
 
 
 def delimiter_of(header: str) -> str:
-    """Return what parts the fields, from a header line: the comma, semicolon or tab that stands there most often."""
+    """Return the delimiter of a header line: comma, semicolon or tab, whichever it contains most often.
+
+    Parameters
+    ----------
+    header : str
+
+    Returns
+    -------
+    str
+        One character.
+    """
     return max(",;\t", key=header.count)
 
 
 def read_timed_rows(
-    table: Table, variables: Mapping[str, Mapping[str, str]], parse: Callable[[dict[str, str]], list[float]]
+    table: DelimitedTable, variables: Mapping[str, Mapping[str, str]], parse: Callable[[dict[str, str]], list[float]]
 ) -> xr.Dataset:
-    """Return the rows of a table that has a column ``time``.
+    """Read the rows of a table that has a column ``time`` into a Dataset.
 
     Parameters
     ----------
-    table : Table
-    variables : mapping
-        Attributes of the variables by name, in the order in which `parse` returns their values.
+    table : DelimitedTable
+    variables : mapping of str to mapping
+        Attributes (units and others) of the variables by name, in the order in which `parse` returns their values.
     parse : callable
-        From the fields of a line by column to its values; raises `BadReading` where one cannot be used.
+        Takes the fields of a line by column, returns its values; raises `BadReading` where one cannot be used.
 
     Returns
     -------
     xarray.Dataset
-        The variables along ``time`` (UTC, increasing); ``attrs["left_out"]`` lists the lines left out.
+        The variables along ``time`` (UTC, increasing); ``attrs["left_out"]`` is a JSON list of the lines left out.
 
     Raises
     ------
     LaserFormatError
-        More lines are bad than good, or only some times have a zone.
+        Fewer than half of the lines can be used, or only some times have a zone.
     """
     rows: dict[np.datetime64, list[float]] = {}
-    left_out: list[Rejected] = []
+    left_out: list[RejectedLine] = []
     zones: dict[str, int] = {}
     for line, fields in table.records():
         try:
@@ -175,26 +222,38 @@ def read_timed_rows(
                 raise BadReading("", f"does not have {len(table.columns)} fields")
             time, zone = parse_time(fields["time"])
             if time in rows:
-                raise BadReading(fields["time"], "stands on an earlier line too, which is kept")
+                raise BadReading(fields["time"], "occurs on an earlier line too, which is kept")
             rows[time] = parse(fields)
         except BadReading as fault:
-            left_out.append(Rejected(table.path.name, line, fault.value, fault.reason))
+            left_out.append(RejectedLine(table.path.name, line, fault.value, fault.reason))
             continue
         zones.setdefault(zone, line)
-    refuse_hopeless(table.path, len(rows), left_out)
+    raise_if_mostly_invalid(table.path, len(rows), left_out)
     times = sorted(rows)
     values = np.array([rows[time] for time in times])
     dataset = xr.Dataset(
-        {name: (("time",), values[:, at], dict(attrs)) for at, (name, attrs) in enumerate(variables.items())},
+        {name: (("time",), values[:, column], dict(attrs)) for column, (name, attrs) in enumerate(variables.items())},
         coords={"time": np.array(times, dtype="datetime64[ns]")},
-        attrs={"source": table.path.name, "left_out": json.dumps([asdict(one) for one in left_out])},
+        attrs={"source": table.path.name, "left_out": json.dumps([asdict(line) for line in left_out])},
     )
-    dataset["time"].attrs["reference"] = join_zones(table.path, zones)
+    dataset["time"].attrs["reference"] = describe_time_zone(table.path, zones)
     return dataset
 
 
 def parse_time(text: str) -> tuple[np.datetime64, str]:
-    """Return an ISO 8601 time in UTC and the zone it was written in ("" where none was).
+    """Parse an ISO 8601 time.
+
+    Parameters
+    ----------
+    text : str
+        Such as 2026-03-09T06:30:05+00:00; a time without a zone is taken as UTC.
+
+    Returns
+    -------
+    time : numpy.datetime64
+        UTC, in ns.
+    zone : str
+        Its zone as +hhmm; "" where the text has none.
 
     Raises
     ------
@@ -210,13 +269,22 @@ def parse_time(text: str) -> tuple[np.datetime64, str]:
     return np.datetime64(utc, "ns"), zone
 
 
-def refuse_hopeless(path: Path, kept: int, left_out: list[Rejected]) -> None:
-    """Raise where fewer than half of the lines could be used: that is a fault of the file, not of single readings.
+def raise_if_mostly_invalid(path: Path, kept: int, left_out: list[RejectedLine]) -> None:
+    """Raise where fewer than half of the lines can be used: that is a fault of the file, not of single readings.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        For the message.
+    kept : int
+        Number of lines that can be used.
+    left_out : list of RejectedLine
+        Those that cannot.
 
     Raises
     ------
     LaserFormatError
-        No line, or less than half of the lines, was usable.
+        There are no lines, or more lines were left out than kept.
     """
     if kept == 0 and not left_out:
         raise LaserFormatError(f"{path}: no reading below the header; export the measured values again")
@@ -228,19 +296,25 @@ def refuse_hopeless(path: Path, kept: int, left_out: list[Rejected]) -> None:
         )
 
 
-def join_zones(path: Path, zones: dict[str, int]) -> str:
-    """Say how the times of a file were brought to UTC.
+def describe_time_zone(path: Path, zones: dict[str, int]) -> str:
+    """Return how the times of a file were converted to UTC, in words.
 
     Parameters
     ----------
     path : pathlib.Path
-    zones : dict
-        First line at which each zone was met, by zone ("" for none).
+        For the message.
+    zones : dict of str to int
+        Number of the first line with each zone (+hhmm; "" for none).
+
+    Returns
+    -------
+    str
+        For the attribute ``reference`` of the times.
 
     Raises
     ------
     LaserFormatError
-        Some times have a zone and some have none: no one can know what the latter mean.
+        Some times have a zone and some have none: the meaning of the latter is unknown.
     """
     if "" in zones and len(zones) > 1:
         other = next(zone for zone in zones if zone)

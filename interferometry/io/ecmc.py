@@ -1,4 +1,4 @@
-"""Positioning tests logged as assignments (``REF_DATA_FWD[target,cycle]=value``), as the ecmc test tools write them."""
+"""Logs of positioning tests as the ecmc test tools write them: assignments such as ``REF_DATA_FWD[target,cycle]=value``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from interferometry.deviations import build_deviations
-from interferometry.io.delimited import LaserFormatError, Rejected
+from interferometry.io.delimited import LaserFormatError, RejectedLine
 
 _ASSIGNMENT = re.compile(r"^(TGT_DATA|REF_DATA_FWD|REF_DATA_BWD|UNIT|CYCLES|POSITIONS)(?:\[(\d+)(?:,(\d+))?\])?=(.*)$")
 _UM_PER_UNIT = {"mm": 1e3, "um": 1.0, "m": 1e6}
@@ -19,17 +19,32 @@ _DIRECTION = {"REF_DATA_FWD": 0, "REF_DATA_BWD": 1}
 
 
 def is_ecmc_log(start: bytes) -> bool:
-    """Tell from the first bytes of a file whether it is such a log."""
+    """Return whether a file is such a log.
+
+    Parameters
+    ----------
+    start : bytes
+        The first bytes of the file; some thousand are enough.
+
+    Returns
+    -------
+    bool
+    """
     return b"REF_DATA_FWD[" in start or b"TGT_DATA[" in start
 
 
 def read_ecmc_log(path: Path) -> xr.Dataset:
-    """Read a test log that holds target and reference positions, but no times.
+    """Read a log that holds target and measured positions, but no times.
+
+    Parameters
+    ----------
+    path : pathlib.Path
 
     Returns
     -------
     xarray.Dataset
-        Keeps ``contract.DEVIATIONS``; every time is NaT (``time.attrs["origin"]`` is "none").
+        Keeps ``contract.DEVIATIONS``; deviations are measured minus target position, forward is the positive direction; every time is
+        NaT (``time.attrs["origin"]`` is "none").
 
     Raises
     ------
@@ -39,7 +54,7 @@ def read_ecmc_log(path: Path) -> xr.Dataset:
     stated: dict[str, str] = {}
     target_at: dict[int, float] = {}
     readings: dict[tuple[int, int, int], float] = {}
-    left_out: list[Rejected] = []
+    left_out: list[RejectedLine] = []
     for line, text in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
         match = _ASSIGNMENT.match(text.strip())
         if match is None:
@@ -51,7 +66,7 @@ def read_ecmc_log(path: Path) -> xr.Dataset:
         try:
             number = float(value)
         except ValueError:
-            left_out.append(Rejected(path.name, line, value, "is not a number"))
+            left_out.append(RejectedLine(path.name, line, value, "is not a number"))
             continue
         if name == "TGT_DATA":
             target_at[int(target)] = number
@@ -64,30 +79,30 @@ def read_ecmc_log(path: Path) -> xr.Dataset:
     scale = _UM_PER_UNIT[unit]
     position = np.array([target_at[target] for target in range(1, targets + 1)])
     deviation = np.full((cycles, 2, targets), np.nan)
-    for at, measured in readings.items():
-        deviation[at] = (measured - position[at[2]]) * scale
+    for index, measured in readings.items():
+        deviation[index] = (measured - position[index[2]]) * scale
     time = np.full(deviation.shape, np.datetime64("NaT", "ns"))
     dataset = build_deviations(range(1, cycles + 1), range(1, targets + 1), position * scale / 1e3, deviation, time)
     dataset["time"].attrs.update(origin="none", reference="the file holds no times")
     missing = int(np.isnan(deviation).sum())
-    dataset.attrs.update(source=path.name, left_out=json.dumps([asdict(one) for one in left_out]), missing=missing)
+    dataset.attrs.update(source=path.name, left_out=json.dumps([asdict(line) for line in left_out]), missing=missing)
     return dataset
 
 
 def _counts(
     path: Path, stated: dict[str, str], target_at: dict[int, float], readings: dict[tuple[int, int, int], float]
 ) -> tuple[int, int]:
-    """Return the numbers of cycles and targets, after holding what was found against what the file states."""
+    """Return the numbers of cycles and targets, after comparing those that were read with those that the file states."""
     if not target_at or not readings:
         raise LaserFormatError(f"{path}: no TGT_DATA or no REF_DATA_FWD/REF_DATA_BWD; export the test again")
-    targets, cycles = max(target_at), max(at[0] for at in readings) + 1
-    if sorted(target_at) != list(range(1, targets + 1)) or max(at[2] for at in readings) + 1 > targets:
+    targets, cycles = max(target_at), max(index[0] for index in readings) + 1
+    if sorted(target_at) != list(range(1, targets + 1)) or max(index[2] for index in readings) + 1 > targets:
         raise LaserFormatError(
             f"{path}: TGT_DATA gives targets {sorted(target_at)}, but readings refer to others; give each its position"
         )
-    for name, found in (("CYCLES", cycles), ("POSITIONS", targets)):
-        if name in stated and int(stated[name]) != found:
+    for name, count in (("CYCLES", cycles), ("POSITIONS", targets)):
+        if name in stated and int(stated[name]) != count:
             raise LaserFormatError(
-                f"{path}: {name}={stated[name]}, but {found} were found; the file is cut short or joined from two"
+                f"{path}: {name}={stated[name]}, but {count} were found; the file is cut short or joined from two"
             )
     return cycles, targets

@@ -1,4 +1,4 @@
-"""Laser and environment files to Datasets; every line that cannot be used is listed, none is dropped in silence."""
+"""Readers of deviations and environment: the kind of file is recognised, and every unusable line is listed in the result."""
 
 from __future__ import annotations
 
@@ -21,23 +21,20 @@ from interferometry.deviations import (
     build_deviations,
     detect_out_of_order,
     set_flag,
-    sort_readings,
 )
 from interferometry.io.delimited import (
     BadReading,
+    DelimitedTable,
     LaserFormatError,
-    Rejected,
-    Table,
-    join_zones,
+    RejectedLine,
+    describe_time_zone,
     parse_time,
+    raise_if_mostly_invalid,
     read_table,
     read_timed_rows,
-    refuse_hopeless,
 )
 from interferometry.io.ecmc import is_ecmc_log, read_ecmc_log
 from interferometry.io.renishaw import read_rtl
-
-__all__ = ["LaserFormatError", "Rejected", "read_deviations", "read_environment", "sort_readings"]
 
 DEVIATION_COLUMNS = ("cycle", "direction", "target", "position_mm", "time", "deviation_um")
 POSITION_TOLERANCE_MM = 1e-4
@@ -65,28 +62,43 @@ class _Reading:
 def read_deviations(
     path: str | Path, *, feed_mm_per_min: float | None = None, dwell_s: float | None = None
 ) -> xr.Dataset:
-    """Read deviations from a CSV file, a Renishaw .rtl, or a log of a positioning test (ISO 230-2 .dat).
+    r"""Read positioning deviations from a file.
 
     Parameters
     ----------
     path : str or pathlib.Path
-        The kind of file is told from its content.
-    feed_mm_per_min, dwell_s : float, optional
-        Feed between targets and time at rest at each: with them the times of readings that a .rtl does not hold are rebuilt
-        more closely. Ignored where every reading has its own time.
+        A CSV file with the columns cycle, direction, target, position_mm, time, deviation_um; a Renishaw linear test (.rtl); or a
+        log of the ecmc test tools (.dat). The kind of file is recognised from its content.
+    feed_mm_per_min : float, optional
+        Feed between targets, mm/min.
+    dwell_s : float, optional
+        Time at rest at each target, s. With both, the times of readings, which a .rtl does not hold, are reconstructed more closely.
+        Ignored where every reading has its own time.
 
     Returns
     -------
     xarray.Dataset
-        Keeps ``contract.DEVIATIONS``: deviation in um and time in UTC (cycle, direction, target), position in mm (target),
-        quality_flag. ``attrs["left_out"]`` is a JSON list of the lines left out (path, line, value, reason);
-        ``time.attrs["origin"]`` is "recorded" or "reconstructed", and where it was rebuilt ``time_u`` is its standard
-        uncertainty in s.
+        Keeps ``contract.DEVIATIONS``: ``deviation`` (um), ``time`` (UTC) and ``quality_flag`` (cycle, direction, target), ``position``
+        (mm; target). ``attrs["left_out"]`` is a JSON list of the lines left out (path, line, value, reason);
+        ``time.attrs["origin"]`` is "recorded", "reconstructed" or "none"; ``time_u`` is the standard uncertainty of reconstructed
+        times, s.
 
     Raises
     ------
     LaserFormatError
         The file cannot be used as a whole.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> path = Path(tempfile.mkdtemp()) / "laser.csv"
+    >>> _ = path.write_text("cycle,direction,target,position_mm,time,deviation_um\n"
+    ...                     "1,positive,1,0,2026-03-09T06:30:00Z,0.12\n"
+    ...                     "1,positive,2,100,2026-03-09T06:30:22Z,1.48\n")
+    >>> test = read_deviations(path)
+    >>> test["deviation"].sel(direction="positive").values.tolist()
+    [[0.12, 1.48]]
     """
     path = Path(path)
     start = path.read_bytes()[:4096]
@@ -104,12 +116,12 @@ def read_deviations(
 def _read_deviations_csv(path: Path) -> xr.Dataset:
     table = read_table(path, DEVIATION_COLUMNS)
     readings, left_out, zones, unreadable = _parse_readings(table)
-    refuse_hopeless(path, len(readings), left_out)
+    raise_if_mostly_invalid(path, len(readings), left_out)
     readings, duplicates = _drop_duplicates(path, readings, left_out)
     readings = _drop_misplaced(path, readings, left_out)
     readings = _drop_wrong_times(path, readings, left_out)
     _check_cycles(path, readings)
-    time_reference = join_zones(path, zones)
+    time_reference = describe_time_zone(path, zones)
     deviations = _assemble(readings)
     deviations = _flag_cells(deviations, UNREADABLE, unreadable)
     deviations = _flag_cells(deviations, DUPLICATE, duplicates)
@@ -118,16 +130,18 @@ def _read_deviations_csv(path: Path) -> xr.Dataset:
     ignored = [name for name in table.columns if name not in DEVIATION_COLUMNS]
     deviations.attrs.update(
         source=path.name,
-        left_out=json.dumps([asdict(one) for one in left_out]),
+        left_out=json.dumps([asdict(line) for line in left_out]),
         missing=int(np.isnan(deviations["deviation"].values).sum()),
         columns_ignored=json.dumps(ignored),
     )
     return deviations
 
 
-def _parse_readings(table: Table) -> tuple[list[_Reading], list[Rejected], dict[str, int], set[tuple[int, str, int]]]:
+def _parse_readings(
+    table: DelimitedTable,
+) -> tuple[list[_Reading], list[RejectedLine], dict[str, int], set[tuple[int, str, int]]]:
     readings: list[_Reading] = []
-    left_out: list[Rejected] = []
+    left_out: list[RejectedLine] = []
     zones: dict[str, int] = {}
     unreadable: set[tuple[int, str, int]] = set()
     for line, fields in table.records():
@@ -144,7 +158,7 @@ def _parse_readings(table: Table) -> tuple[list[_Reading], list[Rejected], dict[
                 line, *cell, table.number(fields["position_mm"]), time, table.number(fields["deviation_um"])
             )
         except BadReading as fault:
-            left_out.append(Rejected(table.path.name, line, fault.value, fault.reason))
+            left_out.append(RejectedLine(table.path.name, line, fault.value, fault.reason))
             if cell is not None:
                 unreadable.add(cell)
             continue
@@ -154,52 +168,52 @@ def _parse_readings(table: Table) -> tuple[list[_Reading], list[Rejected], dict[
 
 
 def _drop_duplicates(
-    path: Path, readings: list[_Reading], left_out: list[Rejected]
+    path: Path, readings: list[_Reading], left_out: list[RejectedLine]
 ) -> tuple[list[_Reading], set[tuple[int, str, int]]]:
     first: dict[tuple[int, str, int], _Reading] = {}
     repeated: set[tuple[int, str, int]] = set()
-    for one in readings:
-        cell = (one.cycle, one.direction, one.target)
+    for reading in readings:
+        cell = (reading.cycle, reading.direction, reading.target)
         if cell in first:
             repeated.add(cell)
-            reason = f"cycle {one.cycle} {one.direction} target {one.target} already stands on line {first[cell].line}, which is kept"
-            left_out.append(Rejected(path.name, one.line, str(one.deviation), reason))
+            reason = (
+                f"cycle {reading.cycle} {reading.direction} target {reading.target} already stands on line {first[cell].line}, "
+                "which is kept"
+            )
+            left_out.append(RejectedLine(path.name, reading.line, str(reading.deviation), reason))
         else:
-            first[cell] = one
+            first[cell] = reading
     return list(first.values()), repeated
 
 
-def _drop_misplaced(path: Path, readings: list[_Reading], left_out: list[Rejected]) -> list[_Reading]:
+def _drop_misplaced(path: Path, readings: list[_Reading], left_out: list[RejectedLine]) -> list[_Reading]:
     """Leave out readings whose position is not the one that 90 % of their target's readings have."""
     by_target: dict[int, list[_Reading]] = defaultdict(list)
-    for one in readings:
-        by_target[one.target].append(one)
+    for reading in readings:
+        by_target[reading.target].append(reading)
     kept: list[_Reading] = []
     for target, group in sorted(by_target.items()):
-        usual = float(np.median([one.position for one in group]))
-        off = [one for one in group if abs(one.position - usual) > POSITION_TOLERANCE_MM]
+        typical = float(np.median([reading.position for reading in group]))
+        off = [reading for reading in group if abs(reading.position - typical) > POSITION_TOLERANCE_MM]
         if len(off) > max(1, 0.1 * len(group)):
             raise LaserFormatError(
-                f"{path}: target {target} stands at {off[0].position} mm on line {off[0].line} but at {usual} mm elsewhere "
+                f"{path}: target {target} stands at {off[0].position} mm on line {off[0].line} but at {typical} mm elsewhere "
                 f"({len(off)} of {len(group)} readings disagree); position_mm is the programmed position, the same in every cycle"
             )
-        for one in off:
-            left_out.append(
-                Rejected(path.name, one.line, str(one.position), f"target {target} stands at {usual} mm elsewhere")
-            )
-        kept += [one for one in group if one not in off]
-    places = {target: group[0].position for target, group in by_target.items()}
-    for first, second in zip(
-        sorted(places, key=places.__getitem__), sorted(places, key=places.__getitem__)[1:], strict=False
-    ):
-        if abs(places[first] - places[second]) <= POSITION_TOLERANCE_MM:
+        for reading in off:
+            reason = f"target {target} stands at {typical} mm elsewhere"
+            left_out.append(RejectedLine(path.name, reading.line, str(reading.position), reason))
+        kept += [reading for reading in group if reading not in off]
+    positions = {target: group[0].position for target, group in by_target.items()}
+    for first, second in itertools.pairwise(sorted(positions, key=positions.__getitem__)):
+        if abs(positions[first] - positions[second]) <= POSITION_TOLERANCE_MM:
             raise LaserFormatError(
-                f"{path}: targets {first} and {second} both stand at {places[first]} mm; number each position once"
+                f"{path}: targets {first} and {second} both stand at {positions[first]} mm; number each position once"
             )
     return kept
 
 
-def _drop_wrong_times(path: Path, readings: list[_Reading], left_out: list[Rejected]) -> list[_Reading]:
+def _drop_wrong_times(path: Path, readings: list[_Reading], left_out: list[RejectedLine]) -> list[_Reading]:
     """Leave out single readings whose time lies beyond the middle of the neighbouring cycles."""
     centres = _cycle_centres(readings)
     numbers = sorted(centres)
@@ -208,34 +222,36 @@ def _drop_wrong_times(path: Path, readings: list[_Reading], left_out: list[Rejec
     steps = np.diff([centres[number] for number in numbers])
     if np.any(steps <= 0):
         return readings
-    usual = float(np.median(steps))
+    typical = float(np.median(steps))
     bounds: dict[int, tuple[float, float]] = {}
-    for at, number in enumerate(numbers):
-        early = centres[numbers[at - 1]] if at else centres[number] - usual
-        late = centres[numbers[at + 1]] if at + 1 < len(numbers) else centres[number] + usual
+    for i, number in enumerate(numbers):
+        early = centres[numbers[i - 1]] if i else centres[number] - typical
+        late = centres[numbers[i + 1]] if i + 1 < len(numbers) else centres[number] + typical
         bounds[number] = (early, late)
     kept = []
-    for one in readings:
-        if bounds[one.cycle][0] <= one.time.astype("i8") <= bounds[one.cycle][1]:
-            kept.append(one)
+    for reading in readings:
+        early, late = bounds[reading.cycle]
+        if early <= reading.time.astype("i8") <= late:
+            kept.append(reading)
         else:
-            left_out.append(Rejected(path.name, one.line, str(one.time), f"is not a time within cycle {one.cycle}"))
+            reason = f"is not a time within cycle {reading.cycle}"
+            left_out.append(RejectedLine(path.name, reading.line, str(reading.time), reason))
     return kept
 
 
 def _cycle_centres(readings: Sequence[_Reading]) -> dict[int, float]:
     times: dict[int, list[int]] = defaultdict(list)
-    for one in readings:
-        times[one.cycle].append(int(one.time.astype("i8")))
+    for reading in readings:
+        times[reading.cycle].append(int(reading.time.astype("i8")))
     return {cycle: float(np.median(values)) for cycle, values in times.items()}
 
 
 def _check_cycles(path: Path, readings: list[_Reading]) -> None:
     """Raise where cycles run backwards or overlap in time."""
     ends: dict[int, tuple[_Reading, _Reading]] = {}
-    for one in readings:
-        low, high = ends.get(one.cycle, (one, one))
-        ends[one.cycle] = (min(low, one, key=lambda r: r.time), max(high, one, key=lambda r: r.time))
+    for reading in readings:
+        low, high = ends.get(reading.cycle, (reading, reading))
+        ends[reading.cycle] = (min(low, reading, key=lambda r: r.time), max(high, reading, key=lambda r: r.time))
     numbers = sorted(ends)
     for number, following in itertools.pairwise(numbers):
         last, first = ends[number][1], ends[following][0]
@@ -247,16 +263,16 @@ def _check_cycles(path: Path, readings: list[_Reading]) -> None:
 
 
 def _assemble(readings: Sequence[_Reading]) -> xr.Dataset:
-    cycles = sorted({one.cycle for one in readings})
-    position = {one.target: one.position for one in readings}
+    cycles = sorted({reading.cycle for reading in readings})
+    position = {reading.target: reading.position for reading in readings}
     targets = sorted(position)
-    row = {cycle: at for at, cycle in enumerate(cycles)}
-    column = {target: at for at, target in enumerate(targets)}
+    row = {cycle: i for i, cycle in enumerate(cycles)}
+    column = {target: i for i, target in enumerate(targets)}
     deviation = np.full((len(cycles), 2, len(targets)), np.nan)
     time = np.full(deviation.shape, np.datetime64("NaT", "ns"))
-    for one in readings:
-        at = row[one.cycle], DIRECTIONS.index(one.direction), column[one.target]
-        deviation[at], time[at] = one.deviation, one.time
+    for reading in readings:
+        index = row[reading.cycle], DIRECTIONS.index(reading.direction), column[reading.target]
+        deviation[index], time[index] = reading.deviation, reading.time
     return build_deviations(cycles, targets, np.array([position[target] for target in targets]), deviation, time)
 
 
@@ -270,18 +286,34 @@ def _flag_cells(deviations: xr.Dataset, flag: Flag, cells: set[tuple[int, str, i
 
 
 def read_environment(path: str | Path) -> xr.Dataset:
-    """Read logged air and material conditions from a CSV file.
+    r"""Read logged air and material conditions from a CSV file.
+
+    Parameters
+    ----------
+    path : str or pathlib.Path
+        With the columns time (ISO 8601), air_temperature_degC, air_pressure_hPa, relative_humidity_percent and
+        material_temperature_degC.
 
     Returns
     -------
     xarray.Dataset
-        Dim time (UTC, sorted): air_temperature and material_temperature in degC, air_pressure in hPa, relative_humidity in
-        percent; ``attrs["left_out"]`` lists the lines left out.
+        Dim time (UTC, increasing): ``air_temperature`` and ``material_temperature`` (degC), ``air_pressure`` (hPa),
+        ``relative_humidity`` (percent); ``attrs["left_out"]`` is a JSON list of the lines left out (path, line, value, reason).
 
     Raises
     ------
     LaserFormatError
-        A column is missing, or more lines are bad than good.
+        A column is missing, or fewer than half of the lines can be used.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> path = Path(tempfile.mkdtemp()) / "environment.csv"
+    >>> _ = path.write_text("time,air_temperature_degC,air_pressure_hPa,relative_humidity_percent,material_temperature_degC\n"
+    ...                     "2026-03-09T06:30:00Z,23.5,1000.2,42,23.9\n")
+    >>> float(read_environment(path)["air_pressure"][0])
+    1000.2
     """
     path = Path(path)
     table = read_table(path, ("time", *(column for column, *_ in ENVIRONMENT_COLUMNS)))
@@ -296,7 +328,7 @@ def read_environment(path: str | Path) -> xr.Dataset:
     return read_timed_rows(table, variables, parse)
 
 
-def _plausible(table: Table, text: str, low: float, high: float) -> float:
+def _plausible(table: DelimitedTable, text: str, low: float, high: float) -> float:
     value = table.number(text)
     if not low <= value <= high:
         raise BadReading(text, f"lies outside {low:g} .. {high:g}, the range of this column's unit")

@@ -1,4 +1,4 @@
-"""Renishaw linear tests (.rtl) and dynamic captures (.rtx)."""
+"""Readers of Renishaw linear tests (.rtl) and dynamic captures (.rtx)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from interferometry.deviations import DIRECTIONS, build_deviations
-from interferometry.io.delimited import SENTINEL_MAGNITUDE, LaserFormatError, Rejected
+from interferometry.io.delimited import SENTINEL_MAGNITUDE, LaserFormatError, RejectedLine
 
 #: A temperature sensor that is not connected reads -10 degC.
 UNCONNECTED_DEGC = -10.0
@@ -39,29 +39,32 @@ def read_rtl(
     """Read a Renishaw linear test.
 
     Runs become cycles and directions by the order in which their targets were measured: towards larger positions is positive.
-    Readings that the file marks with -1e20 are missing. The times of readings, which the file lacks, are rebuilt from its start
-    and end.
+    Readings that the file marks with -1e20 are missing. The times of readings, which the file does not hold, are reconstructed
+    from its start and end.
 
     Parameters
     ----------
     path : pathlib.Path
-    feed_mm_per_min, dwell_s : float, optional
-        Feed between targets and rest at each. With both, what is left of the test's duration is given to the turns between
-        runs; otherwise readings are spread evenly.
+    feed_mm_per_min : float, optional
+        Feed between targets, mm/min.
+    dwell_s : float, optional
+        Time at rest at each target, s. With both, the remaining duration of the test is given to the turns between runs; otherwise
+        readings are spread evenly.
     encoding : str
         Of the user text, whose keys and values are in the language of the program that wrote the file.
 
     Returns
     -------
     xarray.Dataset
-        Keeps ``contract.DEVIATIONS``; beside it, at ``instant`` start and end: air_temperature (degC), air_pressure (hPa),
-        relative_humidity (percent), material_temperature (degC; NaN where not connected), environment_factor (um),
-        expansion_coefficient (ppm/K).
+        Keeps ``contract.DEVIATIONS``, with ``time_u``, the standard uncertainty of reconstructed times (s); and at ``instant``
+        start and end: ``air_temperature`` (degC), ``air_pressure`` (hPa), ``relative_humidity`` (percent),
+        ``material_temperature`` (sensor; degC, NaN where not connected), ``environment_factor`` (um per count),
+        ``expansion_coefficient`` (ppm/K).
 
     Raises
     ------
     LaserFormatError
-        The file is cut short, is not a linear test, or breaks what its own header says.
+        The file is cut short, is not a linear test, or contradicts its own header.
     """
     sections = _split_sections(path, path.read_bytes().decode(encoding))
     kind = _keyed(sections.get("HEADER", [])).get("filetype", "rtl")
@@ -76,8 +79,8 @@ def read_rtl(
     deviation, seconds = _lay_out(runs, targets, schedule)
     time = np.full(deviation.shape, np.datetime64("NaT", "ns"))
     if start is not None:
-        known = np.isfinite(seconds)
-        time[known] = start + (seconds[known] * 1e9).astype("timedelta64[ns]")
+        taken = np.isfinite(seconds)
+        time[taken] = start + (seconds[taken] * 1e9).astype("timedelta64[ns]")
     cycles = deviation.shape[0]
     dataset = build_deviations(range(1, cycles + 1), range(1, len(targets) + 1), targets, deviation, time)
     if start is None:
@@ -89,7 +92,7 @@ def read_rtl(
     dataset = dataset.assign(_parse_environment(sections))
     dataset.attrs.update(
         source=path.name,
-        left_out=json.dumps([asdict(one) for one in left_out]),
+        left_out=json.dumps([asdict(line) for line in left_out]),
         missing=int(np.isnan(deviation).sum()),
         runs_empty=json.dumps([run.number for run in runs if run.is_empty]),
         user_text=json.dumps(_parse_user_text(sections)),
@@ -100,13 +103,13 @@ def read_rtl(
 def _lay_out(runs: list[_Run], targets: np.ndarray, schedule: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return deviations in um and seconds since the start, (cycle, direction, target), from the runs in measuring order."""
     directions = [_direction(run, targets) for run in runs]
-    number = [directions[: at + 1].count(direction) for at, direction in enumerate(directions)]
-    deviation = np.full((max(number, default=1), 2, len(targets)), np.nan)
+    cycles = [directions[: i + 1].count(direction) for i, direction in enumerate(directions)]
+    deviation = np.full((max(cycles, default=1), 2, len(targets)), np.nan)
     seconds = np.full(deviation.shape, np.nan)
-    for run, direction, cycle, instants in zip(runs, directions, number, schedule, strict=True):
+    for run, direction, cycle, instants in zip(runs, directions, cycles, schedule, strict=True):
         for target, value, instant in zip(run.targets, run.deviations, instants, strict=True):
-            at = cycle - 1, DIRECTIONS.index(direction), target - 1
-            deviation[at], seconds[at] = value, instant if math.isfinite(value) else math.nan
+            index = cycle - 1, DIRECTIONS.index(direction), target - 1
+            deviation[index], seconds[index] = value, instant if math.isfinite(value) else math.nan
     return deviation, seconds
 
 
@@ -127,7 +130,7 @@ def _split_sections(path: Path, text: str) -> dict[str, list[tuple[int, str]]]:
 
 
 def _keyed(section: list[tuple[int, str]]) -> dict[str, str]:
-    """Return values by key, letter case and spaces of the key ignored ("Date Time" and "DateTime" are both met)."""
+    """Return values by key, letter case and spaces of the key ignored ("Date Time" and "DateTime" both occur)."""
     pairs = (content.split(":", 1) for _, content in section if ":" in content)
     return {re.sub(r"[^a-z0-9]", "", key.lower()): value.strip() for key, value in pairs}
 
@@ -135,7 +138,7 @@ def _keyed(section: list[tuple[int, str]]) -> dict[str, str]:
 def _parse_targets(path: Path, sections: dict[str, list[tuple[int, str]]]) -> np.ndarray:
     section = sections["TARGET DATA"]
     count = int(_keyed(section).get("targetcount", "0") or 0)
-    begin = next((at for at, (_, content) in enumerate(section) if re.match(r"Targets\s*:", content)), None)
+    begin = next((i for i, (_, content) in enumerate(section) if re.match(r"Targets\s*:", content)), None)
     numbers: list[float] = []
     for line, content in section[begin + 1 :] if begin is not None else []:
         if ":" in content:
@@ -155,9 +158,9 @@ def _parse_targets(path: Path, sections: dict[str, list[tuple[int, str]]]) -> np
 
 def _parse_runs(
     path: Path, sections: dict[str, list[tuple[int, str]]], targets: int
-) -> tuple[list[_Run], list[Rejected]]:
+) -> tuple[list[_Run], list[RejectedLine]]:
     runs: dict[int, _Run] = {}
-    left_out: list[Rejected] = []
+    left_out: list[RejectedLine] = []
     for line, content in sections["DEVIATIONS"]:
         words = content.replace(",", ".").split()
         if words[0] == "Run":
@@ -165,17 +168,17 @@ def _parse_runs(
         try:
             run, target, value = int(words[0]), int(words[1]), float(words[2])
         except (ValueError, IndexError):
-            left_out.append(Rejected(path.name, line, content.strip(), "is not 'run target deviation'"))
+            left_out.append(RejectedLine(path.name, line, content.strip(), "is not 'run target deviation'"))
             continue
         if not 1 <= target <= targets or run < 1:
             left_out.append(
-                Rejected(path.name, line, content.strip(), f"names no run from 1 or no target of 1..{targets}")
+                RejectedLine(path.name, line, content.strip(), f"names no run from 1 or no target of 1..{targets}")
             )
             continue
         rows = runs.setdefault(run, _Run(run))
         if target in rows.targets:
             left_out.append(
-                Rejected(path.name, line, content.strip(), f"repeats run {run} target {target}, the first is kept")
+                RejectedLine(path.name, line, content.strip(), f"repeats run {run} target {target}, the first is kept")
             )
             continue
         rows.targets.append(target)
@@ -236,13 +239,13 @@ def _rebuild_schedule(
         if turn < 0:
             travel = {number: times * duration / moving for number, times in travel.items()}
             turn = 0.0
-    at, schedule = 0.0, []
+    now, schedule = 0.0, []
     for run in runs:
         if run.is_empty:
             schedule.append(np.full(len(run.targets), np.nan))
             continue
-        instants = at + turn + np.concatenate([[0.0], np.cumsum(travel[run.number])])
-        at = float(instants[-1])
+        instants = now + turn + np.concatenate([[0.0], np.cumsum(travel[run.number])])
+        now = float(instants[-1])
         schedule.append(instants)
     return schedule, max(step, turn) / (2 * math.sqrt(3))
 
@@ -258,15 +261,15 @@ def _parse_environment(
         ("envfactor", "environment_factor", "um", 1.0),
         ("expcoeff", "expansion_coefficient", "ppm/K", 1.0),
     )
-    found: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]] = {}
+    variables: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]] = {}
     for key, name, unit, scale in wanted:
         if key in keyed:
-            found[name] = (("instant",), _pair(keyed[key]) * scale, {"units": unit})
+            variables[name] = (("instant",), _pair(keyed[key]) * scale, {"units": unit})
     material = [_pair(keyed[f"mattemp{sensor}"]) for sensor in (1, 2, 3) if f"mattemp{sensor}" in keyed]
     if material:
         data = np.where(np.array(material) == UNCONNECTED_DEGC, np.nan, material)
-        found["material_temperature"] = (("sensor", "instant"), data, {"units": "degC"})
-    return found
+        variables["material_temperature"] = (("sensor", "instant"), data, {"units": "degC"})
+    return variables
 
 
 def _pair(text: str) -> np.ndarray:
@@ -284,10 +287,14 @@ def _parse_user_text(sections: dict[str, list[tuple[int, str]]]) -> dict[str, st
 def read_rtx(path: str | Path) -> xr.Dataset:
     """Read a Renishaw dynamic capture.
 
+    Parameters
+    ----------
+    path : str or pathlib.Path
+
     Returns
     -------
     xarray.Dataset
-        Dim sample: displacement (mm) and seconds (s since the first sample); the header in ``attrs["header"]`` as JSON.
+        Dim sample: ``displacement`` (mm) and ``seconds`` (s since the first sample); the header in ``attrs["header"]`` as JSON.
 
     Raises
     ------

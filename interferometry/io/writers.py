@@ -1,4 +1,4 @@
-"""Deviations and environment to the files that instruments write: Renishaw .rtl and CSV."""
+"""Writers of deviations and environment: Renishaw .rtl and CSV, in the form that the readers expect."""
 
 from __future__ import annotations
 
@@ -40,33 +40,51 @@ def write_rtl(
     end: np.datetime64 | None = None,
     user_text: Mapping[str, str] | None = None,
 ) -> None:
-    """Write a Renishaw linear test: two runs per cycle, the reverse one in measuring order, missing readings as -1e20.
+    """Write a Renishaw linear test: two runs per cycle, the negative one in measuring order, missing readings as -1e20.
 
     Parameters
     ----------
     path : str or pathlib.Path
     deviations : xarray.Dataset
-        Keeps ``contract.DEVIATIONS``. The file has no place for the times of readings.
-    environment : mapping, optional
-        Start and end of the test for any of air_temperature_degC, air_pressure_hPa, relative_humidity_percent,
+        Keeps ``contract.DEVIATIONS``. The file cannot hold the times of readings.
+    environment : mapping of str to (float, float), optional
+        Values at the start and the end of the test of any of air_temperature_degC, air_pressure_hPa, relative_humidity_percent,
         material_temperature_degC, environment_factor_um, expansion_coefficient_ppm_per_K.
     start, end : numpy.datetime64, optional
-        UTC; left out: the first and the last reading's time.
-    user_text : mapping, optional
+        UTC; None: time of the first and of the last reading.
+    user_text : mapping of str to str, optional
         Any of machine, serial_number, date, by, axis, location, title.
 
     Raises
     ------
     InterferometryError
-        An unknown name stands in ``environment`` or ``user_text``.
+        An unknown name in ``environment`` or ``user_text``.
+
+    Notes
+    -----
+    The layout is that of files of the instrument's own software (version 20.02); the air pressure is in kPa there.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from interferometry.deviations import build_deviations
+    >>> from interferometry.io.readers import read_deviations
+    >>> time = np.datetime64("2026-03-09T06:30") + np.array([[[0, 6], [20, 14]]], "timedelta64[s]")
+    >>> test = build_deviations([1], [1, 2], [0.0, 100.0], np.array([[[0.1, 1.2], [0.5, 1.6]]]), time)
+    >>> path = Path(tempfile.mkdtemp()) / "laser.rtl"
+    >>> write_rtl(path, test, environment={"air_temperature_degC": (20.0, 20.5)}, user_text={"axis": "X"})
+    >>> read_deviations(path)["deviation"].values.tolist()
+    [[[0.1, 1.2], [0.5, 1.6]]]
     """
     environment, user_text = environment or {}, user_text or {}
-    _refuse_unknown("environment", environment, [name for name, _, _ in _ENVIRONMENT])
-    _refuse_unknown("user_text", user_text, [name for name, _ in _USER_TEXT])
+    _raise_if_unknown("environment", environment, [name for name, _, _ in _ENVIRONMENT])
+    _raise_if_unknown("user_text", user_text, [name for name, _ in _USER_TEXT])
     position = deviations["position"].values
     lines = ["HEADER::", "File type  : rtl", "Owner      : Linear", "Version no : V20.02.01", ""]
     lines += ["TARGET DATA::", "Filetype  : ISO", f"Target-count: {position.size}", "Targets :"]
-    lines += ["  ".join(f"{value:.6f}" for value in position[at : at + 5]) + " " for at in range(0, position.size, 5)]
+    lines += ["  ".join(f"{value:.6f}" for value in position[i : i + 5]) + " " for i in range(0, position.size, 5)]
     lines += ["Flags: 0 0 2 1", "", "USER-TEXT::"]
     lines += [f"{label}:{user_text.get(name, '')}" for name, label in _USER_TEXT]
     lines += ["", "RUNS::", f"Run-count:{2 * deviations.sizes['cycle']}", "", "DEVIATIONS::", "Run Target Data:"]
@@ -81,11 +99,11 @@ def write_rtl(
     Path(path).write_text("\r\n".join(lines), encoding="latin-1", newline="")
 
 
-def _refuse_unknown(argument: str, given: Mapping[str, object], known: list[str]) -> None:
-    unknown = sorted(set(given) - set(known))
+def _raise_if_unknown(argument: str, given: Mapping[str, object], allowed: list[str]) -> None:
+    unknown = sorted(set(given) - set(allowed))
     if unknown:
         raise InterferometryError(
-            f"{argument}: {', '.join(unknown)} has no place in a .rtl; known are {', '.join(known)}"
+            f"{argument}: {', '.join(unknown)} has no place in a .rtl; known are {', '.join(allowed)}"
         )
 
 
@@ -98,23 +116,25 @@ def _deviation_rows(deviations: xr.Dataset) -> list[str]:
         for direction, name in enumerate(deviations["direction"].values):
             order = along if name == "positive" else along[::-1]
             run = 2 * cycle + direction + 1
-            rows += [f"{run:<3d} {at + 1:<4d} {values[cycle, direction, at]:10.4f}" for at in order]
+            rows += [f"{run:<3d} {i + 1:<4d} {values[cycle, direction, i]:10.4f}" for i in order]
     return rows
 
 
 def _test_times(deviations: xr.Dataset, start: np.datetime64 | None, end: np.datetime64 | None) -> list[str]:
     times = deviations["time"].values
-    known = times[~np.isnat(times)]
+    times = times[~np.isnat(times)]
     if start is None or end is None:
-        if known.size == 0:
+        if times.size == 0:
             return []
-        start, end = known.min() if start is None else start, known.max() if end is None else end
+        start, end = times.min() if start is None else start, times.max() if end is None else end
     first, last = (str(time.astype("datetime64[s]")).replace("T", " ") for time in (start, end))
     return [f'Date Time  : "{first}" "{last}"']
 
 
 def write_deviations_csv(path: str | Path, deviations: xr.Dataset) -> None:
-    """Write readings in measuring order as CSV (cycle,direction,target,position_mm,time,deviation_um); missing ones get no line.
+    """Write readings in measuring order as CSV, with the columns cycle, direction, target, position_mm, time, deviation_um.
+
+    Missing readings, and readings without a time, have no line.
 
     Parameters
     ----------
@@ -124,7 +144,7 @@ def write_deviations_csv(path: str | Path, deviations: xr.Dataset) -> None:
     """
     present = np.isfinite(deviations["deviation"].values) & ~np.isnat(deviations["time"].values)
     times = deviations["time"].values
-    cells = sorted(zip(*np.nonzero(present), strict=True), key=lambda at: times[at])
+    cells = sorted(zip(*np.nonzero(present), strict=True), key=lambda cell: times[cell])
     with Path(path).open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(("cycle", "direction", "target", "position_mm", "time", "deviation_um"))
@@ -142,13 +162,14 @@ def write_deviations_csv(path: str | Path, deviations: xr.Dataset) -> None:
 
 
 def write_environment_csv(path: str | Path, environment: xr.Dataset) -> None:
-    """Write air and material conditions as CSV.
+    """Write air and material conditions as CSV, in the form that `read_environment` reads.
 
     Parameters
     ----------
     path : str or pathlib.Path
     environment : xarray.Dataset
-        Dim time: air_temperature (degC), air_pressure (hPa), relative_humidity (percent), material_temperature (degC).
+        Dim time (UTC): ``air_temperature`` (degC), ``air_pressure`` (hPa), ``relative_humidity`` (percent),
+        ``material_temperature`` (degC).
     """
     names = ("air_temperature", "air_pressure", "relative_humidity", "material_temperature")
     columns = [environment[name].values for name in names]

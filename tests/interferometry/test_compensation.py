@@ -44,9 +44,9 @@ VECTORS = [
 def test_index_of_air_meets_the_published_vectors(
     temperature: float, pressure: float, humidity: float, wavelength: float, index: float
 ) -> None:
-    found = air_index(temperature, pressure * 10, humidity, wavelength_nm=wavelength)
+    computed = air_index(temperature, pressure * 10, humidity, wavelength_nm=wavelength)
     # The vectors are printed to 1e-9.
-    assert float(found) == pytest.approx(index, abs=0.6e-9)
+    assert float(computed) == pytest.approx(index, abs=0.6e-9)
 
 
 def test_sensitivities_of_the_index() -> None:
@@ -194,3 +194,15 @@ def test_readings_without_conditions_are_refused_or_counted(campaign: tuple[xr.D
     timeless["time"].values[:] = np.datetime64("NaT")
     with pytest.raises(CompensationError, match="no reading has a time"):
         compensate(timeless, environment)
+
+
+def test_a_missing_reading_stays_missing_and_leaves_the_others_alone(campaign: tuple[xr.Dataset, xr.Dataset]) -> None:
+    deviations, environment = campaign
+    complete = compensate(deviations, environment, applied_factor_um=(0.31639, 0.31639))
+    lost = deviations.copy(deep=True)
+    lost["deviation"].values[3, 0, 5] = np.nan
+    lost["time"].values[3, 0, 5] = np.datetime64("NaT")
+    redone = compensate(lost, environment, applied_factor_um=(0.31639, 0.31639))
+    assert np.argwhere(np.isnan(redone["deviation"].values)).tolist() == [[3, 0, 5]]
+    kept = np.isfinite(redone["deviation"].values)
+    np.testing.assert_array_equal(redone["deviation"].values[kept], complete["deviation"].values[kept])

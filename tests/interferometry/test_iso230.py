@@ -11,10 +11,8 @@ import pytest
 import xarray as xr
 
 from interferometry.deviations import build_deviations
-from interferometry.io.delimited import LaserFormatError
-from interferometry.io.ecmc import read_ecmc_log
 from interferometry.io.readers import read_deviations
-from interferometry.iso230 import Iso230Budget, budget_table, evaluate, evaluate_windows
+from interferometry.iso230 import Iso230Budget, budget_table, evaluate_iso230, evaluate_windows
 from tests.interferometry.simulated_campaigns import simulate
 
 MOTION = "anderssandstrom__ecmc_target_muts_logger/b02"
@@ -65,7 +63,7 @@ def by_hand(x: np.ndarray) -> dict[str, float]:
 @pytest.mark.parametrize("name", PRINTED)
 def test_published_tests_give_their_printed_values(real_file: Callable[[str], Path], name: str) -> None:
     deviations = read_deviations(real_file(name))
-    result = evaluate(deviations)
+    result = evaluate_iso230(deviations)
     printed = dict(PRINTED[name])
     assert abs(float(result["mean_reversal"])) == pytest.approx(printed.pop("mean"), abs=PRINTED_TOLERANCE)
     for quantity, value in printed.items():
@@ -87,7 +85,7 @@ def read_report_tables(path: Path) -> xr.Dataset:
 
 @pytest.mark.real_data
 def test_published_slit_test_with_its_two_wrong_values_put_right(real_file: Callable[[str], Path]) -> None:
-    result = evaluate(read_report_tables(real_file(f"{SLIT}/report.md")))
+    result = evaluate_iso230(read_report_tables(real_file(f"{SLIT}/report.md")))
     # The tables are rounded to 0.01 um, so means are good to 0.01 um and s to about 0.02 um.
     printed = {"B": 4.56, "mean_reversal": 0.69, "M": 14.95, "A": 18.58}
     for quantity, value in printed.items():
@@ -99,7 +97,7 @@ def test_published_slit_test_with_its_two_wrong_values_put_right(real_file: Call
 
 def test_definitions_by_hand(rng: np.random.Generator) -> None:
     x = rng.normal(0, 2, (7, 2, 6)) + rng.normal(0, 5, (1, 2, 6))
-    result = evaluate(test_made(x))
+    result = evaluate_iso230(test_made(x))
     for quantity, value in by_hand(x).items():
         assert float(result[quantity]) == pytest.approx(value, rel=1e-12)
     assert float(result["mean_reversal"]) == pytest.approx(float((x[:, 0] - x[:, 1]).mean()))
@@ -108,7 +106,7 @@ def test_definitions_by_hand(rng: np.random.Generator) -> None:
 def test_one_direction_has_no_bidirectional_quantity(rng: np.random.Generator) -> None:
     x = rng.normal(0, 1, (5, 2, 4))
     x[:, 1] = np.nan
-    result = evaluate(test_made(x))
+    result = evaluate_iso230(test_made(x))
     assert np.isnan([float(result[name]) for name in ("B", "R", "E", "M", "A", "B_u")]).all()
     assert float(result["A_unidirectional"][0]) > 0
     assert np.isnan(float(result["A_unidirectional"][1]))
@@ -117,7 +115,7 @@ def test_one_direction_has_no_bidirectional_quantity(rng: np.random.Generator) -
 def test_a_missing_reading_is_skipped(rng: np.random.Generator) -> None:
     x = rng.normal(0, 1, (5, 2, 4))
     x[2, 1, 3] = np.nan
-    result = evaluate(test_made(x))
+    result = evaluate_iso230(test_made(x))
     assert int(result["count"][1, 3]) == 4
     assert float(result["standard_deviation"][1, 3]) == pytest.approx(np.nanstd(x[:, 1, 3], ddof=1))
 
@@ -126,7 +124,7 @@ def test_a_target_read_once_is_left_out_by_name(rng: np.random.Generator) -> Non
     x = rng.normal(0, 1, (5, 2, 4))
     x[1:, 1, 3] = np.nan
     x[0, 1, 3] = 100.0
-    result = evaluate(test_made(x))
+    result = evaluate_iso230(test_made(x))
     assert result.attrs["window"] == "cycles 1..5; without targets 4 negative (fewer than two readings)"
     assert float(result["A"]) < 50.0
     assert np.isnan(float(result["reversal"][3]))
@@ -135,11 +133,11 @@ def test_a_target_read_once_is_left_out_by_name(rng: np.random.Generator) -> Non
 def test_windows_that_cannot_be_evaluated_are_refused(rng: np.random.Generator) -> None:
     test = test_made(rng.normal(0, 1, (5, 2, 4)))
     with pytest.raises(ValueError, match=r"cycles \[6, 7\] of the window were not measured"):
-        evaluate(test, cycles=[5, 6, 7])
+        evaluate_iso230(test, cycles=[5, 6, 7])
     with pytest.raises(
         ValueError, match="no target has two readings from one side in a window of one cycle; ISO 230-2"
     ):
-        evaluate(test, cycles=[5])
+        evaluate_iso230(test, cycles=[5])
 
 
 def test_short_tests_and_empty_windows_have_the_windows_that_can_be_evaluated(rng: np.random.Generator) -> None:
@@ -165,7 +163,7 @@ def test_uncertainty_agrees_with_repeated_tests() -> None:
     profile = np.array([[0.0, 3.0, 9.0, 20.0], [4.0, 8.0, 12.0, 26.0]])
     repeated = [by_hand(profile + rng.normal(0, 0.5, (20, 2, 4))) for _ in range(2000)]
     zero = Iso230Budget(device_ppm=0.0)
-    stated = evaluate(test_made(profile + rng.normal(0, 0.5, (20, 2, 4))), budget=zero)
+    stated = evaluate_iso230(test_made(profile + rng.normal(0, 0.5, (20, 2, 4))), budget=zero)
     for name in ("B", "E", "M", "A"):
         spread = np.std([one[name] for one in repeated], ddof=1)
         # One test knows its own s to 1/sqrt(2 * 19) = 16 %; the extremes over positions add a little.
@@ -176,7 +174,7 @@ def test_every_quantity_has_an_uncertainty_in_both_directions_that_repeated_test
     rng = np.random.default_rng(11)
     profile = np.array([[0.0, 3.0, 9.0, 20.0], [4.0, 8.0, 12.0, 26.0]])
     zero = Iso230Budget(device_ppm=0.0)
-    tests = [evaluate(test_made(profile + rng.normal(0, 0.5, (20, 2, 4))), budget=zero) for _ in range(60)]
+    tests = [evaluate_iso230(test_made(profile + rng.normal(0, 0.5, (20, 2, 4))), budget=zero) for _ in range(60)]
     values = [name for name in tests[0].data_vars if not str(name).endswith("_u") and name != "count"]
     assert len(values) == 15
     for name in values:
@@ -191,7 +189,7 @@ def test_every_quantity_has_an_uncertainty_in_both_directions_that_repeated_test
 def test_one_direction_has_its_own_uncertainties(rng: np.random.Generator) -> None:
     x = rng.normal(0, 1, (5, 2, 4))
     x[:, 1] = np.nan
-    result = evaluate(test_made(x))
+    result = evaluate_iso230(test_made(x))
     for name in ("R_unidirectional_u", "E_unidirectional_u", "A_unidirectional_u"):
         assert np.isfinite(result[name].values).tolist() == [True, False]
     assert np.isfinite(result["mean_unidirectional_u"].values).tolist() == [[True] * 4, [False] * 4]
@@ -225,33 +223,3 @@ def test_temperature_and_expansion_enter_as_the_product_rule_says() -> None:
 def test_a_negative_uncertainty_is_refused() -> None:
     with pytest.raises(ValueError, match="device_ppm=-1 is negative"):
         Iso230Budget(device_ppm=-1)
-
-
-def log(folder: Path, old: str = "", new: str = "") -> Path:
-    lines = ["UNIT=mm", "CYCLES=2", "POSITIONS=2"]
-    lines += [f"TGT_DATA[{t}]={10 * t}" for t in (1, 2)]
-    lines += [f"REF_DATA_{d}[{t},{c}]={10 * t + c / 1000}" for d in ("FWD", "BWD") for t in (1, 2) for c in (1, 2)]
-    text = "\n".join(lines)
-    assert old in text
-    path = folder / "log.dat"
-    path.write_text(text.replace(old, new, 1), encoding="utf-8")
-    return path
-
-
-def test_logs_of_assignments_are_read(tmp_path: Path) -> None:
-    test = read_deviations(log(tmp_path))
-    assert test["deviation"].values[:, 0, :] == pytest.approx(np.array([[1.0, 1.0], [2.0, 2.0]]))
-    assert test["time"].attrs["origin"] == "none"
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("UNIT=mm", "UNIT=inch", "UNIT=inch is not known; use one of mm, um, m"),
-        ("CYCLES=2", "CYCLES=5", "CYCLES=5, but 2 were found"),
-        ("TGT_DATA[2]", "TGT_DATA[3]", r"TGT_DATA gives targets \[1, 3\]"),
-    ],
-)
-def test_logs_that_break_their_promises_are_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
-    with pytest.raises(LaserFormatError, match=message):
-        read_ecmc_log(log(tmp_path, old, new))

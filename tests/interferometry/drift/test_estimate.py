@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from interferometry.deviations import OUTLIER, sort_readings
-from interferometry.drift.estimate import DriftDataError, estimate_drift, flag_outliers, state_weights, track_reversal
+from interferometry.drift.estimate import DriftDataError, estimate_drift, flag_outliers, state_weights
 from interferometry.drift.gls import average_drift
 from interferometry.drift.state_space import drift_system
 from tests.interferometry.simulated_campaigns import CYCLE_S, SIGMA_UM, simulate
@@ -40,12 +40,12 @@ def test_average_drift_agrees_with_dense_conditioning(order: int, rng: np.random
     average, covariance, with_drift = average_drift(system, weights, y)
 
     prior = dense_drift_covariance(seconds, order, ratios)
-    seen = np.einsum("kc,ckbj->kbj", loadings, prior)
-    total = np.einsum("kbj,jb->kj", seen, loadings) + np.diag(variance)
-    seen, total = seen[observed], total[np.ix_(observed, observed)]
-    gain = np.linalg.solve(total, seen.reshape(seen.shape[0], -1))
+    with_readings = np.einsum("kc,ckbj->kbj", loadings, prior)
+    total = np.einsum("kbj,jb->kj", with_readings, loadings) + np.diag(variance)
+    with_readings, total = with_readings[observed], total[np.ix_(observed, observed)]
+    gain = np.linalg.solve(total, with_readings.reshape(with_readings.shape[0], -1))
     mean = np.einsum("kp,kbj->bjp", y[observed], gain.reshape(-1, 2, n))
-    posterior = prior - np.einsum("kai,kbj->aibj", seen, gain.reshape(-1, 2, n))
+    posterior = prior - np.einsum("kai,kbj->aibj", with_readings, gain.reshape(-1, 2, n))
     np.testing.assert_allclose(average, np.einsum("j,bjp->bp", weights, mean), atol=1e-9)
     np.testing.assert_allclose(covariance, np.einsum("i,aibj,j->ab", weights, posterior, weights), atol=1e-9)
     np.testing.assert_allclose(with_drift, np.einsum("aibj,j->iab", posterior, weights), atol=1e-9)
@@ -111,7 +111,7 @@ def test_the_state_at_the_start_of_a_steep_warm_up_is_within_its_bands() -> None
     assert np.mean(inside) > 0.75
 
 
-def test_a_wandering_reversal_is_found_and_tracked(rng: np.random.Generator) -> None:
+def test_a_reversal_that_drifts_gets_a_component_of_its_own(rng: np.random.Generator) -> None:
     deviations, truth = simulate(rng)
     growth = 1.0 - np.exp(-truth.seconds / 5000.0)
     deviations["deviation"].values[:] += growth * np.array([0.5, -0.5])[None, :, None]
@@ -122,12 +122,8 @@ def test_a_wandering_reversal_is_found_and_tracked(rng: np.random.Generator) -> 
     # 32 readings a cycle: one cycle alone would know its reversal to 0.14 um; smoothing does better.
     assert np.sqrt(np.mean((tracked - tracked.mean() - centred) ** 2)) < 0.07
     assert float(estimated["sigma"]) == pytest.approx(SIGMA_UM, rel=0.04)
-    history = track_reversal(deviations, estimated)
-    true = (truth.profile[0] - truth.profile[1])[None, :] + growth.mean(axis=(1, 2))[:, None]
-    assert np.sqrt(np.mean((history["reversal"].values - true) ** 2)) < 0.09
-    assert history["as_read"].std() > history["reversal"].std()
-    # Two readings of 0.4 um each.
-    assert float(history["as_read_u"].mean()) == pytest.approx(0.566, rel=0.05)
+    true = truth.profile[0] - truth.profile[1] + growth.mean()
+    assert np.sqrt(np.mean((estimated["reversal"].values - true) ** 2)) < 0.09
 
 
 def test_a_strong_drift_of_the_reversal_leaves_the_noise_what_it_is(rng: np.random.Generator) -> None:
@@ -140,10 +136,9 @@ def test_a_strong_drift_of_the_reversal_leaves_the_noise_what_it_is(rng: np.rand
     assert estimated.attrs["order"] == 2
 
 
-def test_a_reversal_that_stays_is_reported_constant(rng: np.random.Generator) -> None:
+def test_a_constant_reversal_gets_no_component(rng: np.random.Generator) -> None:
     deviations, _ = simulate(rng, cycles=30)
-    history = track_reversal(deviations, estimate_drift(deviations))
-    assert float(history["reversal"].std("cycle").max()) < 1e-12
+    assert estimate_drift(deviations)["component"].values.tolist() == ["shift", "stretch"]
 
 
 def test_a_position_that_scatters_more_is_known_less_well(rng: np.random.Generator) -> None:

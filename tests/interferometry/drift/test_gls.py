@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from interferometry.drift.gls import estimate, fit_fixed_effects, settling_pace
+from interferometry.drift.gls import estimate, fit_fixed_effects, settling_noise_scale
 from interferometry.drift.state_space import DriftModelError, drift_system, start_columns
 
 POSITIONS = np.r_[np.arange(16), np.arange(15, -1, -1)]
@@ -152,13 +152,13 @@ def test_bad_input_is_named(rng, change, message):
 
 
 @pytest.mark.parametrize(("order", "ratio"), [(1, 0.01), (2, 1e-6)])
-def test_a_pace_multiplies_the_variance_of_its_own_steps(rng, order, ratio):
+def test_a_process_noise_scale_multiplies_the_variance_of_its_own_steps(rng, order, ratio):
     seconds, _, y = readings(rng, 40)
-    loadings, pace = np.ones((40, 1)), rng.uniform(0.2, 5.0, 40)
-    system = drift_system(seconds, loadings, order=order, ratios=[ratio], pace=pace)
+    loadings, scale = np.ones((40, 1)), rng.uniform(0.2, 5.0, 40)
+    system = drift_system(seconds, loadings, order=order, ratios=[ratio], process_noise_scale=scale)
     fit = fit_fixed_effects(system, y, start_columns(seconds, loadings, order))
 
-    steps = np.diff(seconds, prepend=seconds[0]) * ratio * pace
+    steps = np.diff(seconds, prepend=seconds[0]) * ratio * scale
     after = np.maximum(np.subtract.outer(seconds, seconds), 0.0)
     begun = np.subtract.outer(seconds, seconds) >= 0
     if order == 1:
@@ -176,15 +176,15 @@ def test_a_pace_multiplies_the_variance_of_its_own_steps(rng, order, ratio):
     np.testing.assert_allclose(drift[:, 0], walk @ inverse @ (y - design @ beta), atol=1e-8)
 
 
-def test_a_drift_that_settles_is_livelier_at_the_start_only(rng):
+def test_a_drift_that_settles_has_larger_process_noise_at_the_start_only(rng):
     seconds = np.arange(600) * 40.0
     loadings = np.ones((600, 1))
     warming = 12.0 * (1.0 - np.exp(-seconds / 1200.0)) + rng.normal(0, 0.4, 600)
     columns = np.ones((600, 1))
     fit = estimate(seconds, loadings, warming, columns, settling=True)
-    assert fit.system.paces[0] > 10.0
-    assert fit.system.paces[-1] == 1.0
-    assert (np.diff(fit.system.paces) <= 0).all()
-    assert settling_pace(seconds, 600.0, 2.0)[15] == pytest.approx(0.25)
+    assert fit.system.step_scales[0] > 10.0
+    assert fit.system.step_scales[-1] == 1.0
+    assert (np.diff(fit.system.step_scales) <= 0).all()
+    assert settling_noise_scale(seconds, 600.0, 2.0)[15] == pytest.approx(0.25)
     wandering = np.cumsum(rng.normal(0, 0.1, 600)) + rng.normal(0, 0.4, 600)
-    assert (estimate(seconds, loadings, wandering, columns, settling=True).system.paces == 1.0).all()
+    assert (estimate(seconds, loadings, wandering, columns, settling=True).system.step_scales == 1.0).all()

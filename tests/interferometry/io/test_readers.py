@@ -166,7 +166,7 @@ def test_two_targets_at_one_position_are_refused(tmp_path: Path) -> None:
     [
         (HEADER.replace("deviation_um", "deviation_mm"), "no column deviation_um; .* convert the values and rename"),
         (HEADER.replace("time,", ""), "no column time"),
-        (HEADER + ",time", "column time stands there more than once"),
+        (HEADER + ",time", "column time occurs more than once"),
     ],
 )
 def test_a_wrong_column_is_refused(tmp_path: Path, header: str, message: str) -> None:
@@ -221,7 +221,7 @@ def test_environment_is_sorted_and_its_faults_are_listed(tmp_path: Path) -> None
     assert environment["air_temperature"].values.tolist() == [23.5, 23.7, 23.6, 23.6]
     reasons = {one["line"]: one["reason"] for one in left_out(environment)}
     assert "lies outside 500 .. 1200" in str(reasons[4])
-    assert "stands on an earlier line too" in str(reasons[5])
+    assert "occurs on an earlier line too" in str(reasons[5])
     assert "lies outside -9 .. 80" in str(reasons[6])
 
 

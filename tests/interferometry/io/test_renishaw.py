@@ -10,13 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from interferometry.compensation import air_index, environment_factor
-from interferometry.inspection import describe_test
 from interferometry.io.delimited import LaserFormatError
-from interferometry.io.readers import read_deviations, read_environment
+from interferometry.io.readers import read_deviations
 from interferometry.io.renishaw import read_rtx
-from interferometry.io.writers import write_deviations_csv, write_environment_csv, write_rtl
-from tests.interferometry.simulated_campaigns import simulate
 
 GENUINE = "friedcucumber__RenishawWork/data/22.rtl"
 
@@ -159,84 +155,6 @@ def test_a_file_without_times_says_so(tmp_path: Path) -> None:
     test = read_deviations(rtl(tmp_path, "DateTime", "Nothing"))
     assert test["time"].attrs["origin"] == "none"
     assert np.isnat(test["time"].values).all()
-
-
-def test_rtl_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
-    deviations, _ = simulate(rng, cycles=3)
-    deviations["deviation"].values[1, 0, 5] = np.nan
-    environment = {"air_temperature_degC": (20.5, 21.0), "air_pressure_hPa": (1000.0, 1001.0)}
-    write_rtl(tmp_path / "t.rtl", deviations, environment=environment, user_text={"machine": "X3"})
-    back = read_deviations(tmp_path / "t.rtl", feed_mm_per_min=300, dwell_s=2)
-    # The file prints four decimals of a micrometre.
-    np.testing.assert_allclose(back["deviation"], deviations["deviation"], atol=5.1e-5)
-    assert back["air_pressure"].values == pytest.approx([1000.0, 1001.0])
-    assert json.loads(back.attrs["user_text"])["machine"] == "X3"
-
-
-def test_rtl_writer_refuses_what_has_no_place(tmp_path: Path, rng: np.random.Generator) -> None:
-    deviations, _ = simulate(rng, cycles=2)
-    with pytest.raises(ValueError, match=r"environment: wind has no place in a .rtl"):
-        write_rtl(tmp_path / "t.rtl", deviations, environment={"wind": (1.0, 2.0)})
-
-
-def test_csv_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
-    deviations, _ = simulate(rng, cycles=3)
-    write_deviations_csv(tmp_path / "t.csv", deviations)
-    back = read_deviations(tmp_path / "t.csv")
-    np.testing.assert_allclose(back["deviation"], deviations["deviation"], atol=5.1e-5)
-    assert (back["time"].values == deviations["time"].values).all()
-
-
-def test_environment_csv_round_trip(tmp_path: Path) -> None:
-    source = tmp_path / "a.csv"
-    source.write_text(
-        "time,air_temperature_degC,air_pressure_hPa,relative_humidity_percent,material_temperature_degC\n"
-        "2026-03-09T06:30:00Z,23.5,1000.2,42,23.9\n2026-03-09T06:31:00Z,23.6,1000.1,41,24.0\n",
-        encoding="utf-8",
-    )
-    environment = read_environment(source)
-    write_environment_csv(tmp_path / "b.csv", environment)
-    assert read_environment(tmp_path / "b.csv").equals(environment)
-
-
-AIR = {
-    "air_temperature_degC": (26.2, 26.3),
-    "air_pressure_hPa": (1011.4, 1011.6),
-    "relative_humidity_percent": (37.0, 38.0),
-    "material_temperature_degC": (24.5, 24.6),
-    "expansion_coefficient_ppm_per_K": (11.7, 11.7),
-}
-
-
-def test_inspection_holds_factor_air_and_material_against_each_other(tmp_path: Path, rng: np.random.Generator) -> None:
-    deviations, _ = simulate(rng, cycles=2)
-    deviations["deviation"].values[:, 1] = np.nan
-    deviations["deviation"].values[0, 0, 3] = np.nan
-    for coefficient, starts in ((11.7, "environment factor"), (10.7, "warning: environment factor")):
-        index = air_index(np.array([26.2, 26.3]), np.array([1011.4, 1011.6]), np.array([37.0, 38.0]))
-        factor = environment_factor(
-            index,
-            material_temperature_degC=np.array([24.5, 24.6]),
-            expansion_coefficient_ppm_per_K=coefficient,
-        )
-        path = tmp_path / "t.rtl"
-        write_rtl(path, deviations, environment={**AIR, "environment_factor_um": (factor[0], factor[1])})
-        lines = describe_test(read_deviations(path))
-        assert lines[0] == "warning: 1 of 32 readings missing in the positive direction"
-        assert lines[1] == "warning: no reading in the negative direction"
-        assert any(line.startswith("runs without a reading: 2, 4") for line in lines)
-        assert any("material 24.5 to 24.6 degC, expansion 11.7 ppm/K" in line for line in lines)
-        assert lines[-1].startswith(starts)
-    # 1 ppm/K over 4.55 K.
-    assert "-4.55" in lines[-1] or "+4.55" in lines[-1]
-
-
-@pytest.mark.real_data
-def test_inspection_of_the_genuine_file(real_file: Callable[[str], Path]) -> None:
-    lines = describe_test(read_deviations(real_file(GENUINE)))
-    assert "warning: no reading in the negative direction" in lines
-    assert "runs without a reading: 2" in lines
-    assert "a vacuum wavelength of 632.99063 nm, +0.013 ppm from" in lines[-1]
 
 
 def rtx(folder: Path, samples: int, stated: int, *, end: bytes = b"EOF::\r\n", rate: str = "100") -> Path:

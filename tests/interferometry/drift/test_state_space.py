@@ -1,0 +1,50 @@
+"""The drift system: checked input, whitening, and what it shares with dense algebra."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from interferometry.drift.state_space import DriftModelError, drift_system, start_columns
+
+
+def test_start_columns_are_levels_and_rates_per_hour() -> None:
+    seconds, loadings = np.array([0.0, 1800.0, 3600.0]), np.array([[1.0], [1.0], [2.0]])
+    assert start_columns(seconds, loadings, 1).tolist() == [[1.0], [1.0], [2.0]]
+    assert start_columns(seconds, loadings, 2).tolist() == [[1.0, 0.0], [1.0, 0.5], [2.0, 2.0]]
+
+
+def test_defaults_are_ordinary_readings_that_all_count_under_constant_process_noise() -> None:
+    system = drift_system([0, 1, 2], np.ones((3, 1)), order=1, ratios=[0.5])  # type: ignore[arg-type]
+    assert system.variance.tolist() == [1.0, 1.0, 1.0]
+    assert system.observed.all()
+    assert system.step_scales.tolist() == [1.0, 1.0, 1.0]
+
+
+def test_whitening_a_random_walk_is_its_cholesky_factor(rng: np.random.Generator) -> None:
+    seconds = np.sort(rng.uniform(0, 20, 12))
+    system = drift_system(seconds, np.ones((12, 1)), order=1, ratios=np.array([0.3]))
+    white, log_determinant = system.whiten(np.eye(12))
+    covariance = 0.3 * np.minimum.outer(seconds - seconds[0], seconds - seconds[0]) + np.eye(12)
+    np.testing.assert_allclose(white @ np.linalg.cholesky(covariance), np.eye(12), atol=1e-12)
+    assert log_determinant == pytest.approx(np.linalg.slogdet(covariance)[1], rel=1e-12)
+
+
+def test_smoothed_drift_and_noise_make_up_the_reading(rng: np.random.Generator) -> None:
+    columns = rng.normal(size=(12, 2))
+    system = drift_system(np.arange(12.0), np.ones((12, 1)), order=2, ratios=np.array([0.1]))
+    smoothed = system.smooth(columns)
+    np.testing.assert_allclose(smoothed.levels[:, 0] + system.variance[:, None] * smoothed.u, columns, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "loadings", "message"),
+    [
+        ([0.0, 2.0, 1.0], np.ones((3, 1)), "must not decrease"),
+        ([0.0, np.nan, 1.0], np.ones((3, 1)), "must be finite"),
+        ([0.0, 1.0, 2.0], np.ones(3), r"loadings has shape \(3,\); expected \(3, number of drift components\)"),
+    ],
+)
+def test_bad_input_is_named(seconds: list[float], loadings: np.ndarray, message: str) -> None:
+    with pytest.raises(DriftModelError, match=message):
+        drift_system(np.array(seconds), loadings, order=1, ratios=np.ones(1))
