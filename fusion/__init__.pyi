@@ -2,8 +2,7 @@ from .alignment.align import align
 from .attribution.attribute import correlate
 from .campaign.config import load_campaign
 from .diagnosis.diagnose import diagnose
-from .effects.candidates import Candidate
-from .effects.library import Effect
+from .effects.effect import Candidate, Effect
 from .errors import FusionError
 from .loop.axis import close_loop
 from .pipeline.run import run_campaign
