@@ -15,7 +15,7 @@ Source: Harris (2020), bioRxiv 2020.11.29.402719 (nonsense correlations).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,6 @@ from fusion.attribution.per_target import screen
 from fusion.attribution.thermal_modes import Modes, Region, localise_modes, region_courses
 from fusion.attribution.warm_up import Excitation, describe_excitation
 from fusion.errors import FusionError
-from fusion.products.grouped import joined
 
 #: Verdict codes of the maps, in the order of the CF flag meanings.
 NOT_ATTRIBUTABLE, ATTRIBUTABLE, NOT_SEPARABLE = 0, 1, 2
@@ -48,6 +47,8 @@ Quantities = dict[str, tuple[Array | NDArray[Any], dict[str, Any]]]
 #: Thermal modes get a larger share of the error probability: few, quiet and each one place, they find what single cells miss, and cells
 #: mostly draw the map around them. A quarter of the unit costs the cells 1 % of power and finds 3 % more sources (simulated).
 FAVOUR = {"modes": 0.25}
+_THRESHOLD = {"units": "1", "long_name": "statistic at a family-wise p of 0.05"}
+_RATE = {"units": "1", "long_name": "share of fresh nulls flagged"}
 #: Cells with gaps in up to this share of the frames are filled by interpolation in time; others are left out.
 _GAP_SHARE = 0.2
 
@@ -67,7 +68,7 @@ def correlate(
     per_target: bool = False,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
-) -> xr.Dataset:
+) -> xr.DataTree:
     """Test plan cells, thermal modes and regions as sources of the drift.
 
     Parameters
@@ -93,15 +94,15 @@ def correlate(
 
     Returns
     -------
-    Dataset
+    DataTree
         Maps over channel, y, x: ``statistic``, ``p_value`` (family-wise), ``q_value`` (false discovery), ``sensitivity`` and
         ``sensitivity_u`` (um/K), ``lag`` (s), ``detectable_sensitivity`` (um/K found with 80 % power), ``verdict``, and
-        ``naive_correlation`` for contrast only. The same over channel and mode as ``modes_*``, with ``modes_pattern`` (1 at the
-        strongest cell, at ``modes_at_x``, ``modes_at_y``) and ``modes_p_beside``, the p value of what a mode adds to the leading one
-        (NaN for that one itself, and where none passes); over channel and region as ``regions_*``. Per channel ``threshold``, ``noise``
-        (um), ``unexplained_drift`` (um over one hour), ``drift_order``; scalars ``false_alarm_rate`` (of everything tested),
-        ``cells_false_alarm_rate``, ``modes_false_alarm_rate``, ``regions_false_alarm_rate``, ``warm_up_share``; attribute
-        ``verdict``. With `per_target`, maps over series, y, x as ``targets_*`` and, over series and region, ``target_regions_*``.
+        ``naive_correlation`` for contrast only. Per channel ``threshold``, ``noise`` (um), ``unexplained_drift`` (um over one hour),
+        ``drift_order``; scalars ``false_alarm_rate`` (of everything tested), ``cells_false_alarm_rate``, ``warm_up_share``; attribute
+        ``verdict``. Group ``modes`` holds the same over channel and mode, with ``pattern`` (1 at the strongest cell, at ``at_x``,
+        ``at_y``), ``threshold``, ``false_alarm_rate`` and ``p_beside``, the p value of what a mode adds to the leading one (NaN for that
+        one itself, and where none passes); group ``regions`` the same over channel and region. With `per_target`, groups ``targets``
+        with maps over series, y, x and ``target_regions`` over series and region.
 
     Raises
     ------
@@ -131,15 +132,20 @@ def correlate(
     quantities = {
         name: describe(tested, series, films[name], lags_s, excitation) for name, tested in found.sets.items()
     }
-    dataset = describe_session(found, excitation).assign_coords(y=field["y"], x=field["x"])
-    dataset = dataset.assign(_over_cells("channel", quantities["cells"], seen, field))
+    plan = {"y": field["y"], "x": field["x"]}
+    cells = describe_session(found, excitation).assign_coords(plan)
+    groups = {"/": cells.assign(_over_cells("channel", quantities["cells"], seen, field))}
     if "modes" in quantities:
-        dataset = joined(dataset, modes=_over_modes(quantities["modes"], modes, seen, field))
-        dataset["modes_p_beside"] = _beside_leader(
-            found.sets["modes"], series, films["modes"], excitation, lags_s, draws, seed
+        beside = _beside_leader(found.sets["modes"], series, films["modes"], excitation, lags_s, draws, seed)
+        groups["modes"] = (
+            _over_modes(quantities["modes"], modes, seen, field)
+            .assign(_describe_set(found.sets["modes"]))
+            .assign(p_beside=beside)
         )
     if "regions" in quantities:
-        dataset = joined(dataset, regions=_over_regions("channel", quantities["regions"], regions))
+        groups["regions"] = _over_regions("channel", quantities["regions"], regions).assign(
+            _describe_set(found.sets["regions"])
+        )
     if per_target:
         table = target_table(readings)
         single: dict[str, Quantities] = {
@@ -147,9 +153,12 @@ def correlate(
             for name in ("cells", "regions")
             if name in films
         }
-        dataset = _add_targets(dataset.assign_coords(series=table[0]), single, seen, field, regions)
-    dataset.attrs["readings_outside_film"] = readings.outside_film
-    return dataset
+        groups["targets"] = xr.Dataset(_over_cells("series", single["cells"], seen, field), {"series": table[0]})
+        if "regions" in single:
+            few = _over_regions("series", single["regions"], regions)
+            groups["target_regions"] = few.assign_coords(series=table[0])
+    groups["/"].attrs["readings_outside_film"] = readings.outside_film
+    return xr.DataTree.from_dict(groups)
 
 
 def read_film(field: xr.DataArray, frame_seconds: Array) -> tuple[FieldSeries, NDArray[np.bool_]]:
@@ -259,12 +268,20 @@ def describe(
     }
 
 
+def _describe_set(tested: FamilyTest) -> dict[str, tuple[tuple[str, ...], Any, dict[str, str]]]:
+    """Threshold per channel and rate of false alarms of one set of candidates, as variables."""
+    return {
+        "threshold": (("channel",), tested.threshold, _THRESHOLD),
+        "false_alarm_rate": ((), tested.false_alarm_rate, _RATE),
+    }
+
+
 def describe_session(found: AttributionResult, excitation: Excitation) -> xr.Dataset:
     """What holds for the whole session: thresholds, noise and unexplained drift per channel, false alarms, verdict."""
     cells = found.sets["cells"]
     nulls = list(found.banks) + [found.banks[0]] * (len(cells.names) - len(found.banks))
     per_channel: dict[str, tuple[list[float], dict[str, Any]]] = {
-        "threshold": (cells.threshold.tolist(), {"units": "1", "long_name": "statistic at a family-wise p of 0.05"}),
+        "threshold": (cells.threshold.tolist(), _THRESHOLD),
         "noise": ([bank.sigma for bank in nulls], {"units": "um", "long_name": "noise of one value of the channel"}),
         "unexplained_drift": (
             [bank.drift_per_hour for bank in nulls],
@@ -275,22 +292,12 @@ def describe_session(found: AttributionResult, excitation: Excitation) -> xr.Dat
             {"units": "1", "long_name": "0 none, 1 random walk, 2 integrated random walk"},
         ),
     }
-    rates = {"false_alarm_rate": found.false_alarm_rate} | {
-        f"{name}_false_alarm_rate": tested.false_alarm_rate for name, tested in found.sets.items()
-    }
     session = _session_verdict(found, excitation)
-    others = {
-        f"{name}_threshold": (tested.threshold.tolist(), per_channel["threshold"][1])
-        for name, tested in found.sets.items()
-        if name != "cells"
-    }
     return xr.Dataset(
-        {name: (("channel",), values, attrs) for name, (values, attrs) in (per_channel | others).items()}
+        {name: (("channel",), values, attrs) for name, (values, attrs) in per_channel.items()}
         | {
-            name: ((), rate, {"units": "1", "long_name": "share of fresh nulls flagged"})
-            for name, rate in rates.items()
-        }
-        | {
+            "false_alarm_rate": ((), found.false_alarm_rate, _RATE),
+            "cells_false_alarm_rate": ((), cells.false_alarm_rate, _RATE),
             "warm_up_share": (
                 (),
                 excitation.warm_up_share,
@@ -342,20 +349,6 @@ def _over_modes(quantities: Quantities, modes: Modes, seen: NDArray[np.bool_], f
         )
         .assign_coords(mode=np.arange(1, modes.peaks.size + 1))
     )
-
-
-def _add_targets(
-    dataset: xr.Dataset,
-    single: Mapping[str, Quantities],
-    seen: NDArray[np.bool_],
-    field: xr.DataArray,
-    regions: Sequence[Region],
-) -> xr.Dataset:
-    """Add what every target and direction shows by itself: maps, and regions where there are any."""
-    dataset = joined(dataset, targets=xr.Dataset(_over_cells("series", single["cells"], seen, field)))
-    if "regions" in single:
-        dataset = joined(dataset, target_regions=_over_regions("series", single["regions"], regions))
-    return dataset
 
 
 def _over_columns(leading: str, trailing: str, quantities: Quantities) -> xr.Dataset:

@@ -61,9 +61,9 @@ class Found:
     others_mm: tuple[tuple[float, float], ...]
 
 
-def find_source(maps: xr.Dataset) -> Found:
+def find_source(maps: xr.DataTree) -> Found:
     """Return the leading candidate of :func:`fusion.attribution.attribute.correlate` with the session's verdict."""
-    sets = {name: kind for name, kind in _SETS if name == "cells" or f"{name}_p_value" in maps}
+    sets = {name: kind for name, kind in _SETS if name == "cells" or name in maps.children}
     leading = {name: _leader(maps, name) for name in sets}
     smallest = {name: float(one["p_value"]) for name, one in leading.items()}
     passed = [name for name, p in smallest.items() if p <= LEVEL]
@@ -72,7 +72,8 @@ def find_source(maps: xr.Dataset) -> Found:
     channel = str(best["channel"].values)
     x_mm, y_mm = float(best["x"]), float(best["y"])
     inside, others = _surroundings(maps, chosen, best)
-    y, x = np.meshgrid(maps["y"].values, maps["x"].values, indexing="ij")
+    plan = maps.to_dataset()
+    y, x = np.meshgrid(plan["y"].values, plan["x"].values, indexing="ij")
     name = "" if kind == "cell" else str(best[kind].values)
     return Found(
         verdict=str(maps.attrs["verdict"]),
@@ -91,15 +92,15 @@ def find_source(maps: xr.Dataset) -> Found:
     )
 
 
-def _columns(maps: xr.Dataset, name: str) -> xr.Dataset:
+def _columns(maps: xr.DataTree, name: str) -> xr.Dataset:
     """Findings of one set over channel and candidate, with the candidates' places as x and y."""
     if name == "cells":
-        return maps[list(_QUANTITIES)].stack(candidate=("y", "x"))
-    few = xr.Dataset({quantity: maps[f"{name}_{quantity}"] for quantity in _QUANTITIES})
-    return few.assign_coords(x=maps[f"{name}_at_x"], y=maps[f"{name}_at_y"])
+        return maps.to_dataset()[list(_QUANTITIES)].stack(candidate=("y", "x"))
+    few = maps.children[name].to_dataset()
+    return few[list(_QUANTITIES)].assign_coords(x=few["at_x"], y=few["at_y"])
 
 
-def _leader(maps: xr.Dataset, name: str) -> xr.Dataset:
+def _leader(maps: xr.DataTree, name: str) -> xr.Dataset:
     """The candidate of smallest p; equal ones (the resolution of the draws) are told apart by statistic over threshold."""
     columns = _columns(maps, name)
     p_value = columns["p_value"].fillna(1.0).values
@@ -109,26 +110,29 @@ def _leader(maps: xr.Dataset, name: str) -> xr.Dataset:
     return columns.isel({"channel": channel, columns["p_value"].dims[1]: column})
 
 
-def _surroundings(maps: xr.Dataset, name: str, best: xr.Dataset) -> tuple[NDArray[np.bool_], list[tuple[float, float]]]:
+def _surroundings(
+    maps: xr.DataTree, name: str, best: xr.Dataset
+) -> tuple[NDArray[np.bool_], list[tuple[float, float]]]:
     """Cells (y, x) of the leading place, and the other places that explain the drift as well."""
-    channel = best["channel"].values
+    channel, plan = best["channel"].values, maps.to_dataset()
     if name == "cells":
-        statistic = np.nan_to_num(maps["statistic"].sel(channel=channel).values, nan=-np.inf)
-        return _split(statistic, statistic >= statistic.max() - EQUAL_RATIO, maps)
+        statistic = np.nan_to_num(plan["statistic"].sel(channel=channel).values, nan=-np.inf)
+        return _split(statistic, statistic >= statistic.max() - EQUAL_RATIO, plan)
     few = _columns(maps, name).sel(channel=channel)
     kind = dict(_SETS)[name]
     alike = (few["statistic"] >= best["statistic"] - EQUAL_RATIO).values & (few[kind] != best[kind]).values
     others = [(float(x), float(y)) for x, y in zip(few["x"].values[alike], few["y"].values[alike], strict=True)]
     if name == "regions":
-        return np.zeros((maps.sizes["y"], maps.sizes["x"]), bool), others
-    pattern = np.abs(np.nan_to_num(maps["modes_pattern"].sel(mode=int(best["mode"])).values))
-    _, elsewhere = _split(pattern, pattern >= _PEAK, maps)
-    inside, _ = _split(pattern, pattern >= IN_MODE, maps)
+        return np.zeros((plan.sizes["y"], plan.sizes["x"]), bool), others
+    modes = maps.children["modes"].to_dataset()
+    pattern = np.abs(np.nan_to_num(modes["pattern"].sel(mode=int(best["mode"])).values))
+    _, elsewhere = _split(pattern, pattern >= _PEAK, plan)
+    inside, _ = _split(pattern, pattern >= IN_MODE, plan)
     return inside, [*elsewhere, *others]
 
 
 def _split(
-    strength: Array, equal: NDArray[np.bool_], maps: xr.Dataset
+    strength: Array, equal: NDArray[np.bool_], plan: xr.Dataset
 ) -> tuple[NDArray[np.bool_], list[tuple[float, float]]]:
     """The connected piece of equal cells that holds the strongest one, and the strongest cell (x, y in mm) of every other piece."""
     labels, count = ndimage.label(equal, np.ones((3, 3)))
@@ -139,13 +143,14 @@ def _split(
         if label == own:
             continue
         at = np.unravel_index(int(np.where(labels == label, strength, -np.inf).argmax()), strength.shape)
-        others.append((float(maps["x"][at[1]]), float(maps["y"][at[0]])))
+        others.append((float(plan["x"][at[1]]), float(plan["y"][at[0]])))
     return labels == own, others
 
 
-def would_tell(maps: xr.Dataset, found: Found) -> str:
+def would_tell(maps: xr.DataTree, found: Found) -> str:
     """What would decide what these data leave open, with the numbers of this session; empty where nothing is open."""
-    common = maps.sel(channel="common") if "common" in maps["channel"].values else maps.isel(channel=0)
+    session = maps.to_dataset()
+    common = session.sel(channel="common") if "common" in session["channel"].values else session.isel(channel=0)
     plan = (
         f"thermofuse plan --source NAME=TIME proposes when to switch each heat source at random; give it this session's noise and "
         f'drift: --noise "{float(common["noise"]):.2g} um" --drift "{max(float(common["unexplained_drift"]), 0.01):.2g} um"'

@@ -88,7 +88,7 @@ class SourceAgreement:
         return self.agrees and self.separate
 
 
-def compare_sources(first: xr.Dataset, second: xr.Dataset) -> list[SourceAgreement]:
+def compare_sources(first: xr.DataTree, second: xr.DataTree) -> list[SourceAgreement]:
     """Return every source that passes in either of two sessions, once, and whether the other session agrees.
 
     A session's sources are its thermal modes that pass, each with the part of the drift that it goes with most; where none passes, its
@@ -110,8 +110,8 @@ def compare_sources(first: xr.Dataset, second: xr.Dataset) -> list[SourceAgreeme
         for channel, x_mm, y_mm, separate in _passing(session):
             if channel not in near or _already(found, channel, x_mm, y_mm):
                 continue
-            row = int(np.argmin(np.abs(first["y"].values - y_mm)))
-            column = int(np.argmin(np.abs(first["x"].values - x_mm)))
+            row = int(np.argmin(np.abs(first.coords["y"].values - y_mm)))
+            column = int(np.argmin(np.abs(first.coords["x"].values - x_mm)))
             places = near[channel]
             p_value = _at(places, "p_value", row, column)
             agrees = max(p_value) <= LEVEL and bool(_consistent(*places)[row, column])
@@ -137,7 +137,7 @@ def _at(places: Places, name: str, row: int, column: int) -> tuple[float, float]
     return float(places[0][name][row, column]), float(places[1][name][row, column])
 
 
-def _passing(session: xr.Dataset) -> list[tuple[str, float, float, bool]]:
+def _passing(session: xr.DataTree) -> list[tuple[str, float, float, bool]]:
     """Part of the drift, place (x, y in mm), and whether it is told from the leading one, of every source that a session shows."""
     if session.attrs["verdict"] != "attributable":
         return []
@@ -145,14 +145,15 @@ def _passing(session: xr.Dataset) -> list[tuple[str, float, float, bool]]:
     if leading.kind != "mode":
         return [(leading.channel, leading.x_mm, leading.y_mm, True)]
     order = ("channel", "mode")
-    ratio = (session["modes_statistic"] / session["modes_threshold"]).fillna(0.0).transpose(*order).values
-    passed = session["modes_p_value"].transpose(*order).values <= LEVEL
-    adds = session["modes_p_beside"].transpose(*order).fillna(0.0).values <= LEVEL
+    modes = session.children["modes"].to_dataset()
+    ratio = (modes["statistic"] / modes["threshold"]).fillna(0.0).transpose(*order).values
+    passed = modes["p_value"].transpose(*order).values <= LEVEL
+    adds = modes["p_beside"].transpose(*order).fillna(0.0).values <= LEVEL
     sources = []
     for k in np.flatnonzero(passed.any(axis=0)):
         best = int(np.where(passed[:, k], ratio[:, k], -1.0).argmax())
-        place = float(session["modes_at_x"][k]), float(session["modes_at_y"][k])
-        sources.append((str(session["channel"].values[best]), *place, bool(adds[best, k])))
+        place = float(modes["at_x"][k]), float(modes["at_y"][k])
+        sources.append((str(modes["channel"].values[best]), *place, bool(adds[best, k])))
     return sources
 
 
@@ -164,27 +165,27 @@ def _already(found: list[SourceAgreement], channel: str, x_mm: float, y_mm: floa
     )
 
 
-def _refuse_other_grids(first: xr.Dataset, second: xr.Dataset) -> None:
+def _refuse_other_grids(first: xr.DataTree, second: xr.DataTree) -> None:
     for name in ("x", "y"):
-        if first.sizes[name] != second.sizes[name] or not np.allclose(first[name], second[name]):
+        if first.sizes[name] != second.sizes[name] or not np.allclose(first.coords[name], second.coords[name]):
             raise ConjunctionError(
                 f"the plan grids differ along {name}; give both campaigns the same [plan] size, cell_size and fiducials"
             )
 
 
-def _shared_channels(first: xr.Dataset, second: xr.Dataset) -> list[str]:
-    channels = [str(name) for name in first["channel"].values if name in second["channel"].values]
+def _shared_channels(first: xr.DataTree, second: xr.DataTree) -> list[str]:
+    channels = [str(name) for name in first.coords["channel"].values if name in second.coords["channel"].values]
     if not channels:
         raise ConjunctionError("the two campaigns share no drift channel; both need readings at several targets")
     return channels
 
 
-def _reach(session: xr.Dataset) -> int:
+def _reach(session: xr.DataTree) -> int:
     """Cells within which places count as the same."""
-    return max(1, round(SAME_PLACE_MM / float(np.median(np.diff(session["x"].values)))))
+    return max(1, round(SAME_PLACE_MM / float(np.median(np.diff(session.coords["x"].values)))))
 
 
-def agree(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, list[Common]]:
+def agree(first: xr.DataTree, second: xr.DataTree) -> tuple[xr.Dataset, list[Common]]:
     """Join the maps of two campaigns.
 
     Parameters
@@ -223,29 +224,30 @@ def agree(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, list[Commo
                 np.stack(maps),
                 {"units": "1", "long_name": "larger of both sessions' family-wise p values"},
             ),
-            "verdict": (dims, np.stack(verdicts).astype(np.int8), dict(first["verdict"].attrs)),
+            "verdict": (dims, np.stack(verdicts).astype(np.int8), dict(first.to_dataset()["verdict"].attrs)),
         },
-        coords={"channel": channels, "y": first["y"], "x": first["x"]},
+        coords={"channel": channels, "y": first.coords["y"], "x": first.coords["x"]},
     )
     return joined, found
 
 
-def _candidates(session: xr.Dataset, channel: str) -> dict[str, Array]:
+def _candidates(session: xr.DataTree, channel: str) -> dict[str, Array]:
     """Strongest candidate at every place, (y, x) each: the cell itself, or the thermal mode that has its height there.
 
     The statistic is divided by its threshold, so that cells and modes compare.
     """
-    chosen = session.sel(channel=channel)
+    chosen = session.to_dataset().sel(channel=channel)
     strongest = {name: np.nan_to_num(chosen[name].values, nan=none) for name, none in _BLANK.items()}
     strongest["statistic"] = strongest["statistic"] / float(chosen["threshold"])
-    for mode in session["mode"].values if "modes_p_value" in session else ():
-        one = chosen.sel(mode=mode)
-        at = (int(np.argmin(np.abs(chosen["y"].values - float(one["modes_at_y"])))),
-              int(np.argmin(np.abs(chosen["x"].values - float(one["modes_at_x"])))))  # fmt: skip
-        ratio = float(one["modes_statistic"]) / float(one["modes_threshold"])
-        if ratio > strongest["statistic"][at]:
+    modes = session.children["modes"].to_dataset().sel(channel=channel) if "modes" in session.children else xr.Dataset()
+    for k in range(modes.sizes.get("mode", 0)):
+        mode = modes.isel(mode=k)
+        place = (int(np.argmin(np.abs(chosen["y"].values - float(mode["at_y"])))),
+                 int(np.argmin(np.abs(chosen["x"].values - float(mode["at_x"])))))  # fmt: skip
+        ratio = float(mode["statistic"]) / float(mode["threshold"])
+        if ratio > strongest["statistic"][place]:
             for name in _BLANK:
-                strongest[name][at] = ratio if name == "statistic" else float(one[f"modes_{name}"])
+                strongest[name][place] = ratio if name == "statistic" else float(mode[name])
     y, x = np.meshgrid(chosen["y"].values, chosen["x"].values, indexing="ij")
     return strongest | {"x": x, "y": y}
 

@@ -15,7 +15,6 @@ from fusion.attribution.leading_source import Found, find_source, would_tell
 from fusion.attribution.randomised_duty import randomisation_test
 from fusion.attribution.thermal_modes import Region, cluster_cells, disc
 from fusion.campaign.inputs import Source
-from fusion.products.grouped import group, has, joined
 from fusion.products.progress import Report
 from fusion.products.results import Outcome
 from thermography.fields.hotspots import Hotspot, detect_hotspots
@@ -23,7 +22,7 @@ from thermography.fields.hotspots import Hotspot, detect_hotspots
 _CORRELATION_CELL_MM = 10.0
 
 
-def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, report: Report) -> Outcome:
+def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, report: Report) -> Outcome[xr.DataTree]:
     """Test every part of the field as a source of the drift.
 
     The cells are averaged to about a centimetre first: within one cycle heat spreads further than that in steel, so nothing is lost
@@ -45,11 +44,12 @@ def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, re
     report("correlation", 100, 100)
     report("sensor places", 0, 1)
     choice = choose_sensors(fused, film)
-    maps = joined(maps, clusters=cluster_cells(film), sensors=sensor_variables(choice))
+    maps["clusters"] = xr.DataTree(cluster_cells(film))
+    maps["sensors"] = xr.DataTree(sensor_variables(choice))
     report("sensor places", 1, 1)
     if source.duty is not None:
         schedule, law = source.duty
-        maps = joined(maps, duty=randomisation_test(fused, schedule, law))
+        maps["duty"] = xr.DataTree(randomisation_test(fused, schedule, law))
     found = find_source(maps)
     parts = {
         "hotspots": [_hotspot(f"hotspot {k}", spot, maps, fused) for k, spot in enumerate(spots, start=1)],
@@ -80,8 +80,8 @@ def sensor_variables(choice: SensorChoice) -> xr.Dataset:
     dataset = xr.Dataset(
         {name: ("sensor", np.array(values, float), um) for name, values in columns.items()}
         | {
-            "x": ("sensor", places[:, 0], mm),
-            "y": ("sensor", places[:, 1], mm),
+            "at_x": ("sensor", places[:, 0], mm),
+            "at_y": ("sensor", places[:, 1], mm),
             "decided": ("sensor", np.array([one.decided for one in losses], np.int8), {"units": "1"}),
             "camera_gain": ((), choice.without.um, um),
             "camera_gain_at_most": ((), choice.without.at_most_um, um),
@@ -92,14 +92,15 @@ def sensor_variables(choice: SensorChoice) -> xr.Dataset:
     return dataset.assign_coords(sensor=np.arange(1, len(losses) + 1))
 
 
-def correlation_part(maps: xr.Dataset, found: Found, fused: xr.Dataset) -> dict[str, Any]:
+def correlation_part(maps: xr.DataTree, found: Found, fused: xr.Dataset) -> dict[str, Any]:
     """Return what results.json says of drift and field."""
-    channels = [str(name) for name in maps["channel"].values]
-    duty = group(maps, "duty") if has(maps, "duty") else None
+    session = maps.to_dataset()
+    channels = [str(name) for name in session["channel"].values]
+    duty = maps.children["duty"].to_dataset() if "duty" in maps.children else None
     return {
         "verdict": found.verdict,
         "excitation": str(maps.attrs["excitation"]),
-        "false_alarm_rate": float(maps["false_alarm_rate"]),
+        "false_alarm_rate": float(session["false_alarm_rate"]),
         "source": {
             "kind": found.kind,
             "name": found.name,
@@ -114,11 +115,11 @@ def correlation_part(maps: xr.Dataset, found: Found, fused: xr.Dataset) -> dict[
         },
         "would_tell": would_tell(maps, found),
         "unexplained_drift_um_per_h": {
-            name: float(maps["unexplained_drift"].sel(channel=name)) for name in channels if name != "joint"
+            name: float(session["unexplained_drift"].sel(channel=name)) for name in channels if name != "joint"
         },
         "modes": _candidates(maps, "modes", "mode"),
         "regions": _candidates(maps, "regions", "region"),
-        "sensors": _sensors(group(maps, "sensors")),
+        "sensors": _sensors(maps.children["sensors"].to_dataset()),
         "randomised_duty": None if duty is None else duty_part(duty),
     }
 
@@ -137,11 +138,11 @@ def duty_part(duty: xr.Dataset) -> list[dict[str, Any]]:
     ]
 
 
-def _candidates(maps: xr.Dataset, name: str, kind: str) -> list[dict[str, Any]]:
+def _candidates(maps: xr.DataTree, name: str, kind: str) -> list[dict[str, Any]]:
     """Return modes or regions with what they show in every part of the drift."""
-    if not has(maps, name):
+    if name not in maps.children:
         return []
-    few = group(maps, name)
+    few = maps.children[name].to_dataset()
     listed = []
     for at in range(few.sizes[kind]):
         one = few.isel({kind: at})
@@ -173,8 +174,8 @@ def _sensors(sensors: xr.Dataset) -> dict[str, Any]:
         "camera_gain_decided": bool(sensors["camera_decided"]),
         "sets": [
             {
-                "x_mm": float(one["x"]),
-                "y_mm": float(one["y"]),
+                "x_mm": float(one["at_x"]),
+                "y_mm": float(one["at_y"]),
                 "loss_um": float(one["loss"]),
                 "loss_at_most_um": float(one["loss_at_most"]),
                 "decided": bool(one["decided"]),
@@ -184,11 +185,12 @@ def _sensors(sensors: xr.Dataset) -> dict[str, Any]:
     }
 
 
-def _hotspot(name: str, spot: Hotspot, maps: xr.Dataset, fused: xr.Dataset) -> dict[str, Any]:
+def _hotspot(name: str, spot: Hotspot, maps: xr.DataTree, fused: xr.Dataset) -> dict[str, Any]:
     """Return one entry of ``hotspots``: its strongest part of the drift, and the targets that it drives."""
     found: dict[str, Any] = {"targets": [], "p_value": None, "lag_s": None}
-    if has(maps, "regions") and name in maps["region"].values:
-        one = group(maps, "regions").sel(region=name)
+    regions = maps.children["regions"].to_dataset() if "regions" in maps.children else None
+    if regions is not None and name in regions["region"].values:
+        one = regions.sel(region=name)
         ratio = (one["statistic"] / one["threshold"]).fillna(0.0).values
         best = one.isel(channel=int(np.lexsort((-ratio, one["p_value"].fillna(1.0).values))[0]))
         found = {
@@ -199,7 +201,7 @@ def _hotspot(name: str, spot: Hotspot, maps: xr.Dataset, fused: xr.Dataset) -> d
     return {"x_mm": spot.x_mm, "y_mm": spot.y_mm, "peak_rise_K": spot.peak_rise_K, **found}
 
 
-def driven_targets(maps: xr.Dataset, fused: xr.Dataset, region: str, best: xr.Dataset) -> list[int]:
+def driven_targets(maps: xr.DataTree, fused: xr.Dataset, region: str, best: xr.Dataset) -> list[int]:
     """Return the targets that a region drives: none unless the session tells and the region passes.
 
     Through a shift it drives all, through a stretch those away from the laser's zero, and whatever target shows it by itself.
@@ -209,7 +211,7 @@ def driven_targets(maps: xr.Dataset, fused: xr.Dataset, region: str, best: xr.Da
     driven = np.zeros(fused.sizes["target"], bool)
     if float(best["p_value"]) <= LEVEL:
         driven |= fused["position"].values != 0 if best["channel"] == "proportional" else True
-    single = maps["target_regions_p_value"].sel(region=region)
+    single = maps.children["target_regions"].to_dataset()["p_value"].sel(region=region)
     for series in single["series"].values[(single <= LEVEL).values]:
         driven |= fused["target"].values == int(str(series).split()[-1])
     return fused["target"].values[driven].astype(int).tolist()

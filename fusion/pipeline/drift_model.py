@@ -205,8 +205,8 @@ def field_notices(errors: Sequence[FieldError]) -> list[Notice]:
     ]
 
 
-def join_fusion(fused: xr.Dataset, maps: xr.Dataset, loop: xr.Dataset) -> xr.Dataset:
-    """Everything that joins both recordings, for fusion.nc.
+def join_fusion(fused: xr.Dataset, maps: xr.DataTree, loop: xr.Dataset) -> xr.DataTree:
+    """Everything that joins both recordings, for fusion.nc: readings and loop at the root, the attribution in its own groups.
 
     Parameters
     ----------
@@ -214,9 +214,9 @@ def join_fusion(fused: xr.Dataset, maps: xr.Dataset, loop: xr.Dataset) -> xr.Dat
     maps : of the attribution
     loop : of the closed loop
     """
-    dataset = joined(fused, correlation=maps, loop=loop)
-    own = {name: value for name, value in maps.attrs.items() if name not in store.GLOBAL_ATTRIBUTES}
-    return dataset.assign_attrs({f"correlation_{name}": value for name, value in own.items()})
+    correlation = maps.copy()
+    correlation.attrs = {name: value for name, value in maps.attrs.items() if name not in store.GLOBAL_ATTRIBUTES}
+    return xr.DataTree(joined(fused, loop=loop), children={"correlation": correlation})
 
 
 def loop_variables(fused: xr.Dataset, models: Mapping[str, ModelFit], tests: Mapping[str, ResidualTests]) -> xr.Dataset:

@@ -10,8 +10,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import xarray as xr
-
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import Source, compensate_by_camera, read_source
 from fusion.pipeline import attribution, drift_model, interferometry, thermal
@@ -20,12 +18,14 @@ from fusion.pipeline.provenance import describe_run, hash_inputs, versions
 from fusion.products.progress import Report, silent
 from fusion.products.results import Notice, Outcome, assemble
 from fusion.products.store import (
+    Product,
     StageStamps,
     annotate,
     digest,
     open_folder,
     plain,
     read_dataset,
+    read_tree,
     write_dataset,
     write_json,
     write_text,
@@ -58,9 +58,14 @@ class Run:
     keys: dict[str, str] = field(default_factory=dict)
 
     def stage(
-        self, name: str, tables: tuple[str, ...], after: tuple[str, ...], compute: Callable[[], Outcome]
-    ) -> xr.Dataset:
-        """Return the Dataset of a stage: computed and stamped, or taken over where the stamp says nothing has changed.
+        self,
+        name: str,
+        tables: tuple[str, ...],
+        after: tuple[str, ...],
+        compute: Callable[[], Outcome[Product]],
+        read: Callable[[Path], Product],
+    ) -> Product:
+        """Return the product of a stage: computed and stamped, or taken over where the stamp says nothing has changed.
 
         Parameters
         ----------
@@ -72,13 +77,15 @@ class Run:
             Stages it builds on; it is done again whenever one of them is.
         compute : callable
             Does the work.
+        read : callable
+            Reads the product that a kept stage has written.
         """
         key = self.key_of(name, tables, after)
         path = self.folder / FILES[name]
         begun = time.monotonic()
         if self.stamps.done(name, key):
             note = self.stamps.note(name)
-            outcome = Outcome(read_dataset(path), note["parts"], tuple(Notice(**item) for item in note["notices"]))
+            outcome = Outcome(read(path), note["parts"], tuple(Notice(**item) for item in note["notices"]))
             self.report(f"{interferometry.LABELS[name]} (kept)", 1, 1)
         else:
             computed = compute()
@@ -107,11 +114,11 @@ class Run:
                 shutil.rmtree(stale)
         return chosen
 
-    def described(self, dataset: xr.Dataset) -> xr.Dataset:
-        """Return a product's Dataset with what NetCDF files have to say of themselves."""
+    def described(self, product: Product) -> Product:
+        """Return a product with what NetCDF files have to say of themselves."""
         history = f"{self.started.isoformat(timespec='seconds')} thermofuse run {self.campaign.path.name}"
         origin = {"software": "thermofuse", "versions": versions(), "inputs": dict(self.inputs)}
-        return annotate(dataset, title=self.campaign.campaign.title, history=history, provenance=origin)
+        return annotate(product, title=self.campaign.campaign.title, history=history, provenance=origin)
 
 
 def run_campaign(
@@ -171,6 +178,7 @@ def _run_instruments(run: Run, source: Source, *, scheduler: str | None) -> dict
         seen,
         (),
         lambda: thermal.reduce_thermography(source, checkpoint=checkpoint, scheduler=scheduler, report=report),
+        read_dataset,
     )
     source, redone = compensate_by_camera(source, fields)
     run.notices.extend(redone)
@@ -179,6 +187,7 @@ def _run_instruments(run: Run, source: Source, *, scheduler: str | None) -> dict
         ("interferometry",),
         ("fields",) if source.needs_camera else (),
         lambda: interferometry.evaluate_interferometry(source),
+        read_dataset,
     )
     fused, outside = interferometry.align_recordings(source, fields, deviations)
     run.notices.extend(outside)
@@ -188,12 +197,14 @@ def _run_instruments(run: Run, source: Source, *, scheduler: str | None) -> dict
         joint,
         ("fields", "deviations"),
         lambda: attribution.correlate_field(source, fields, fused, report=report),
+        read_tree,
     )
     model = run.stage(
         "model",
         (*joint, "model"),
         ("fields", "deviations"),
         lambda: drift_model.model_drift(source, fields, fused, deviations, report=report),
+        read_dataset,
     )
     fusion = run.described(drift_model.join_fusion(fused, maps, model))
     write_dataset(folder / "fusion.nc", fusion)
@@ -203,11 +214,13 @@ def _run_instruments(run: Run, source: Source, *, scheduler: str | None) -> dict
 
 def _run_record(run: Run, source: record_stage.RecordSource) -> dict[str, Any]:
     """Run the main job on a record: one table, one stage."""
-    record = run.stage("record", ("record", "model"), (), lambda: record_stage.model_record(source, report=run.report))
+    record = run.stage(
+        "record", ("record", "model"), (), lambda: record_stage.model_record(source, report=run.report), read_dataset
+    )
     return _finish(run, {"record": record})
 
 
-def _finish(run: Run, datasets: Mapping[str, xr.Dataset]) -> dict[str, Any]:
+def _finish(run: Run, datasets: Mapping[str, Any]) -> dict[str, Any]:
     """Write results, provenance and report from what the stages found."""
     results = plain(assemble(run.campaign.campaign.title, run.parts, run.notices))
     provenance = describe_run(run.campaign, run.inputs, started=run.started, seconds=run.seconds)

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from fusion.attribution.two_sessions import Common, SourceAgreement, agree, compare_sources
-from fusion.products.grouped import correlation_of
-from fusion.products.store import read_dataset, write_dataset, write_json, write_text
+from fusion.products.store import read_dataset, read_tree, write_dataset, write_json, write_text
 from fusion.report.html import render_report
 from fusion.report.model_section import readable
 from fusion.report.plots_attribution import CHANNELS
 from fusion.report.wording import duration, measured, number, p_value
 
-PRODUCTS = ("fields", "deviations", "fusion")
+READERS = {"fields": read_dataset, "deviations": read_dataset, "fusion": read_tree}
 
 
 def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
@@ -39,8 +38,10 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
     ConjunctionError
         If the campaigns cannot be compared.
     """
-    datasets = [{name: read_dataset(folder / f"{name}.nc") for name in PRODUCTS} for folder in folders]
-    sessions = [correlation_of(one["fusion"]) for one in datasets]
+    products: list[dict[str, Any]] = [
+        {name: read(folder / f"{name}.nc") for name, read in READERS.items()} for folder in folders
+    ]
+    sessions = [product["fusion"].children["correlation"] for product in products]
     maps, found = agree(*sessions)
     sources = compare_sources(*sessions)
     write_dataset(out / "joint.nc", maps)
@@ -59,7 +60,7 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
         joint = {"other": _title(folders[1 - at]), "rows": rows, "causes": causes, "sources": table}
         write_text(
             folder / "report.html",
-            render_report(_json(folder, "results"), _json(folder, "provenance"), datasets[at], joint=joint),
+            render_report(_json(folder, "results"), _json(folder, "provenance"), products[at], joint=joint),
         )
     if not table:
         return [("sources", "neither session shows one")]

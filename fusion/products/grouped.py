@@ -1,4 +1,4 @@
-"""Several results in one Dataset: each keeps its own names behind a prefix, so that one file holds them all."""
+"""Several results on the axes of one Dataset, each behind a prefix: the parts of deviations.nc, and the closed loop in fusion.nc."""
 
 from __future__ import annotations
 
@@ -22,13 +22,3 @@ def group(dataset: xr.Dataset, name: str) -> xr.Dataset:
 def has(dataset: xr.Dataset, name: str) -> bool:
     """Tell whether a part is there."""
     return any(str(variable).startswith(f"{name}_") for variable in dataset.data_vars)
-
-
-def correlation_of(fusion: xr.Dataset) -> xr.Dataset:
-    """Return the correlation in fusion.nc as `fusion.attribution.attribute.correlate` gave it, attributes included."""
-    attrs = {
-        str(name).removeprefix("correlation_"): value
-        for name, value in fusion.attrs.items()
-        if str(name).startswith("correlation_")
-    }
-    return group(fusion, "correlation").assign_attrs(attrs)

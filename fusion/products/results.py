@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Generic
 
-import xarray as xr
+from fusion.products.store import Product
 
 SCHEMA_VERSION = 1
 CAUSES = ("structural", "local_temperature", "stick_slip", "step", "undetermined")
@@ -168,9 +168,19 @@ def results_schema() -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What a stage found: its Dataset, its shares of results.json, and what it left out."""
+class Outcome(Generic[Product]):
+    """Result of a stage.
 
-    dataset: xr.Dataset
+    Attributes
+    ----------
+    dataset : Dataset or DataTree
+        What the stage writes as its product.
+    parts : dict
+        Its shares of results.json, by name.
+    notices : tuple of Notice
+        What it left out or doubts.
+    """
+
+    dataset: Product
     parts: dict[str, Any]
     notices: tuple[Notice, ...] = ()

@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -19,6 +19,8 @@ from fusion.errors import FusionError
 
 STAMPS = ".stages/stamps.json"
 _PARTIAL = ".partial"
+#: A product is one Dataset, or a tree of them whose nodes become the groups of one NetCDF file.
+Product = TypeVar("Product", xr.Dataset, xr.DataTree)
 
 
 class OutputError(FusionError):
@@ -71,19 +73,52 @@ def write_json(path: Path, content: object) -> Path:
     return write_text(path, json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def write_dataset(path: Path, dataset: xr.Dataset) -> Path:
-    """Write a Dataset as NetCDF 4 whole or not at all; floating-point maps are compressed without loss."""
+def write_dataset(path: Path, product: xr.Dataset | xr.DataTree) -> Path:
+    """Write a product as NetCDF 4 whole or not at all; floating-point maps are compressed without loss.
+
+    Every node of a tree becomes a group with coordinates of its own, so that ``xarray.open_dataset(path, group=...)`` needs no other
+    group to make sense of it.
+    """
+    tree = xr.DataTree(product) if isinstance(product, xr.Dataset) else product
+
+    def write_groups(temporary: Path) -> None:
+        for node in tree.subtree:
+            dataset = _with_own_coordinates(node)
+            mode: Literal["w", "a"] = "w" if node is tree else "a"
+            group = node.relative_to(tree)
+            dataset.to_netcdf(
+                temporary, mode, group=None if group == "." else group, engine="h5netcdf", encoding=_encoding(dataset)
+            )
+
+    return write_atomically(path, write_groups)
+
+
+def _with_own_coordinates(node: xr.DataTree) -> xr.Dataset:
+    """Return a node with the coordinates that it inherits, as far as its variables have their dimensions."""
+    own = node.to_dataset(inherit=False)
+    inherited = node.to_dataset().coords
+    return own.assign_coords({name: inherited[name] for name in own.dims if name in inherited and name not in own})
+
+
+def _encoding(dataset: xr.Dataset) -> dict[Any, dict[str, object]]:
+    """Return the encoding of a Dataset: coordinates without fill value, large maps compressed."""
     encoding: dict[Any, dict[str, object]] = {name: {"_FillValue": None} for name in dataset.coords}
     for name, array in dataset.data_vars.items():
         if array.dtype.kind == "f" and array.size > 10_000:
             encoding[name] = {"zlib": True, "complevel": 1}
-    return write_atomically(path, lambda temporary: dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding))
+    return encoding
 
 
 def read_dataset(path: Path) -> xr.Dataset:
     """Read a Dataset written by `write_dataset` into memory."""
     with xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as dataset:
         return dataset.load()
+
+
+def read_tree(path: Path) -> xr.DataTree:
+    """Read a tree written by `write_dataset` into memory."""
+    with xr.open_datatree(path, engine="h5netcdf", decode_timedelta=False) as tree:
+        return tree.load()
 
 
 def plain(value: Any) -> Any:
@@ -153,12 +188,12 @@ CONVENTIONS = "CF-1.11"
 GLOBAL_ATTRIBUTES = ("Conventions", "title", "history", "provenance")
 
 
-def annotate(dataset: xr.Dataset, *, title: str, history: str, provenance: Mapping[str, Any]) -> xr.Dataset:
-    """Return `dataset` with the global attributes of the CF conventions and a long name wherever none was given.
+def annotate(product: Product, *, title: str, history: str, provenance: Mapping[str, Any]) -> Product:
+    """Return `product` with the global attributes of the CF conventions and a long name wherever none was given.
 
     Parameters
     ----------
-    dataset : Dataset
+    product : Dataset or DataTree
     title : str
         What the campaign is called.
     history : str
@@ -166,13 +201,13 @@ def annotate(dataset: xr.Dataset, *, title: str, history: str, provenance: Mappi
     provenance : mapping
         Stored as one JSON text, since NetCDF attributes hold neither mappings nor None.
     """
-    described = dataset.copy()
-    for name in described.variables:
-        attrs = described[name].attrs
-        if "long_name" not in attrs and "standard_name" not in attrs:
-            attrs["long_name"] = name_in_words(str(name))
+    described = product.copy()
+    for node in described.subtree if isinstance(described, xr.DataTree) else (described,):
+        for name, variable in node.variables.items():
+            if "long_name" not in variable.attrs and "standard_name" not in variable.attrs:
+                variable.attrs["long_name"] = name_in_words(str(name))
     described.attrs = {
-        **dataset.attrs,
+        **product.attrs,
         "Conventions": CONVENTIONS,
         "title": title,
         "history": history,

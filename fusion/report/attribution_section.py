@@ -10,7 +10,6 @@ import xarray as xr
 
 from fusion.attribution.family_wise import LEVEL
 from fusion.attribution.leading_source import Found, find_source, would_tell
-from fusion.products.grouped import correlation_of, group, has
 from fusion.report.model_section import readable
 from fusion.report.plots_attribution import CHANNELS, caption_of, rate_text
 from fusion.report.wording import duration, join, measured, number, p_value
@@ -20,30 +19,30 @@ _SHORT = {"common": "common", "proportional": "growing", "reversal": "reversal",
 
 
 def describe_correlation(
-    fused: xr.Dataset, results: Mapping[str, Any], joint: Mapping[str, Any] | None
+    fused: xr.DataTree, results: Mapping[str, Any], joint: Mapping[str, Any] | None
 ) -> dict[str, Any] | None:
     """Return everything the section on drift and field says; None where it was not tested."""
-    if not has(fused, "correlation"):
+    if "correlation" not in fused.children:
         return None
-    maps = correlation_of(fused)
+    maps = fused.children["correlation"]
     found = find_source(maps)
-    duty = group(maps, "duty") if has(maps, "duty") else None
+    duty = maps.children["duty"].to_dataset() if "duty" in maps.children else None
     captions = {"cells": caption_of(maps, found.channel)}
-    if has(maps, "modes"):
+    if "modes" in maps.children:
         captions["modes"] = caption_of(maps, found.channel, "modes")
     return {
         "headline": _headline(found),
         "sentences": [*_sentences(found), *_beside(maps, found), _worth(found, joint, duty)],
         "tell": readable(would_tell(maps, found)),
         "captions": captions,
-        "channels": [_channel_row(maps, str(channel)) for channel in maps["channel"].values],
+        "channels": [_channel_row(maps, str(channel)) for channel in maps.coords["channel"].values],
         "modes": _candidate_rows(maps, "modes", "mode"),
         "regions": _candidate_rows(maps, "regions", "region"),
-        "region": leading_region(maps) if has(maps, "target_regions") else "",
-        "region_targets": _region_targets(maps) if has(maps, "target_regions") else "",
+        "region": leading_region(maps) if "target_regions" in maps.children else "",
+        "region_targets": _region_targets(maps) if "target_regions" in maps.children else "",
         "session": _session(maps),
         "duty": [] if duty is None else _duty_rows(duty),
-        "sensors": _sensors(group(maps, "sensors"), found.verdict),
+        "sensors": _sensors(maps.children["sensors"].to_dataset(), found.verdict),
     }
 
 
@@ -76,17 +75,18 @@ def _sentences(found: Found) -> list[str]:
     return sentences
 
 
-def _beside(maps: xr.Dataset, found: Found) -> list[str]:
+def _beside(maps: xr.DataTree, found: Found) -> list[str]:
     """Which other modes add to the leading one, and which pass but may only warm with it."""
     if found.verdict != "attributable" or found.kind != "mode":
         return []
-    beside = maps["modes_p_beside"].min("channel").fillna(1.0).values
-    alone = maps["modes_p_value"].min("channel").values
+    modes = maps.children["modes"].to_dataset()
+    beside = modes["p_beside"].min("channel").fillna(1.0).values
+    alone = modes["p_value"].min("channel").values
     named = [
         f"mode {mode} (x {float(x):.0f} mm, y {float(y):.0f} mm)"
-        for mode, x, y in zip(maps["mode"].values, maps["modes_at_x"].values, maps["modes_at_y"].values, strict=True)
+        for mode, x, y in zip(modes["mode"].values, modes["at_x"].values, modes["at_y"].values, strict=True)
     ]
-    others = maps["mode"].values.astype(str) != found.name
+    others = modes["mode"].values.astype(str) != found.name
     adds, alike = others & (beside <= LEVEL), others & (beside > LEVEL) & (alone <= LEVEL)
     sentences = []
     if adds.any():
@@ -119,9 +119,10 @@ def _worth(found: Found, joint: Mapping[str, Any] | None, duty: xr.Dataset | Non
     )
 
 
-def _channel_row(maps: xr.Dataset, channel: str) -> Row:
+def _channel_row(maps: xr.DataTree, channel: str) -> Row:
     """Strongest cell of one channel, what would have been found, and the drift that nothing explains."""
-    chosen = maps[["p_value", "sensitivity", "sensitivity_u", "lag", "detectable_sensitivity"]].sel(channel=channel)
+    session = maps.to_dataset()
+    chosen = session[["p_value", "sensitivity", "sensitivity_u", "lag", "detectable_sensitivity"]].sel(channel=channel)
     flat = chosen.stack(cell=("y", "x"))
     best = flat.isel(cell=int(np.argmin(flat["p_value"].fillna(np.inf).values)))
     return [
@@ -131,15 +132,15 @@ def _channel_row(maps: xr.Dataset, channel: str) -> Row:
         measured(float(best["sensitivity"]), float(best["sensitivity_u"])),
         duration(float(best["lag"])),
         number(float(best["detectable_sensitivity"]), 2),
-        number(float(maps["unexplained_drift"].sel(channel=channel)), 2),
+        number(float(session["unexplained_drift"].sel(channel=channel)), 2),
     ]
 
 
-def _candidate_rows(maps: xr.Dataset, name: str, kind: str) -> dict[str, list[dict[str, Any]]]:
+def _candidate_rows(maps: xr.DataTree, name: str, kind: str) -> dict[str, list[dict[str, Any]]]:
     """Modes or regions: the strongest part of the drift for each, and all parts, with p, sensitivity, lag, and what would be found."""
-    if not has(maps, name):
+    if name not in maps.children:
         return {"strongest": [], "all": []}
-    few = group(maps, name)
+    few = maps.children[name].to_dataset()
     ratio = (few["statistic"] / few["threshold"]).fillna(0.0)
     strongest, everything = [], []
     for at in range(few.sizes[kind]):
@@ -164,18 +165,19 @@ def _candidate_rows(maps: xr.Dataset, name: str, kind: str) -> dict[str, list[di
     return {"strongest": strongest, "all": everything}
 
 
-def leading_region(maps: xr.Dataset) -> str:
+def leading_region(maps: xr.DataTree) -> str:
     """Return the region that explains the drift best."""
-    ratio = (maps["regions_statistic"] / maps["regions_threshold"]).fillna(0.0).max("channel")
-    return str(maps["region"].values[int(ratio.values.argmax())])
+    regions = maps.children["regions"].to_dataset()
+    ratio = (regions["statistic"] / regions["threshold"]).fillna(0.0).max("channel")
+    return str(regions["region"].values[int(ratio.values.argmax())])
 
 
-def _region_targets(maps: xr.Dataset) -> str:
+def _region_targets(maps: xr.DataTree) -> str:
     """Which targets follow which region by themselves."""
-    p = maps["target_regions_p_value"]
+    p = maps.children["target_regions"].to_dataset()["p_value"]
     named = []
-    for region in map(str, maps["region"].values):
-        passed = [str(name) for name in maps["series"].values[(p.sel(region=region) <= LEVEL).values]]
+    for region in map(str, p["region"].values):
+        passed = [str(name) for name in p["series"].values[(p.sel(region=region) <= LEVEL).values]]
         if passed:
             named.append(
                 f"{region}: {len(passed)} of {p.sizes['series']} ({join(passed[:6])}{', …' if len(passed) > 6 else ''})"
@@ -183,17 +185,17 @@ def _region_targets(maps: xr.Dataset) -> str:
     return "; ".join(named) or "none"
 
 
-def _session(maps: xr.Dataset) -> list[tuple[str, str]]:
+def _session(maps: xr.DataTree) -> list[tuple[str, str]]:
     """What holds for the whole test."""
-    clusters = group(maps, "clusters")
+    session, clusters = maps.to_dataset(), maps.children["clusters"].to_dataset()
     return [
         (
             "Chance of any false find",
-            f"{rate_text(float(maps['false_alarm_rate']))} over cells, modes and regions together",
+            f"{rate_text(float(session['false_alarm_rate']))} over cells, modes and regions together",
         ),
         (
             "Excitation",
-            f"{maps.attrs['excitation']}; one warm-up explains {float(maps['warm_up_share']):.1%} of the field's course",
+            f"{maps.attrs['excitation']}; one warm-up explains {float(session['warm_up_share']):.1%} of the field's course",
         ),
         (
             "Courses of temperature",
@@ -249,7 +251,7 @@ def _sensors(sensors: xr.Dataset, session: str) -> dict[str, Any]:
         rows.append(
             [
                 str(at + 1),
-                f"x {float(one['x']):.0f} mm, y {float(one['y']):.0f} mm",
+                f"x {float(one['at_x']):.0f} mm, y {float(one['at_y']):.0f} mm",
                 number(float(one["loss"]), 2),
                 number(float(one["loss_at_most"]), 2),
                 verdict,

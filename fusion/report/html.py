@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.attribution.leading_source import find_source
-from fusion.products.grouped import correlation_of, group, has
+from fusion.products.grouped import group, has
 from fusion.report import plots_attribution, plots_model, plots_plan, record_section, summary_section, wording
 from fusion.report.attribution_section import leading_region
 from interferometry import figures
@@ -32,7 +32,7 @@ _LAYERS = (("rise", "temperature_rise", "K"), ("temperature", "temperature", "°
 def render_report(
     results: Mapping[str, Any],
     provenance: Mapping[str, Any],
-    datasets: Mapping[str, xr.Dataset],
+    datasets: Mapping[str, Any],
     *,
     joint: Mapping[str, Any] | None = None,
 ) -> str:
@@ -43,8 +43,8 @@ def render_report(
     results, provenance : mapping
         Content of results.json and provenance.json.
     datasets : mapping
-        ``fields``, ``deviations``, ``fusion`` as they were written; those that a campaign does not have may be missing. A ``record``
-        stands alone.
+        ``fields`` and ``deviations`` (Dataset) and ``fusion`` (DataTree) as they were written; those that a campaign does not have may be
+        missing. A ``record`` stands alone.
     joint : mapping, optional
         What this campaign and another one of the machine agree on: ``other``, its title, and ``rows`` of name and text.
     """
@@ -81,7 +81,7 @@ def render_report(
 _OPTIONAL = ("registration", "iso230", "neighbours", "drift", "anomalies", "hotspots", "loop")
 
 
-def draw_figures(results: Mapping[str, Any], datasets: Mapping[str, xr.Dataset]) -> dict[str, str]:
+def draw_figures(results: Mapping[str, Any], datasets: Mapping[str, Any]) -> dict[str, str]:
     """Return every figure that the data allow, by name, as SVG text."""
     charts: dict[str, Callable[[], Axes]] = {}
     if "fields" in datasets:
@@ -91,10 +91,10 @@ def draw_figures(results: Mapping[str, Any], datasets: Mapping[str, xr.Dataset])
     if "deviations" in datasets:
         charts |= _drift_charts(results, datasets["deviations"])
     fused = datasets.get("fusion")
-    if fused is not None and has(fused, "correlation"):
+    if fused is not None and "correlation" in fused.children:
         charts |= _correlation_charts(fused)
-    if fused is not None and has(fused, "loop") and "deviations" in datasets:
-        loop, deviations = group(fused, "loop"), datasets["deviations"]
+    if fused is not None and has(fused.to_dataset(), "loop") and "deviations" in datasets:
+        loop, deviations = group(fused.to_dataset(), "loop"), datasets["deviations"]
         charts["residual_time"] = lambda: plots_model.plot_residual_time(loop, deviations)
         charts["residual_position"] = lambda: plots_model.plot_residual_position(loop, deviations)
         charts["residual_direction"] = lambda: plots_model.plot_residual_direction(loop, deviations)
@@ -127,20 +127,23 @@ def _drift_charts(results: Mapping[str, Any], deviations: xr.Dataset) -> dict[st
     }
 
 
-def _correlation_charts(fused: xr.Dataset) -> dict[str, Callable[[], Axes]]:
+def _correlation_charts(fused: xr.DataTree) -> dict[str, Callable[[], Axes]]:
     """The maps of the channel that leads, the modes, the clusters, and the leading region by target."""
-    maps = correlation_of(fused)
+    maps = fused.children["correlation"]
+    cells, position = maps.to_dataset(), fused.to_dataset()["position"]
     channel = find_source(maps).channel
     charts: dict[str, Callable[[], Axes]] = {
-        "sensitivity": lambda: plots_attribution.plot_cells(maps, "sensitivity", channel, label="sensitivity / (µm/K)"),
-        "significance": lambda: plots_attribution.plot_cells(maps, "p_value", channel, label="family-wise p"),
-        "clusters": lambda: plots_attribution.plot_clusters(maps),
+        "sensitivity": lambda: plots_attribution.plot_cells(
+            cells, "sensitivity", channel, label="sensitivity / (µm/K)"
+        ),
+        "significance": lambda: plots_attribution.plot_cells(cells, "p_value", channel, label="family-wise p"),
+        "clusters": lambda: plots_attribution.plot_clusters(maps.children["clusters"].to_dataset()),
     }
-    if has(maps, "modes"):
-        charts["modes"] = lambda: plots_attribution.plot_modes(maps, channel)
-    if has(maps, "target_regions"):
-        region = leading_region(maps)
-        charts["region_targets"] = lambda: plots_attribution.plot_region_targets(maps, region, fused["position"])
+    if "modes" in maps.children:
+        charts["modes"] = lambda: plots_attribution.plot_modes(maps.children["modes"].to_dataset(), channel)
+    if "target_regions" in maps.children:
+        region, targets = leading_region(maps), maps.children["target_regions"].to_dataset()
+        charts["region_targets"] = lambda: plots_attribution.plot_region_targets(targets, region, position)
     return charts
 
 
@@ -162,7 +165,7 @@ def svg_text(draw: Callable[[], Axes], name: str) -> str:
     return text.replace("<svg ", f'<svg role="img" aria-label="{name.replace("_", " ")}" ', 1)
 
 
-def embed_maps(fields: xr.Dataset, fused: xr.Dataset, results: Mapping[str, Any]) -> dict[str, Any]:
+def embed_maps(fields: xr.Dataset, fused: xr.DataTree, results: Mapping[str, Any]) -> dict[str, Any]:
     """Return the interactive map of the table: per-cycle fields as 16-bit numbers with offset and step, in JSON."""
     kept, note = _thin(fields[[variable for _, variable, _ in _LAYERS]])
     x, y = kept["x"].values, kept["y"].values

@@ -56,28 +56,28 @@ def plot_cells(maps: xr.Dataset, name: str, channel: str, *, label: str, ax: Axe
     return ax
 
 
-def plot_modes(maps: xr.Dataset, channel: str) -> Axes:
+def plot_modes(modes: xr.Dataset, channel: str) -> Axes:
     """Draw the pattern of every thermal mode with its p value and lag in one channel; significant ones have a bold frame."""
     import matplotlib.pyplot as plt
 
-    modes = maps["mode"].values
-    columns = min(2, modes.size)
-    rows = -(-modes.size // columns)
-    left, right, bottom, top = extent_of(maps)
+    numbers = modes["mode"].values
+    columns = min(2, numbers.size)
+    rows = -(-numbers.size // columns)
+    left, right, bottom, top = extent_of(modes)
     height = 0.5 + 5.2 / columns * min((top - bottom) / (right - left), 1.2)
     with plt.rc_context(STYLE):
         _, axes = plt.subplots(rows, columns, figsize=(5.2, rows * height), squeeze=False, sharex=True, sharey=True)
-    for ax in axes.ravel()[modes.size :]:
+    for ax in axes.ravel()[numbers.size :]:
         ax.set_visible(False)
-    for ax, mode in zip(axes.ravel(), modes, strict=False):
+    for ax, mode in zip(axes.ravel(), numbers, strict=False):
         one = {"mode": mode, "channel": channel}
-        p = float(maps["modes_p_value"].sel(one))
+        p = float(modes["p_value"].sel(one))
         ax.imshow(
-            maps["modes_pattern"].sel(mode=mode), origin="lower", extent=extent_of(maps), interpolation="nearest",
+            modes["pattern"].sel(mode=mode), origin="lower", extent=extent_of(modes), interpolation="nearest",
             cmap="PuOr_r", vmin=-1.0, vmax=1.0,
         )  # fmt: skip
-        ax.plot(float(maps["modes_at_x"].sel(mode=mode)), float(maps["modes_at_y"].sel(mode=mode)), "+", color="white")
-        text = f"mode {mode}: p {p_value(p)}, lag {duration(float(maps['modes_lag'].sel(one)))}"
+        ax.plot(float(modes["at_x"].sel(mode=mode)), float(modes["at_y"].sel(mode=mode)), "+", color="white")
+        text = f"mode {mode}: p {p_value(p)}, lag {duration(float(modes['lag'].sel(one)))}"
         ax.set_title(text, fontsize=8.5, fontweight="bold" if p <= LEVEL else "normal")
         ax.grid(visible=False)
         for spine in ax.spines.values():
@@ -86,18 +86,18 @@ def plot_modes(maps: xr.Dataset, channel: str) -> Axes:
     return first
 
 
-def plot_clusters(maps: xr.Dataset, *, ax: Axes | None = None) -> Axes:
+def plot_clusters(clusters: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Draw which cells take one course of temperature; inside a colour no analysis of this session can tell places apart."""
     import matplotlib as mpl
 
     ax = new_axes(ax, height=2.2)
-    cluster = maps["clusters_cluster"].values
+    cluster = clusters["cluster"].values
     count = int(cluster.max())
     shown = np.ma.masked_equal(cluster, 0)
     ax.imshow(
         shown,
         origin="lower",
-        extent=extent_of(maps),
+        extent=extent_of(clusters),
         interpolation="nearest",
         cmap=mpl.colormaps["tab20"],
         vmin=0.5,
@@ -107,17 +107,17 @@ def plot_clusters(maps: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         row, column = np.nonzero(cluster == label)
         at = np.argmin((row - row.mean()) ** 2 + (column - column.mean()) ** 2)
         ax.text(
-            float(maps["x"][column[at]]), float(maps["y"][row[at]]), str(label), ha="center", va="center", fontsize=8, color=INK
+            float(clusters["x"][column[at]]), float(clusters["y"][row[at]]), str(label), ha="center", va="center", fontsize=8, color=INK
         )  # fmt: skip
     ax.set(xlabel="x / mm", ylabel="y / mm")
     ax.grid(visible=False)
     return ax
 
 
-def plot_region_targets(maps: xr.Dataset, region: str, position: xr.DataArray, *, ax: Axes | None = None) -> Axes:
+def plot_region_targets(targets: xr.Dataset, region: str, position: xr.DataArray, *, ax: Axes | None = None) -> Axes:
     """Plot the sensitivity of every target and direction to one region, by itself, with its 95 % interval; filled where p is up to 0.05."""
     ax = new_axes(ax)
-    one = maps.sel(region=region)
+    one = targets.sel(region=region)
     names = [str(name).split() for name in one["series"].values]
     place = {int(target): float(mm) for target, mm in zip(position["target"].values, position.values, strict=True)}
     step = float(np.median(np.diff(np.sort(position.values)))) if position.size > 1 else 1.0
@@ -126,8 +126,8 @@ def plot_region_targets(maps: xr.Dataset, region: str, position: xr.DataArray, *
         if not rows:
             continue
         x = np.array([place[int(names[k][1])] for k in rows]) + shift * step
-        value, u = one["target_regions_sensitivity"].values[rows], one["target_regions_sensitivity_u"].values[rows]
-        passed = one["target_regions_p_value"].values[rows] <= LEVEL
+        value, u = one["sensitivity"].values[rows], one["sensitivity_u"].values[rows]
+        passed = one["p_value"].values[rows] <= LEVEL
         colour = COLOURS[direction]
         ax.errorbar(x, value, 2 * u, fmt="none", ecolor=colour, capsize=2, linewidth=0.9)
         ax.plot(x, value, MARKERS[direction], color=colour, markerfacecolor="white", label=ARROWS[direction])
@@ -138,17 +138,19 @@ def plot_region_targets(maps: xr.Dataset, region: str, position: xr.DataArray, *
     return ax
 
 
-def caption_of(maps: xr.Dataset, channel: str, name: str = "") -> str:
+def caption_of(maps: xr.DataTree, channel: str, name: str = "") -> str:
     """Return what every map has to say of itself: false alarms, drift that nothing explains, what it could have found, collinearity."""
-    prefix = f"{name}_" if name else ""
-    rate = float(maps[f"{name or 'cells'}_false_alarm_rate"])
-    detectable = maps[f"{prefix}detectable_sensitivity"].sel(channel=channel)
+    session = maps.to_dataset()
+    tested = maps.children[name].to_dataset() if name else session
+    rate = float(tested["false_alarm_rate" if name else "cells_false_alarm_rate"])
+    detectable = tested["detectable_sensitivity"].sel(channel=channel)
     smallest = float(detectable.where(np.isfinite(detectable)).median())
-    drift = float(maps["unexplained_drift"].sel(channel=channel))
+    courses = int(maps.children["clusters"].to_dataset()["cluster"].max())
+    drift = float(session["unexplained_drift"].sel(channel=channel))
     return (
         f"False alarms of this map, on nulls fitted to this session: {rate_text(rate)}. Drift that nothing explains: "
         f"{number(drift, 2)} µm in one hour. Found with 80 % power: from {number(smallest, 2)} µm/K on (median over the map). "
-        f"The field shows {int(maps['clusters_cluster'].max())} courses of temperature; places that share one cannot be told apart."
+        f"The field shows {courses} courses of temperature; places that share one cannot be told apart."
     )
 
 

@@ -63,7 +63,7 @@ SECTIONS = (
 def describe(
     results: Mapping[str, Any],
     provenance: Mapping[str, Any],
-    datasets: Mapping[str, xr.Dataset],
+    datasets: Mapping[str, Any],
     joint: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
     """Return everything the template says in words and tables."""

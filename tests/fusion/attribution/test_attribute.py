@@ -113,11 +113,11 @@ def test_every_target_can_be_mapped_by_itself(rng):
     made = simulator.driven_session(rng, source=0)
     few = made.fused.isel(target=slice(0, 16, 8))
     maps = correlate(few, thin(made.field)[:, ::2, ::2], draws=39, checks=1, per_target=True)
-    assert list(maps["series"].values) == ["positive 1", "positive 9", "negative 1", "negative 9"]
+    assert list(maps["targets/series"].values) == ["positive 1", "positive 9", "negative 1", "negative 9"]
     # Target 1 has -1 of the slope: common and proportional cancel there, target 9 sees the common part.
-    assert float(maps["targets_p_value"].sel(series="positive 9").min()) <= 0.05
-    assert float(maps["targets_statistic"].sel(series="positive 1").max()) < float(
-        maps["targets_statistic"].sel(series="positive 9").max()
+    assert float(maps["targets/p_value"].sel(series="positive 9").min()) <= 0.05
+    assert float(maps["targets/statistic"].sel(series="positive 1").max()) < float(
+        maps["targets/statistic"].sel(series="positive 9").max()
     )
 
 
@@ -165,7 +165,7 @@ def test_rate_of_false_alarms(kind, bar):
         made = simulator.null_session(kind, np.random.default_rng([seed, 77]))
         maps = correlate(made.fused, made.field[:, ::3, ::3], checks=20, seed=seed)
         cells += bool((maps["p_value"] <= 0.05).any())
-        modes = bool((maps["modes_p_value"] <= 0.05).any()) if "modes_p_value" in maps else False
+        modes = bool((maps["modes/p_value"] <= 0.05).any()) if "modes" in maps.children else False
         anything += modes or bool((maps["p_value"] <= 0.05).any())
         naive += bool((np.abs(maps["naive_correlation"].sel(channel="common")) > NAIVE_LIMIT).any())
         not_separable += maps.attrs["verdict"] == "not separable"

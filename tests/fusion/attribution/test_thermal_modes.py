@@ -22,18 +22,18 @@ def maps(driven):
 
 
 def test_the_region_that_drives_the_axis_is_named_with_its_sensitivity(maps):
-    common = maps.sel(channel="common", region="source 1")
-    assert float(common["regions_p_value"]) <= 0.05
-    ratio = maps["regions_statistic"].sel(channel="common").values
+    common = maps["regions"].to_dataset().sel(channel="common", region="source 1")
+    assert float(common["p_value"]) <= 0.05
+    ratio = maps["regions/statistic"].sel(channel="common").values
     assert int(np.argmax(ratio)) == 1
     # 3 um per 3 K at the centre; the disc of 3 cells radius in a halo of 5 cells sees 0.84 of that rise.
-    u = float(common["regions_sensitivity_u"])
-    assert float(common["regions_sensitivity"]) == pytest.approx(1 / 0.84, abs=4 * u)
-    assert float(common["regions_at_x"]) == pytest.approx(125.0)
+    u = float(common["sensitivity_u"])
+    assert float(common["sensitivity"]) == pytest.approx(1 / 0.84, abs=4 * u)
+    assert float(common["at_x"]) == pytest.approx(125.0)
 
 
 def test_every_target_is_tested_against_every_region(maps):
-    p = maps["target_regions_p_value"].sel(region="source 1")
+    p = maps["target_regions/p_value"].sel(region="source 1")
     assert p.sizes == {"series": 32}
     # Common and stretch add up at the far end and cancel at target 1, which then does not move with the source.
     assert float(p.sel(series="positive 16")) <= 0.05
@@ -46,7 +46,7 @@ def test_the_answer_comes_from_the_mode_of_the_right_source(maps):
     assert simulator.distance_cells(found.y_mm / 10 - 0.5, found.x_mm / 10 - 0.5, 1) <= 5
     assert found.others_mm == ()
     assert 20.0 < found.width_mm < 120.0
-    assert float(np.nanmax(maps["modes_pattern"])) == pytest.approx(1.0)
+    assert float(np.nanmax(maps["modes/pattern"])) == pytest.approx(1.0)
     assert "A second session that finds the same place" in would_tell(maps, found)
 
 
@@ -77,9 +77,9 @@ def test_places_that_warm_alike_are_named_as_equal(rng):
 def modes_of(film, driver, rng):
     made = simulator.session(film, driver, driver, rng)
     maps = correlate(made.fused, made.field[:, ::2, ::2], draws=199, checks=1).sel(channel="joint")
-    place = np.stack([maps["modes_at_y"].values / 10 - 0.5, maps["modes_at_x"].values / 10 - 0.5], axis=1)
+    place = np.stack([maps["modes/at_y"].values / 10 - 0.5, maps["modes/at_x"].values / 10 - 0.5], axis=1)
     nearest = [int(np.argmin(np.hypot(*(place - np.array(source)).T))) for source in simulator.SOURCES[:2]]
-    return maps["modes_p_value"].values[nearest], maps["modes_p_beside"].values[nearest]
+    return maps["modes/p_value"].values[nearest], maps["modes/p_beside"].values[nearest]
 
 
 def test_a_second_source_adds_to_the_leading_one(rng):
@@ -108,7 +108,7 @@ def test_a_still_field_has_no_modes(driven, rng):
     assert localise_modes(still - still.mean(axis=0)).courses.shape == (100, 0)
     field = driven.field[:, ::4, ::4].copy(data=20.0 + 0.03 * rng.standard_normal((100, 6, 8)))
     maps = correlate(driven.fused, field, draws=39, checks=1)
-    assert "modes_p_value" not in maps
+    assert "modes" not in maps.children
     assert find_source(maps).kind == "cell"
 
 

@@ -14,8 +14,8 @@ import xarray as xr
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.campaign.inputs import read_source
 from fusion.pipeline.attribution import correlate_field
+from fusion.pipeline.drift_model import join_fusion
 from fusion.pipeline.interferometry import align_recordings
-from fusion.products.grouped import correlation_of, group
 from fusion.products.progress import silent
 from fusion.products.results import results_schema
 from fusion.products.store import read_dataset
@@ -49,7 +49,7 @@ def campaign(campaign_folder: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.fixture(scope="module")
-def outcome(campaign: Path, results_folder: Path) -> tuple[xr.Dataset, dict[str, object], xr.Dataset]:
+def outcome(campaign: Path, results_folder: Path) -> tuple[xr.DataTree, dict[str, object], xr.Dataset]:
     source = read_source(load_campaign(campaign / "campaign.toml"))
     fields = read_dataset(results_folder / "fields.nc")
     fused, _ = align_recordings(source, fields, read_deviations(campaign / "laser.csv"))
@@ -69,7 +69,7 @@ def test_regions_and_hotspots_are_tested_by_name(outcome) -> None:
     assert names[0] == "motor"
     assert names[1:] == [f"hotspot {k}" for k in range(1, len(names))]
     assert set(parts["correlation"]["regions"][0]["parts"]) == {"common", "proportional", "reversal", "joint"}
-    assert maps["target_regions_p_value"].sizes == {"series": 12, "region": len(names)}
+    assert maps["target_regions/p_value"].sizes == {"series": 12, "region": len(names)}
     assert len(parts["hotspots"]) >= len(names) - 1
 
 
@@ -83,10 +83,9 @@ def test_the_switched_load_gets_its_own_verdict(outcome) -> None:
 
 def test_the_report_says_it_in_words(outcome) -> None:
     maps, parts, fused = outcome
-    whole = fused.assign({f"correlation_{name}": array for name, array in maps.data_vars.items()})
-    whole = whole.assign_attrs({f"correlation_{name}": value for name, value in maps.attrs.items()})
-    xr.testing.assert_equal(group(correlation_of(whole), "duty"), group(maps, "duty"))
-    assert correlation_of(whole).attrs["verdict"] == maps.attrs["verdict"]
+    whole = join_fusion(fused, maps, xr.Dataset())
+    xr.testing.assert_equal(whole["correlation/duty"].to_dataset(inherit=False), maps["duty"].to_dataset(inherit=False))
+    assert whole["correlation"].attrs["verdict"] == maps.attrs["verdict"]
     said = describe_correlation(whole, parts, None)
     assert said is not None
     assert said["duty"][0][0] == "spindle" and said["duty"][0][-1] == "not shown"

@@ -11,7 +11,7 @@ import pytest
 
 from fusion.attribution.two_sessions import ConjunctionError, SourceAgreement
 from fusion.pipeline.two_campaigns import join_campaigns, source_row
-from fusion.products.store import read_dataset, write_dataset
+from fusion.products.store import read_dataset, read_tree, write_dataset
 
 
 @pytest.fixture
@@ -38,8 +38,11 @@ def test_both_reports_tell_what_the_sessions_agree_on(folders: list[Path], tmp_p
 
 
 def test_other_grids_are_refused(folders: list[Path], tmp_path: Path) -> None:
-    fusion = read_dataset(folders[1] / "fusion.nc")
-    write_dataset(folders[1] / "fusion.nc", fusion.assign_coords(x=fusion["x"] + 7.0))
+    fusion = read_tree(folders[1] / "fusion.nc")
+    for group in fusion["correlation"].subtree:
+        if "x" in group.to_dataset(inherit=False).coords:
+            group.coords["x"] = group["x"] + 7.0
+    write_dataset(folders[1] / "fusion.nc", fusion)
     with pytest.raises(ConjunctionError, match="the plan grids differ along x"):
         join_campaigns(folders, tmp_path)
 
