@@ -1,1 +1,1 @@
-"""Both recordings on one clock (level 4): readings with the field at their own time."""
+"""Both recordings on one clock: readings with the temperature field at their own time."""

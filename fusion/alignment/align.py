@@ -1,4 +1,4 @@
-"""Both recordings on one clock: every reading gets the temperature field at its own time.
+"""Align both recordings on one clock: every reading gets the temperature field at its own time.
 
 The camera sees the table with the axis at position 0; the point of the table under the spindle at axis position ``X`` is
 ``origin + X * direction``. Between two frames the field is interpolated linearly; a reading outside the frames' time gets none.
@@ -17,13 +17,13 @@ from fusion._typing import Array
 from fusion.alignment.reflection_patch import find_switching_patch
 from fusion.errors import FusionError
 
-DIMS = ("cycle", "direction", "target")
-#: Half the width over which a line or point average is taken, in plan cells: enough to halve the noise of a single cell.
+_DIMS = ("cycle", "direction", "target")
+#: Half the width of line and point averages, in plan cells: enough to halve the noise of a single cell.
 _HALF_WIDTH_CELLS = 1.5
 
 
 class AlignmentError(FusionError):
-    """The two recordings cannot be brought together; the message names the times or places and what to do."""
+    """Recordings that cannot be aligned; the message names the times or places and what to do."""
 
 
 @dataclass(frozen=True)
@@ -32,34 +32,46 @@ class AxisGeometry:
 
     Attributes
     ----------
-    origin_mm : plan point under the spindle at axis position 0
-    direction : how that point moves over the plan as the axis position grows; its length does not matter
+    origin_mm : (float, float), mm
+        Plan point (x, y) under the spindle at axis position 0.
+    direction : (float, float)
+        Direction (x, y) in which that point moves over the plan as the axis position grows, of any length.
     """
 
     origin_mm: tuple[float, float]
     direction: tuple[float, float]
 
     def points(self, position_mm: Array) -> tuple[Array, Array]:
-        """Plan coordinates x, y in mm of axis positions in mm."""
+        """Return the plan coordinates x and y, mm, of axis positions, mm; both have the shape of `position_mm`."""
         step = np.asarray(self.direction, float) / np.hypot(*self.direction)
         return self.origin_mm[0] + step[0] * position_mm, self.origin_mm[1] + step[1] * position_mm
 
     def across(self) -> tuple[float, float]:
-        """Unit vector on the plan at right angles to the measured line."""
+        """Return the unit vector (x, y) on the plan at right angles to the measured line."""
         step = np.asarray(self.direction, float) / np.hypot(*self.direction)
         return float(-step[1]), float(step[0])
 
 
 def cycle_bounds(deviations: xr.Dataset) -> NDArray[np.datetime64]:
-    """Start and end of every cycle on the laser's clock, (cycle, 2) datetime64[ns].
+    """Return start and end of every cycle on the laser's clock.
 
     A cycle lasts from its first reading to the first reading of the next one, so that a frame taken on the way back to the start
     belongs to the cycle that has just been measured. The last cycle is as long as the median of the others.
 
+    Parameters
+    ----------
+    deviations : Dataset
+        ``time`` over cycle and any further dims, NaT where a reading has no time, and the numbers of the cycles.
+
+    Returns
+    -------
+    (cycle, 2) ndarray of datetime64[ns]
+        First instant of each cycle, and of the time after it.
+
     Raises
     ------
     AlignmentError
-        if a cycle has no time at all, or cycles overlap.
+        If no reading of a cycle has a time, or if cycles overlap.
     """
     times = deviations["time"].values.reshape(deviations.sizes["cycle"], -1)
     empty = np.isnat(times).all(axis=1)
@@ -82,7 +94,19 @@ def cycle_bounds(deviations: xr.Dataset) -> NDArray[np.datetime64]:
 
 
 def camera_on_laser_clock(time: NDArray[np.datetime64], clock_offset_s: float) -> NDArray[np.datetime64]:
-    """Frame times on the laser's clock; ``clock_offset_s`` is the camera's clock minus the laser's."""
+    """Return frame times on the laser's clock.
+
+    Parameters
+    ----------
+    time : (frames,) ndarray of datetime64
+        Times by the camera's clock.
+    clock_offset_s : float, s
+        Camera clock minus laser clock.
+
+    Returns
+    -------
+    (frames,) ndarray of datetime64[ns]
+    """
     return np.asarray(time.astype("datetime64[ns]") - np.timedelta64(round(clock_offset_s * 1e9), "ns"))
 
 
@@ -94,38 +118,49 @@ def align(
     environment: xr.Dataset | None = None,
     drivers: xr.Dataset | None = None,
 ) -> xr.Dataset:
-    """Bring readings, fields, environment and drivers together on the laser's clock.
+    """Align readings, fields, environment and drivers on the laser's clock.
 
     Parameters
     ----------
-    deviations : Dataset keeping ``interferometry.contract.DEVIATIONS``
-    fields : Dataset keeping ``thermography.contract.FIELDS``, its ``time`` already on the laser's clock
-    axis : where the measured line lies on the plan
-    environment, drivers : Datasets along ``time``
+    deviations : Dataset
+        Readings as promised by ``interferometry.contract.DEVIATIONS``: ``deviation`` (um) and ``time`` over cycle, direction and target,
+        ``position`` (mm) over target.
+    fields : Dataset
+        Fields as promised by ``thermography.contract.FIELDS``: ``frame_temperature`` (degC) over time, y, x (mm), ``time`` on the
+        laser's clock (see `camera_on_laser_clock`).
+    axis : AxisGeometry
+        Where the measured line lies on the plan.
+    environment, drivers : Dataset, optional
+        Logged columns along ``time``; those that are not numeric, or have fewer than two values, are left out.
 
     Returns
     -------
     Dataset
         The deviations with, per reading, ``mean_rise`` (K, of the seen table), ``axis_integral`` (K mm, of the rise from axis
         position 0 to the target), ``local_rise`` (K, at the target), ``inside_frames``, every environment quantity and driver;
-        and the same quantities as series on their own times (``frame_time``, ``environment_time``, ``driver_time``).
+        and the same quantities as ``<name>_series`` on their own times (``frame_time``, ``environment_time``, ``driver_time``).
 
     Raises
     ------
     AlignmentError
-        if frames and readings never meet in time, or the measured line leaves the seen plan.
+        If frames and readings do not overlap in time, or if the measured line leaves the seen plan.
+
+    Notes
+    -----
+    An axis that expands freely from its position 0 with coefficient alpha moves the reading at X by ``alpha`` times ``axis_integral``
+    (docs/method/fields.md).
     """
     frame_time = fields["time"].values.astype("datetime64[ns]")
     reading_time = deviations["time"].values.astype("datetime64[ns]")
     _check_overlap(reading_time, frame_time)
-    series = field_series(fields, axis, deviations["position"].values)
+    series = _reduce_fields(fields, axis, deviations["position"].values)
     inside = ~np.isnat(reading_time) & (reading_time >= frame_time[0]) & (reading_time <= frame_time[-1])
 
     fused = deviations[["deviation", "time", "position", "quality_flag"]].copy()
-    fused["inside_frames"] = (DIMS, inside, {"long_name": "the reading lies between the first and the last frame"})
+    fused["inside_frames"] = (_DIMS, inside, {"long_name": "the reading lies between the first and the last frame"})
     for name, values in series.items():
         at_readings = interpolate_series(reading_time, frame_time, values)
-        fused[name] = (DIMS, np.where(inside, at_readings, np.nan), _ATTRIBUTES[name])
+        fused[name] = (_DIMS, np.where(inside, at_readings, np.nan), _ATTRIBUTES[name])
         dims = ("frame_time",) if values.ndim == 1 else ("frame_time", "target")
         fused[f"{name}_series"] = (dims, values, _ATTRIBUTES[name])
     fused = fused.assign_coords(frame_time=frame_time)
@@ -145,12 +180,11 @@ _ATTRIBUTES: dict[str, dict[str, str]] = {
 }
 
 
-def field_series(fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -> dict[str, Array]:
-    """Reduce the frames on the plan to what moves a reading: mean rise (time,), integral and local rise (time, target).
+def _reduce_fields(fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -> dict[str, Array]:
+    """Reduce the frames on the plan to mean rise (time,), axis integral and local rise (time, target).
 
-    Where a patch of the field switches like a reflection, its shares in the mean rise and in the integral are given beside them.
-
-    The rise counts from the first frame; cells that frame does not see are left out of the mean.
+    Where a patch of the field switches like a reflection, its shares in the mean rise and in the integral are given beside them. The
+    rise counts from the first frame; cells that are not seen in every frame are left out of the mean.
     """
     temperature = fields["frame_temperature"].values.astype(float)
     rise = temperature - temperature[0]
@@ -178,11 +212,28 @@ def _cell_size(fields: xr.Dataset) -> float:
 class MeasuredLine:
     """The measured line on the plan, sampled four times per cell, and averaged across its width.
 
+    Parameters
+    ----------
+    fields : Dataset
+        Plan coordinates ``x`` and ``y``, mm, evenly spaced.
+    axis : AxisGeometry
+        Where the line lies.
+    position_mm : (target,) ndarray, mm
+        Axis positions of the targets.
+
     Attributes
     ----------
-    along_mm : (sample,) axis positions of the samples
-    nearest : (target,) sample at every target
-    reach : samples on either side that a point average takes
+    along_mm : (sample,) ndarray, mm
+        Axis positions of the samples; position 0 and every target are among them.
+    nearest : (target,) ndarray of int
+        Index of the sample at every target.
+    reach : int
+        Number of samples on either side that a point average takes.
+
+    Raises
+    ------
+    AlignmentError
+        If the line leaves the plan.
     """
 
     def __init__(self, fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -> None:
@@ -210,23 +261,23 @@ class MeasuredLine:
             )
 
     def sample(self, frames: Array) -> Array:
-        """Frames (time, y, x) along the line (time, sample); gaps are bridged along the line."""
+        """Return frames (time, y, x) along the line, (time, sample), in their unit; gaps are interpolated along the line."""
         place = [self._row, self._column]
         samples = np.stack([ndimage.map_coordinates(frame, place, order=1, mode="nearest") for frame in frames])
         samples[:, self._outside] = np.nan
         valid = np.isfinite(samples)
         number = valid.sum(axis=1)
         line = np.where(valid, samples, 0.0).sum(axis=1) / np.maximum(number, 1)
-        for values, known in zip(line, number > 0, strict=True):
-            if not known.any():
+        for values, seen in zip(line, number > 0, strict=True):
+            if not seen.any():
                 raise AlignmentError(
                     "no part of the measured line is seen by the camera; check [plan.axis] and the fiducials"
                 )
-            values[~known] = np.interp(self.along_mm[~known], self.along_mm[known], values[known])
+            values[~seen] = np.interp(self.along_mm[~seen], self.along_mm[seen], values[seen])
         return line
 
     def integrate(self, samples: Array) -> Array:
-        """Integral from axis position 0 to every target, (time, target)."""
+        """Return the integral of samples (time, sample), K, from axis position 0 to every target, (time, target), K mm."""
         steps = 0.5 * (samples[:, 1:] + samples[:, :-1]) * np.diff(self.along_mm)
         integral = np.concatenate([np.zeros((samples.shape[0], 1)), np.cumsum(steps, axis=1)], axis=1)
         zero = int(np.argmin(np.abs(self.along_mm)))
@@ -234,45 +285,61 @@ class MeasuredLine:
 
 
 def _check_overlap(reading_time: NDArray[np.datetime64], frame_time: NDArray[np.datetime64]) -> None:
-    known = reading_time[~np.isnat(reading_time)]
-    if known.size == 0:
+    timed = reading_time[~np.isnat(reading_time)]
+    if timed.size == 0:
         raise AlignmentError("no reading has a time; readings and frames cannot be brought together")
-    first, last = known.min(), known.max()
+    first, last = timed.min(), timed.max()
     if frame_time.size < 2 or frame_time[-1] < first or frame_time[0] > last:
         raise AlignmentError(
-            f"frames ({_shown(frame_time[0])} .. {_shown(frame_time[-1])}) and readings ({_shown(first)} .. {_shown(last)}) never "
-            "meet; check the time zone of both clocks and [thermography] clock_offset (camera clock minus laser clock)"
+            f"frames ({_time_text(frame_time[0])} .. {_time_text(frame_time[-1])}) and readings ({_time_text(first)} .. "
+            f"{_time_text(last)}) never meet; check the time zone of both clocks and [thermography] clock_offset (camera clock minus "
+            "laser clock)"
         )
 
 
-def _shown(time: np.datetime64) -> str:
+def _time_text(time: np.datetime64) -> str:
     return f"{np.datetime_as_string(time, unit='s')}Z"
 
 
 def interpolate_series(
     reading_time: NDArray[np.datetime64], series_time: NDArray[np.datetime64], values: Array
 ) -> Array:
-    """Linear interpolation of a series (time,) or (time, target) at readings (cycle, direction, target); ends are held."""
+    """Interpolate a series linearly at the times of the readings; its ends are held.
+
+    Parameters
+    ----------
+    reading_time : (cycle, direction, target) ndarray of datetime64
+        Times of the readings, NaT where there is none.
+    series_time : (time,) ndarray of datetime64
+        Times of the series, increasing.
+    values : (time,) or (time, target) ndarray
+        The series, for all targets together or one column per target, in any unit.
+
+    Returns
+    -------
+    (cycle, direction, target) ndarray
+        In the unit of `values`.
+    """
     start = series_time[0]
-    at = (reading_time - start) / np.timedelta64(1, "s")
+    seconds = (reading_time - start) / np.timedelta64(1, "s")
     knots = (series_time - start) / np.timedelta64(1, "s")
     if values.ndim == 1:
-        return np.interp(at, knots, values)
-    return np.stack([np.interp(at[..., k], knots, values[:, k]) for k in range(values.shape[1])], axis=-1)
+        return np.interp(seconds, knots, values)
+    return np.stack([np.interp(seconds[..., k], knots, values[:, k]) for k in range(values.shape[1])], axis=-1)
 
 
 def _add_table(fused: xr.Dataset, table: xr.Dataset, dim: str) -> xr.Dataset:
-    """Every numeric column of a table along time: at the readings, and as a series on its own times; gaps stay NaN."""
+    """Add every numeric column of a table along time: at the readings, and as a series on its own times with its NaN."""
     added: dict[str, tuple[tuple[str, ...], NDArray[np.generic], dict[str, object]]] = {}
     for name, column in table.data_vars.items():
         if column.dims != ("time",) or column.dtype.kind not in "fiu":
             continue
-        known = np.isfinite(column.values)
-        if known.sum() < 2:
+        finite = np.isfinite(column.values)
+        if finite.sum() < 2:
             continue
-        time = table["time"].values.astype("datetime64[ns]")[known]
-        at_readings = interpolate_series(fused["time"].values, time, column.values[known].astype(float))
+        time = table["time"].values.astype("datetime64[ns]")[finite]
+        at_readings = interpolate_series(fused["time"].values, time, column.values[finite].astype(float))
         outside = (fused["time"].values < time[0]) | (fused["time"].values > time[-1])
-        added[str(name)] = (DIMS, np.where(outside, np.nan, at_readings), dict(column.attrs))
+        added[str(name)] = (_DIMS, np.where(outside, np.nan, at_readings), dict(column.attrs))
         added[f"{name}_series"] = ((dim,), column.values.astype(float), dict(column.attrs))
     return fused.assign(added).assign_coords({dim: table["time"].values.astype("datetime64[ns]")})

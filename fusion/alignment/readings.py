@@ -1,8 +1,7 @@
-"""The readings of a campaign as one time-ordered series, with what was logged beside them.
+"""The readings of a positioning campaign as one time-ordered series, with the series that were logged beside them.
 
-A positioning campaign and a record of displacement channels become the same object, so that effects, search and tests are written once:
-a *site* is a target approached from one direction, or a channel; every site has its own constant, and the drift that nobody explains
-enters each reading with known loadings (common shift and stretch, or one drift per channel).
+A *site* is a target position approached from one direction. Every site has its own constant, and the unexplained drift enters each
+reading with known loadings: a common shift, and a stretch proportional to the axis position.
 """
 
 from __future__ import annotations
@@ -12,34 +11,22 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numba import njit
 from numpy.typing import NDArray
+from scipy import stats
 
 from fusion._typing import Array
+from fusion.alignment.first_order_lag import respond
 from fusion.errors import FusionError
 
-#: Names of the air and material quantities that a laser's environment unit logs.
+#: Names of the air and material quantities that the environment unit of a laser logs.
 ENVIRONMENT = ("air_temperature", "air_pressure", "relative_humidity", "material_temperature")
 
-#: A stretch without samples counts as a gap from this many usual intervals on.
+#: A time without samples is a gap from this many median sampling intervals on.
 _GAP_INTERVALS = 5.0
 
 
 class ReadingsError(FusionError):
-    """A campaign that holds too little to be modelled; the message says what is missing."""
-
-
-@njit(cache=True)
-def _first_order(seconds: Array, values: Array, time_constant_s: float, start: Array) -> Array:
-    """Response (m, columns) of a first-order system to values (m, columns) that are linear between samples."""
-    response = np.empty_like(values)
-    response[0] = start
-    for k in range(seconds.size - 1):
-        step = seconds[k + 1] - seconds[k]
-        decay = np.exp(-step / time_constant_s)
-        ramp = (values[k + 1] - values[k]) / step * time_constant_s
-        response[k + 1] = (response[k] - values[k] + ramp) * decay + values[k + 1] - ramp
-    return response
+    """A campaign with too few readings to be modelled; the message says what is missing."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +35,12 @@ class Series:
 
     Attributes
     ----------
-    seconds : (m,) s since the first reading, increasing
-    values : (m,) one value for all sites, or (m, targets) one per target
-    units : unit of the values
+    seconds : (m,) ndarray, s
+        Time since the first reading, increasing.
+    values : (m,) or (m, targets) ndarray, in `units`
+        One value for all sites, or one per target position.
+    units : str
+        Unit of the values.
     """
 
     seconds: Array
@@ -58,26 +48,33 @@ class Series:
     units: str
 
     def lagged(self, time_constant_s: float, *, at_rest: float | None = None) -> Series:
-        """Response of a first-order system to the series, exact for values that are linear between samples.
+        """Return the response of a first-order system to the series; see `fusion.alignment.first_order_lag.respond`.
 
-        ``at_rest`` is the input before the first sample; by default the first sample itself (steady state).
+        Parameters
+        ----------
+        time_constant_s : float, s
+            Up to 0 the series itself is returned.
+        at_rest : float, optional
+            State of the system at the first sample, in `units`; by default the first sample itself (steady state).
         """
         if time_constant_s <= 0.0:
             return self
         values = self.values if self.values.ndim == 2 else self.values[:, None]
-        start = values[0] if at_rest is None else np.full(values.shape[1], at_rest)
-        response = _first_order(self.seconds, np.ascontiguousarray(values), time_constant_s, start)
+        start = None if at_rest is None else np.full(values.shape[1], at_rest)
+        response = respond(values, self.seconds, time_constant_s=time_constant_s, start=start)
         return Series(self.seconds, response.reshape(self.values.shape), self.units)
 
 
 @dataclass(frozen=True)
 class Gap:
-    """A stretch in which a series has no sample and is taken as a straight line.
+    """A time in which a series has no sample and is interpolated linearly.
 
     Attributes
     ----------
-    series : its name
-    start_s, end_s : the samples beside the gap, s since the first reading
+    series : str
+        Name of the series.
+    start_s, end_s : float, s
+        Times of the samples on either side, since the first reading.
     """
 
     series: str
@@ -91,13 +88,26 @@ class Readings:
 
     Attributes
     ----------
-    seconds, response : (n,) time since the first reading in s, deviation in um
-    cycle, target : (n,) numbers from 1
-    position_mm, sign : (n,) axis position, and +1 or -1 for a positive or negative approach
-    positions_mm : (targets,) axis position of each target
-    series : what was seen and logged, by name
-    drivers : names of the series that were logged as drivers
-    left_out : how many readings could not be used, by reason
+    seconds : (n,) ndarray, s
+        Time since the first reading.
+    response : (n,) ndarray, um
+        Positioning deviation.
+    cycle, target : (n,) ndarray of int
+        Numbers of the cycle and of the target position, from 1.
+    position_mm : (n,) ndarray, mm
+        Axis position.
+    sign : (n,) ndarray
+        +1 for a positive approach, -1 for a negative one.
+    targets : (targets,) ndarray of int
+        Numbers of the target positions.
+    positions_mm : (targets,) ndarray, mm
+        Axis position of each target.
+    series : mapping of str to Series
+        Reduced fields, environment and drivers, by name.
+    drivers : tuple of str
+        Names of the series that were logged as drivers.
+    left_out : mapping of str to int
+        Number of readings that could not be used, by reason.
     """
 
     seconds: Array
@@ -119,7 +129,7 @@ class Readings:
 
     @property
     def share(self) -> Array:
-        """Position as a share of the travel, (n,)."""
+        """Axis position over `span_mm`, (n,)."""
         return self.position_mm / self.span_mm
 
     @property
@@ -129,35 +139,51 @@ class Readings:
 
     @property
     def loadings(self) -> Array:
-        """How a common shift and a stretch enter each reading, (n, 2)."""
+        """Loadings of each reading on a common shift and on a stretch that is 1 at `span_mm`, (n, 2)."""
         return np.column_stack([np.ones_like(self.share), self.share])
 
     @property
     def target_index(self) -> NDArray[np.int64]:
-        """Place of each reading's target in ``targets``, (n,)."""
+        """Index of each reading's target in `targets`, (n,)."""
         return np.searchsorted(self.targets, self.target)
 
     @property
+    def site(self) -> NDArray[np.int64]:
+        """Index of each reading's site, (n,): twice the index of the target, plus 1 for a negative approach."""
+        return self.target_index * 2 + (self.sign < 0)
+
+    @property
     def profile(self) -> Array:
-        """Columns of the static profile: one constant per target, one reversal per target that both directions reach, (n, k)."""
+        """Regressors of the static profile, (n, k): a constant per target, and a reversal per target with both approaches."""
         one_hot = (self.target_index[:, None] == np.arange(self.targets.size)).astype(float)
         approach = one_hot * (0.5 * self.sign)[:, None]
         both = np.array([np.unique(self.sign[self.target_index == k]).size == 2 for k in range(self.targets.size)])
         return np.column_stack([one_hot, approach[:, both]])
 
     def at(self, series: Series) -> Array:
-        """A series interpolated at every reading's time (and at its target where the series has one value per target), (n,)."""
+        """Return a series at the time of every reading (and at its target, where the series has one value per target).
+
+        Parameters
+        ----------
+        series : Series
+            Interpolated linearly; its ends are held.
+
+        Returns
+        -------
+        (n,) ndarray
+            In the unit of the series.
+        """
         if series.values.ndim == 1:
             return np.interp(self.seconds, series.seconds, series.values)
         column = np.empty(self.seconds.size)
         for k in range(self.targets.size):
-            here = self.target_index == k
-            column[here] = np.interp(self.seconds[here], series.seconds, series.values[:, k])
+            rows = self.target_index == k
+            column[rows] = np.interp(self.seconds[rows], series.seconds, series.values[:, k])
         return column
 
     def gaps(self) -> list[Gap]:
-        """Stretches without a sample, five times the usual interval and more, in what was logged while readings were taken."""
-        found = []
+        """Return the gaps of drivers and environment between the first and the last reading: five median intervals and longer."""
+        gaps = []
         logged = {*self.drivers, *ENVIRONMENT}
         for name, series in self.series.items():
             if name not in logged:
@@ -168,11 +194,11 @@ class Readings:
             for k in np.flatnonzero(steps > _GAP_INTERVALS * np.median(steps)):
                 start, end = float(series.seconds[k]), float(series.seconds[k + 1])
                 if end > self.seconds[0] and start < self.seconds[-1]:
-                    found.append(Gap(name, start, end))
-        return found
+                    gaps.append(Gap(name, start, end))
+        return gaps
 
     def subset(self, keep: NDArray[np.bool_]) -> Readings:
-        """Only the readings that are kept; series stay whole."""
+        """Return the readings where `keep`, (n,) bool, is true; series stay complete."""
         return Readings(
             self.seconds[keep],
             self.response[keep],
@@ -189,41 +215,67 @@ class Readings:
 
 
 def sample_noise(samples: Array) -> float:
-    """Noise of single samples of a series from their second differences, in which whatever is slow cancels."""
-    second = np.diff(samples, 2)
-    return float(1.4826 * np.median(np.abs(second - np.median(second))) / np.sqrt(6.0))
+    """Estimate the noise of single samples of a slow series from their second differences.
+
+    Parameters
+    ----------
+    samples : (n,) ndarray
+        Samples at even intervals, without NaN, in any unit.
+
+    Returns
+    -------
+    float
+        Standard deviation of the noise, in the unit of the samples.
+
+    Notes
+    -----
+    The second difference of white noise has six times its variance, and a slow series cancels in it. Its scatter is the normalised
+    median absolute deviation (Rousseeuw and Croux 1993, J. Am. Stat. Assoc. 88, 1273), which outliers do not enlarge.
+    """
+    return float(stats.median_abs_deviation(np.diff(samples, 2), scale="normal") / np.sqrt(6.0))
 
 
 def read_fused(fused: xr.Dataset) -> Readings:
-    """Lay the fused Dataset out as readings.
+    """Return the readings of an aligned campaign.
+
+    Parameters
+    ----------
+    fused : Dataset
+        As from `fusion.alignment.align.align`: ``deviation`` (um) and ``time`` over cycle, direction, target, ``position`` (mm), and
+        every ``<name>_series`` on its own time axis.
+
+    Returns
+    -------
+    Readings
+        The readings with a value and a time, inside the frames' time where ``inside_frames`` is given.
 
     Raises
     ------
     ReadingsError
-        if fewer than 3 cycles or 3 targets remain.
+        If fewer than 3 cycles or 3 targets remain.
     """
     deviation = fused["deviation"].values
     time = fused["time"].values.astype("datetime64[ns]")
     present = np.isfinite(deviation) & ~np.isnat(time)
     inside = fused["inside_frames"].values if "inside_frames" in fused else np.ones_like(present)
     used = present & inside
-    at_cycle, at_direction, at_target = np.nonzero(used)
-    if np.unique(at_cycle).size < 3 or np.unique(at_target).size < 3:
+    cycle, direction, target = np.nonzero(used)
+    if np.unique(cycle).size < 3 or np.unique(target).size < 3:
         raise ReadingsError(
-            f"{np.unique(at_cycle).size} cycles and {np.unique(at_target).size} targets have readings within the frames' time; "
+            f"{np.unique(cycle).size} cycles and {np.unique(target).size} targets have readings within the frames' time; "
             "the model of the drift needs at least 3 of each"
         )
     stamps = time[used]
     order = np.argsort(stamps, kind="stable")
     start = time[present].min()
-    sign = np.where(fused["direction"].values[at_direction] == "positive", 1.0, -1.0)
+    sign = np.where(fused["direction"].values[direction] == "positive", 1.0, -1.0)
     series = _series(fused, start)
     return Readings(
         seconds=_seconds(stamps, start)[order],
         response=deviation[used][order],
-        cycle=fused["cycle"].values[at_cycle][order].astype(np.int64),
-        target=fused["target"].values[at_target][order].astype(np.int64),
-        position_mm=fused["position"].values[at_target][order].astype(float),
+        cycle=fused["cycle"].values[cycle][order].astype(np.int64),
+        target=fused["target"].values[target][order].astype(np.int64),
+        position_mm=fused["position"].values[target][order].astype(float),
         sign=sign[order],
         targets=fused["target"].values.astype(np.int64),
         positions_mm=fused["position"].values.astype(float),
@@ -243,7 +295,7 @@ def _seconds(time: NDArray[np.datetime64], start: np.datetime64) -> Array:
 
 
 def _series(fused: xr.Dataset, start: np.datetime64) -> dict[str, Series]:
-    """Every ``<name>_series`` of the fused Dataset on its own time axis, samples without a value left out."""
+    """Every ``<name>_series`` of the fused Dataset on its own time axis, without the samples that have no value."""
     series = {}
     for variable in fused.data_vars:
         name = str(variable)
@@ -251,7 +303,7 @@ def _series(fused: xr.Dataset, start: np.datetime64) -> dict[str, Series]:
             continue
         column = fused[name]
         values = column.values.astype(float)
-        known = np.isfinite(values) if values.ndim == 1 else np.isfinite(values).all(axis=1)
-        seconds = _seconds(fused[column.dims[0]].values, start)[known]
-        series[name.removesuffix("_series")] = Series(seconds, values[known], str(column.attrs.get("units", "1")))
+        finite = np.isfinite(values) if values.ndim == 1 else np.isfinite(values).all(axis=1)
+        seconds = _seconds(fused[column.dims[0]].values, start)[finite]
+        series[name.removesuffix("_series")] = Series(seconds, values[finite], str(column.attrs.get("units", "1")))
     return series

@@ -1,8 +1,8 @@
-"""Patches of the field that switch faster than heat can flow: what a reflection does, and a warming table cannot.
+"""Find patches of the field that switch as a reflection does, faster than heat can flow.
 
 Heat needs minutes to cross a few centimetres of iron (diffusivity 1.6e-5 m2/s: 1 cm in 6 s, 5 cm in 160 s, 20 cm in 40 min), and a
 source under the table changes the slope of a temperature, not its value. A patch that jumps between two frames, and jumps back, is
-light from elsewhere.
+radiation from elsewhere.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from fusion._typing import Array
 
@@ -17,17 +18,19 @@ from fusion._typing import Array
 _JUMP_SIGMAS = 8.0
 #: A patch stands out where its jump is this much larger than the same jump averaged over the table; a camera offset has 1.
 _LOCAL_RATIO = 3.0
-_LEAST_FRAMES = 9
+_MIN_FRAMES = 9
 
 
 @dataclass(frozen=True)
 class SwitchingPatch:
-    """A patch that switches.
+    """A patch of the plan whose apparent temperature switches.
 
     Attributes
     ----------
-    pattern : (y, x) relative size of the jump, largest 1
-    course : (time,) K, the sum of all jumps up to each frame
+    pattern : (y, x) ndarray
+        Relative size of the jump, about 1 on the patch, 0 where the plan is not seen.
+    course : (time,) ndarray, K
+        Sum of all jumps up to each frame, on the patch.
     """
 
     pattern: Array
@@ -35,27 +38,38 @@ class SwitchingPatch:
 
 
 def find_switching_patch(rise: Array) -> SwitchingPatch | None:
-    """The patch whose switching explains most of the sudden changes of a field, or None.
+    """Find the patch whose switching explains most of the sudden changes of a field.
 
     Parameters
     ----------
-    rise : (time, y, x) K, NaN where the plan is not seen
+    rise : (time, y, x) ndarray, K
+        Temperature rise on the plan, NaN where the plan is not seen.
+
+    Returns
+    -------
+    SwitchingPatch or None
+        None where nothing jumps, where the whole table jumps alike (a camera offset), or with fewer than 9 frames.
+
+    Notes
+    -----
+    Sudden changes are differences of neighbouring frames minus the median of the differences around them. Their first principal
+    component is the patch; its scores beyond 8 robust standard deviations are the jumps.
     """
-    if rise.shape[0] < _LEAST_FRAMES:
+    if rise.shape[0] < _MIN_FRAMES:
         return None
     seen = np.isfinite(rise).all(axis=0)
     sudden = _sudden_changes(rise[:, seen])
-    _, _, modes = np.linalg.svd(sudden, full_matrices=False)
-    mode = modes[0] * np.sign(modes[0][np.argmax(np.abs(modes[0]))])
-    size = sudden @ mode / (mode @ mode)
-    scatter = 1.4826 * np.median(np.abs(size - np.median(size)))
-    jumps = np.where(np.abs(size) > _JUMP_SIGMAS * max(scatter, 1e-9), size, 0.0)
+    _, _, components = np.linalg.svd(sudden, full_matrices=False)
+    component = components[0] * np.sign(components[0][np.argmax(np.abs(components[0]))])
+    score = sudden @ component / (component @ component)
+    scatter = stats.median_abs_deviation(score, scale="normal")
+    jumps = np.where(np.abs(score) > _JUMP_SIGMAS * max(scatter, 1e-9), score, 0.0)
     # The upper percent stands for the patch's own height, so that one noisy cell does not make a pattern local.
-    height = float(np.quantile(mode, 0.99))
-    if not jumps.any() or height < _LOCAL_RATIO * abs(float(mode.mean())):
+    height = float(np.quantile(component, 0.99))
+    if not jumps.any() or height < _LOCAL_RATIO * abs(float(component.mean())):
         return None
     pattern = np.zeros(seen.shape)
-    pattern[seen] = mode / height
+    pattern[seen] = component / height
     return SwitchingPatch(pattern, np.concatenate([[0.0], np.cumsum(jumps)]) * height)
 
 

@@ -1,1 +1,1 @@
-"""Which parts of the field, loads and sensors the drift follows (level 4), and with what error probability."""
+"""Which part of the temperature field drives the drift: tests, places, sensors, and schedules that establish causation."""

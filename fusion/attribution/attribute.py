@@ -197,7 +197,7 @@ def _beside_leader(
     others = np.flatnonzero(np.arange(count) != leader)
     if tested.p_value[channel, leader] <= LEVEL and others.size and not excitation.warm_up_only:
         lag_s = lags_s[int(tested.lag_index[channel, leader])]
-        given = respond(modes.seconds, lag_s, modes.values[:, [leader]])
+        given = respond(modes.values[:, [leader]], modes.seconds, time_constant_s=lag_s)
         again = evaluate_films(
             series,
             {"modes": FieldSeries(modes.seconds, modes.values[:, others])},

@@ -178,7 +178,7 @@ def _drift_responses(
 ) -> Array:
     """Drift per unit effect at the cycles under many schedules of one source, (cycles, schedules)."""
     courses = np.column_stack([law.course(fine, rng) for _ in range(_SCHEDULES)])
-    moved = respond(fine, machine.lag_s, respond(fine, time_constant_s, courses))
+    moved = respond(respond(courses, fine, time_constant_s=time_constant_s), fine, time_constant_s=machine.lag_s)
     return moved[np.searchsorted(fine, cycles)]
 
 

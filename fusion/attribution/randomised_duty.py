@@ -147,8 +147,8 @@ def duty_responses(seconds: Array, courses: Array) -> Array:
     responses = []
     for first, second in RESPONSES_S:
         if first not in bodies:
-            bodies[first] = respond(seconds, first, courses)
-        responses.append(respond(seconds, second, bodies[first]))
+            bodies[first] = respond(courses, seconds, time_constant_s=first)
+        responses.append(respond(bodies[first], seconds, time_constant_s=second))
     return np.stack(responses, axis=2)
 
 

@@ -302,7 +302,10 @@ def lagged_temperature(residual: Residual) -> Array | None:
     if residual.temperature is None:
         return None
     seconds, values = residual.temperature
-    columns = [np.interp(residual.seconds, seconds, respond(seconds, lag, values[:, None])[:, 0]) for lag in LAGS_S]
+    columns = [
+        np.interp(residual.seconds, seconds, respond(values[:, None], seconds, time_constant_s=lag)[:, 0])
+        for lag in LAGS_S
+    ]
     return np.column_stack(columns)
 
 

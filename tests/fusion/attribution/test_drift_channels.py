@@ -87,7 +87,7 @@ def test_first_order_response_is_exact_for_a_step_and_a_ramp():
     ramp = seconds[:, None] / 1000.0
     tau = 900.0
     expected = (seconds - tau * (1 - np.exp(-seconds / tau))) / 1000.0
-    np.testing.assert_allclose(respond(seconds, tau, ramp)[:, 0], expected, atol=1e-12)
+    np.testing.assert_allclose(respond(ramp, seconds, time_constant_s=tau)[:, 0], expected, atol=1e-12)
     operator = lag_operators(seconds, [0.0, tau])[1]
     np.testing.assert_allclose(operator @ ramp[:, 0], expected, atol=1e-12)
 

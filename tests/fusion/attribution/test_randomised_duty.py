@@ -31,8 +31,8 @@ def run_schedule(law, rng):
 
 
 def driven(duty, source, rng, um=3.0, nuisance_um=0.1):
-    heated = respond(FINE, simulator.TAU_S[source], duty.values[:, [source]])
-    moved = np.interp(MIDDLE, FINE, respond(FINE, 1800.0, heated)[:, 0])
+    heated = respond(duty.values[:, [source]], FINE, time_constant_s=simulator.TAU_S[source])
+    moved = np.interp(MIDDLE, FINE, respond(heated, FINE, time_constant_s=1800.0)[:, 0])
     walks = nuisance_um * np.cumsum(rng.standard_normal((2, simulator.CYCLES)), axis=1)
     still = np.zeros((simulator.CYCLES, 1, 1))
     return simulator.session(still, um * moved + walks[0], um * moved + walks[1], rng).fused
