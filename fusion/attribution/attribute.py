@@ -1,21 +1,22 @@
-"""Which part of the temperature field drives the drift, tested so that two warming series do not pass for cause and effect.
+"""Test which part of the temperature field drives the drift, so that two series that merely both rise are not taken for cause and effect.
 
-Plan cells, localised thermal modes and regions are tested against the drift's channels (common, proportional to position, reversal; on
-request every target and direction): each temperature goes through a bank of first-order lags, the drift that the field does not explain
-is a random or integrated random walk whose size is estimated anew under every hypothesis, and the statistic is the profile likelihood
-ratio. The family-wise p value compares it with the maxima over all cells, modes, regions, lags and channels in series redrawn from the
-fitted null: one error probability for everything that can become a finding.
+Plan cells, localised thermal modes and regions are tested against the drift channels (common, proportional to position, reversal; on
+request every target and direction). Each temperature passes through a bank of first-order lags. The drift that the field does not explain
+is a random walk or an integrated random walk whose size is estimated anew under every hypothesis, and the statistic is the profile
+likelihood ratio. The family-wise p-value compares it with the maxima over all cells, modes, regions, lags and channels in series that are
+simulated under the fitted null hypothesis: one error probability for everything that can become a finding.
 
-Two limits are built into the answer. A session that is one warm-up moves every series along one curve; it is tested beside free
-exponentials and its best verdict is "not separable"; where a warm-up only dominates, the rest must carry the evidence. And a map
-without a finding says how large an effect it would have found.
+Two limits are stated with the result. A session that is one warm-up moves every series along one curve; it is tested beside free
+exponentials, and its best verdict is "not separable"; where a warm-up only dominates, the remaining variation must carry the evidence. And
+a map without a finding states its detection limit.
 
-Source: Harris (2020), bioRxiv 2020.11.29.402719 (nonsense correlations).
+Source: Harris (2020), bioRxiv 2020.11.29.402719 (nonsense correlations); docs/method/attribution.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,13 @@ from numpy.typing import NDArray
 
 from fusion._typing import Array
 from fusion.alignment.first_order_lag import respond
-from fusion.attribution.drift_channels import DriftSeries, read_clock, reduce_channels, target_table
+from fusion.attribution.drift_channels import (
+    ClockedReadings,
+    DriftSeries,
+    clock_readings,
+    reduce_channels,
+    target_series,
+)
 from fusion.attribution.family_wise import (
     CHECKS,
     LAGS_S,
@@ -32,7 +39,7 @@ from fusion.attribution.family_wise import (
     AttributionResult,
     FamilyTest,
     FieldSeries,
-    evaluate_films,
+    evaluate_candidates,
 )
 from fusion.attribution.per_target import screen
 from fusion.attribution.thermal_modes import Modes, Region, localise_modes, region_courses
@@ -42,19 +49,19 @@ from fusion.errors import FusionError
 #: Verdict codes of the maps, in the order of the CF flag meanings.
 NOT_ATTRIBUTABLE, ATTRIBUTABLE, NOT_SEPARABLE = 0, 1, 2
 _FLAG_MEANINGS = "not_attributable attributable not_separable"
-#: Values (channels or series, columns) and attributes with units, by name.
-Quantities = dict[str, tuple[Array | NDArray[Any], dict[str, Any]]]
-#: Thermal modes get a larger share of the error probability: few, quiet and each one place, they find what single cells miss, and cells
-#: mostly draw the map around them. A quarter of the unit costs the cells 1 % of power and finds 3 % more sources (simulated).
-FAVOUR = {"modes": 0.25}
+#: Thermal modes get a larger share of the error probability: few, of low noise and each one place, they find what single cells miss, and
+#: cells mostly draw the map around them. A quarter of the unit costs the cells 1 % of power and finds 3 % more sources (simulated).
+_FAVOUR = {"modes": 0.25}
 _THRESHOLD = {"units": "1", "long_name": "statistic at a family-wise p of 0.05"}
 _RATE = {"units": "1", "long_name": "share of fresh nulls flagged"}
 #: Cells with gaps in up to this share of the frames are filled by interpolation in time; others are left out.
 _GAP_SHARE = 0.2
+#: Values (channels or series, columns) and attributes with units, by name.
+_Quantities = dict[str, tuple[Array | NDArray[Any], dict[str, Any]]]
 
 
 class CorrelationError(FusionError):
-    """The field cannot be correlated with the drift; the message says what is missing."""
+    """A field that cannot be correlated with the drift; the message says what is missing."""
 
 
 def correlate(
@@ -74,95 +81,71 @@ def correlate(
     Parameters
     ----------
     fused_readings : Dataset
-        ``deviation`` (um) and ``time`` (UTC) with dims cycle, direction, target, and ``position`` (mm) per target.
-    field : DataArray
-        Temperature in degC or rise in K, dims time, y, x (mm), at least 12 frames; NaN where masked.
+        ``deviation`` (um) and ``time`` (UTC) over cycle, direction and target, and ``position`` (mm) over target.
+    field : DataArray, (time, y, x)
+        Temperature in degC or rise in K on the plan (mm), at least 12 frames; NaN where the plan is not seen.
     regions : sequence of Region
         Parts of the plan whose mean temperature is tested as well, each with a name of its own.
-    lags_s : sequence of float
-        Time constants of the first-order response, s.
+    lags_s : sequence of float, s
+        Time constants of the first-order lags; 0 is no lag.
     draws : int
-        Series redrawn from the fitted null, which set the threshold.
+        Number of series simulated under the fitted null hypothesis, which set the threshold.
     checks : int
-        Fresh nulls on which the rate of false alarms of this threshold is measured.
+        Number of further simulated series on which the false alarm rate of this threshold is measured.
     per_target : bool
-        Also screen every target and direction by itself, with its own family-wise error and the whitening fixed under the null.
+        Also test every target and direction by itself, with its own family-wise error and the whitening fixed under the null.
     seed : int
-        Seed of the redrawn series.
+        Seed of the simulated series.
     progress : callable, optional
-        Called with the finished share, 0..1.
+        Called with the finished share, 0 to 1.
 
     Returns
     -------
     DataTree
-        Maps over channel, y, x: ``statistic``, ``p_value`` (family-wise), ``q_value`` (false discovery), ``sensitivity`` and
-        ``sensitivity_u`` (um/K), ``lag`` (s), ``detectable_sensitivity`` (um/K found with 80 % power), ``verdict``, and
-        ``naive_correlation`` for contrast only. Per channel ``threshold``, ``noise`` (um), ``unexplained_drift`` (um over one hour),
-        ``drift_order``; scalars ``false_alarm_rate`` (of everything tested), ``cells_false_alarm_rate``, ``warm_up_share``; attribute
-        ``verdict``. Group ``modes`` holds the same over channel and mode, with ``pattern`` (1 at the strongest cell, at ``at_x``,
-        ``at_y``), ``threshold``, ``false_alarm_rate`` and ``p_beside``, the p value of what a mode adds to the leading one (NaN for that
-        one itself, and where none passes); group ``regions`` the same over channel and region. With `per_target`, groups ``targets``
-        with maps over series, y, x and ``target_regions`` over series and region.
+        Root: maps (channel, y, x) ``statistic``, ``p_value`` (family-wise), ``q_value`` (false discovery), ``sensitivity``,
+        ``sensitivity_u`` and ``detectable_sensitivity`` (um/K; the last with 80 % power), ``lag`` (s), ``verdict``, and
+        ``naive_correlation`` for contrast only; per channel ``threshold``, ``noise`` (um), ``unexplained_drift`` (um over one hour),
+        ``drift_order``; ``false_alarm_rate`` of everything tested, ``cells_false_alarm_rate``, ``warm_up_share``; attribute ``verdict``.
+        Group ``modes``: the same over channel and mode, with ``pattern`` (1 at the strongest cell, at ``at_x``, ``at_y``) and
+        ``p_beside``, the p-value given the leading mode (NaN for that one, and where none passes). Group ``regions``: over channel and
+        region. With `per_target`: groups ``targets`` (series, y, x) and ``target_regions`` (series, region).
 
     Raises
     ------
     CorrelationError, ChannelError, RegionError
-        if no cell is seen, too few frames or cycles remain, or a region holds no seen cell.
+        If no cell is seen, too few frames or cycles remain, or a region contains no seen cell.
     """
     if field.dims != ("time", "y", "x"):
         raise CorrelationError(f"field has dims {field.dims}; expected ('time', 'y', 'x')")
-    readings = read_clock(fused_readings, field["time"].values.astype("datetime64[ns]"))
-    film, seen = read_film(field, readings.frame_seconds)
-    series = reduce_channels(readings)
-    excitation = describe_excitation(film.seconds, film.values)
-    modes = localise_modes(film.values)
-    courses = {"modes": modes.courses, "regions": region_courses(film.values, seen, field, regions)}
-    films = {"cells": film} | {name: FieldSeries(film.seconds, few) for name, few in courses.items() if few.shape[1]}
-    found = evaluate_films(
-        series,
-        films,
-        excitation,
-        lags_s=lags_s,
-        draws=draws,
-        checks=checks,
-        favour=FAVOUR,
-        rng=np.random.default_rng(seed),
-        progress=progress,
+    readings = clock_readings(fused_readings, field["time"].values.astype("datetime64[ns]"))
+    session = _Session.prepare(
+        readings, _Candidates.collect(field, readings.frame_seconds, regions), lags_s, draws, seed
     )
-    quantities = {
-        name: describe(tested, series, films[name], lags_s, excitation) for name, tested in found.sets.items()
-    }
-    plan = {"y": field["y"], "x": field["x"]}
-    cells = describe_session(found, excitation).assign_coords(plan)
-    groups = {"/": cells.assign(_over_cells("channel", quantities["cells"], seen, field))}
-    if "modes" in quantities:
-        beside = _beside_leader(found.sets["modes"], series, films["modes"], excitation, lags_s, draws, seed)
-        groups["modes"] = (
-            _over_modes(quantities["modes"], modes, seen, field)
-            .assign(_describe_set(found.sets["modes"]))
-            .assign(p_beside=beside)
-        )
-    if "regions" in quantities:
-        groups["regions"] = _over_regions("channel", quantities["regions"], regions).assign(
-            _describe_set(found.sets["regions"])
-        )
-    if per_target:
-        table = target_table(readings)
-        single: dict[str, Quantities] = {
-            name: _screen_targets(table, films[name], excitation, lags_s, draws, seed + 1)
-            for name in ("cells", "regions")
-            if name in films
-        }
-        groups["targets"] = xr.Dataset(_over_cells("series", single["cells"], seen, field), {"series": table[0]})
-        if "regions" in single:
-            few = _over_regions("series", single["regions"], regions)
-            groups["target_regions"] = few.assign_coords(series=table[0])
-    groups["/"].attrs["readings_outside_film"] = readings.outside_film
-    return xr.DataTree.from_dict(groups)
+    return session.describe(session.evaluate(checks, progress), readings, per_target=per_target)
 
 
-def read_film(field: xr.DataArray, frame_seconds: Array) -> tuple[FieldSeries, NDArray[np.bool_]]:
-    """Flatten a field (time, y, x) to the cells that are seen in nearly every frame; short gaps are interpolated in time."""
+def flatten_field(field: xr.DataArray, frame_seconds: Array) -> tuple[FieldSeries, NDArray[np.bool_]]:
+    """Return the courses of the cells that are seen in nearly every frame.
+
+    Parameters
+    ----------
+    field : DataArray, (time, y, x)
+        Temperature in degC or rise in K, NaN where the plan is not seen.
+    frame_seconds : (frames,) ndarray, s
+        Times of the frames since the first one, increasing.
+
+    Returns
+    -------
+    FieldSeries
+        The seen cells as columns, each minus its mean over time; gaps are interpolated linearly in time.
+    (y * x,) ndarray of bool
+        Which cells these are.
+
+    Raises
+    ------
+    CorrelationError
+        If no cell is seen in at least 80 % of the frames.
+    """
     values = field.values.reshape(field.sizes["time"], -1).astype(float)
     gaps = ~np.isfinite(values)
     seen = gaps.mean(axis=0) <= _GAP_SHARE
@@ -172,214 +155,269 @@ def read_film(field: xr.DataArray, frame_seconds: Array) -> tuple[FieldSeries, N
         )
     values, gaps = values[:, seen], gaps[:, seen]
     for column in np.flatnonzero(gaps.any(axis=0)):
-        known = ~gaps[:, column]
-        values[~known, column] = np.interp(frame_seconds[~known], frame_seconds[known], values[known, column])
+        finite = ~gaps[:, column]
+        values[~finite, column] = np.interp(frame_seconds[~finite], frame_seconds[finite], values[finite, column])
     return FieldSeries(frame_seconds, values - values.mean(axis=0)), seen
 
 
-def _beside_leader(
-    tested: FamilyTest,
-    series: Sequence[DriftSeries],
-    modes: FieldSeries,
-    excitation: Excitation,
-    lags_s: Sequence[float],
-    draws: int,
-    seed: int,
-) -> xr.DataArray:
-    """Family-wise p (channel, mode) of what each mode adds to the leading one, which is taken as given at its lag.
+@dataclass(frozen=True)
+class _Candidates:
+    """The temperatures to test, and where they lie on the plan.
 
-    Modes that warm with the leading one go with the drift as it does, but add nothing to it.
+    Attributes
+    ----------
+    sets : ``cells``, and ``modes`` and ``regions`` where there are any
+    field : (time, y, x), for the coordinates of the plan
+    seen : (y * x,) which cells are the columns of ``cells``
+    modes, regions : what the columns of ``modes`` and ``regions`` are
     """
-    count = modes.values.shape[1]
-    p_value = np.full((len(tested.names), count), np.nan)
-    ratio = tested.statistic / tested.threshold[:, None]
-    channel, leader = np.unravel_index(int(np.where(tested.p_value <= LEVEL, ratio, -1.0).argmax()), ratio.shape)
-    others = np.flatnonzero(np.arange(count) != leader)
-    if tested.p_value[channel, leader] <= LEVEL and others.size and not excitation.warm_up_only:
-        lag_s = lags_s[int(tested.lag_index[channel, leader])]
-        given = respond(modes.values[:, [leader]], modes.seconds, time_constant_s=lag_s)
-        again = evaluate_films(
-            series,
-            {"modes": FieldSeries(modes.seconds, modes.values[:, others])},
-            excitation,
-            lags_s=lags_s,
-            draws=draws,
-            checks=0,
-            beside=[one.sampling @ given for one in series],
-            rng=np.random.default_rng(seed + 2),
+
+    sets: dict[str, FieldSeries]
+    field: xr.DataArray
+    seen: NDArray[np.bool_]
+    modes: Modes
+    regions: Sequence[Region]
+
+    @staticmethod
+    def collect(field: xr.DataArray, frame_seconds: Array, regions: Sequence[Region]) -> _Candidates:
+        cells, seen = flatten_field(field, frame_seconds)
+        modes = localise_modes(cells.values)
+        courses = {"modes": modes.courses, "regions": region_courses(cells.values, seen, field, regions)}
+        few = {name: FieldSeries(cells.seconds, values) for name, values in courses.items() if values.shape[1]}
+        return _Candidates({"cells": cells, **few}, field, seen, modes, regions)
+
+    def lay_out(self, name: str, leading: str, quantities: _Quantities) -> xr.Dataset:
+        """Quantities (leading, columns) of one set as variables, with the places of its columns."""
+        if name == "cells":
+            return xr.Dataset(self._maps(leading, quantities), {"y": self.field["y"], "x": self.field["x"]})
+        kind = {"modes": "mode", "regions": "region"}[name]
+        variables = {
+            quantity: ((leading, kind), _without_infinities(values), attrs)
+            for quantity, (values, attrs) in quantities.items()
+        }
+        if name == "regions":
+            centre = np.array([region.centre_mm for region in self.regions]).reshape(-1, 2)
+            return _placed(xr.Dataset(variables, {"region": [region.name for region in self.regions]}), centre)
+        row, column = np.divmod(np.flatnonzero(self.seen)[self.modes.peaks], self.field.sizes["x"])
+        peak = np.column_stack([self.field["x"].values[column], self.field["y"].values[row]])
+        pattern = self._maps("mode", {"pattern": (self.modes.patterns, {"units": "1"})})
+        return _placed(xr.Dataset(variables, {"mode": np.arange(1, peak.shape[0] + 1)}).assign(pattern), peak)
+
+    def _maps(self, leading: str, quantities: _Quantities) -> dict[str, xr.DataArray]:
+        """Quantities (leading, seen cells) as maps; cells that were not tested are NaN, flags there 0."""
+        maps = {}
+        for name, (values, attrs) in quantities.items():
+            whole = np.full((values.shape[0], self.seen.size), 0 if values.dtype.kind == "i" else np.nan, values.dtype)
+            whole[:, self.seen] = _without_infinities(values)
+            maps[name] = xr.DataArray(whole.reshape(-1, *self.field.shape[1:]), dims=(leading, "y", "x"), attrs=attrs)
+        return maps
+
+
+def _placed(columns: xr.Dataset, place_mm: Array) -> xr.Dataset:
+    """A Dataset over one kind of candidates with their places (candidates, 2), mm."""
+    (kind,) = columns.coords
+    mm = {"units": "mm"}
+    return columns.assign(at_x=((kind,), place_mm[:, 0], mm), at_y=((kind,), place_mm[:, 1], mm))
+
+
+def _without_infinities(values: NDArray[Any]) -> NDArray[Any]:
+    return values if values.dtype.kind == "i" else np.where(np.isfinite(values), values, np.nan)
+
+
+@dataclass(frozen=True)
+class _Session:
+    """One session ready to be tested: its drift, its candidates, and how they are compared."""
+
+    series: Sequence[DriftSeries]
+    candidates: _Candidates
+    excitation: Excitation
+    lags_s: Sequence[float]
+    draws: int
+    seed: int
+
+    @staticmethod
+    def prepare(
+        readings: ClockedReadings, candidates: _Candidates, lags_s: Sequence[float], draws: int, seed: int
+    ) -> _Session:
+        cells = candidates.sets["cells"]
+        excitation = describe_excitation(cells.values, cells.seconds)
+        return _Session(reduce_channels(readings), candidates, excitation, lags_s, draws, seed)
+
+    def evaluate(self, checks: int, progress: Callable[[float], None] | None) -> AttributionResult:
+        """Test all candidates together."""
+        return evaluate_candidates(
+            self.series,
+            self.candidates.sets,
+            self.excitation,
+            lags_s=self.lags_s,
+            draws=self.draws,
+            checks=checks,
+            favour=_FAVOUR,
+            rng=np.random.default_rng(self.seed),
+            progress=progress,
         )
-        p_value[:, others] = again.sets["modes"].p_value
-    attrs = {"units": "1", "long_name": "family-wise p value of what this mode adds to the leading one"}
-    return xr.DataArray(p_value, dims=("channel", "mode"), attrs=attrs)
+
+    def describe(self, result: AttributionResult, readings: ClockedReadings, *, per_target: bool) -> xr.DataTree:
+        """Everything that was tested, as `correlate` returns it."""
+        groups: dict[str, xr.Dataset] = {}
+        for name, test in result.sets.items():
+            groups[name] = self.candidates.lay_out(name, "channel", self._quantities(name, test))
+            if name != "cells":
+                groups[name] = groups[name].assign(_describe_set(test))
+        if "modes" in groups:
+            groups["modes"]["p_beside"] = self._p_beside_leader(result.sets["modes"])
+        if per_target:
+            groups |= self._screen_targets(readings)
+        root = _describe_session(result, self.excitation).assign(groups.pop("cells"))
+        root.attrs["readings_outside_film"] = readings.outside_frames
+        return xr.DataTree.from_dict({"/": root, **groups})
+
+    def _quantities(self, name: str, test: FamilyTest) -> _Quantities:
+        """What the test found per channel and column."""
+        verdict = np.where(test.p_value <= LEVEL, ATTRIBUTABLE, NOT_ATTRIBUTABLE)
+        if self.excitation.warm_up_only:
+            verdict = np.full_like(verdict, NOT_SEPARABLE)
+        naive = [_naive_correlation(channel, self.candidates.sets[name]) for channel in self.series]
+        naive += naive[:1] * (len(test.names) - len(naive))
+        one, per_kelvin = {"units": "1"}, {"units": "um/K"}
+        plain = "plain correlation, for contrast only: two trending series always correlate"
+        flags = {"flag_values": np.array([0, 1, 2], np.int8), "flag_meanings": _FLAG_MEANINGS}
+        return {
+            "statistic": (test.statistic, {**one, "long_name": "profile likelihood ratio"}),
+            "p_value": (test.p_value, {**one, "long_name": "family-wise p value"}),
+            "q_value": (test.q_value, {**one, "long_name": "false-discovery rate"}),
+            "sensitivity": (test.coefficient, {**per_kelvin, "long_name": "drift per rise of this place"}),
+            "sensitivity_u": (
+                test.coefficient_u,
+                {**per_kelvin, "long_name": "standard uncertainty of the sensitivity"},
+            ),
+            "detectable_sensitivity": (
+                test.detectable,
+                {**per_kelvin, "long_name": "sensitivity found with 80 % power at this place"},
+            ),
+            "lag": (
+                np.asarray(self.lags_s, float)[test.lag_index],
+                {"units": "s", "long_name": "time constant of the response"},
+            ),
+            "verdict": (verdict.astype(np.int8), flags),
+            "naive_correlation": (np.stack(naive), {**one, "long_name": plain}),
+        }
+
+    def _p_beside_leader(self, test: FamilyTest) -> xr.DataArray:
+        """Family-wise p (channel, mode) of what each mode adds to the leading one, which is taken as given at its lag.
+
+        Modes that are collinear with the leading one go with the drift as it does, but add nothing to it.
+        """
+        modes = self.candidates.sets["modes"]
+        count = modes.values.shape[1]
+        p_value = np.full((len(test.names), count), np.nan)
+        ratio = test.statistic / test.threshold[:, None]
+        channel, leader = np.unravel_index(int(np.where(test.p_value <= LEVEL, ratio, -1.0).argmax()), ratio.shape)
+        others = np.flatnonzero(np.arange(count) != leader)
+        if test.p_value[channel, leader] <= LEVEL and others.size and not self.excitation.warm_up_only:
+            lag_s = self.lags_s[int(test.lag_index[channel, leader])]
+            given = respond(modes.values[:, [leader]], modes.seconds, time_constant_s=lag_s)
+            again = evaluate_candidates(
+                self.series,
+                {"modes": FieldSeries(modes.seconds, modes.values[:, others])},
+                self.excitation,
+                lags_s=self.lags_s,
+                draws=self.draws,
+                checks=0,
+                beside=[channel.sampling @ given for channel in self.series],
+                rng=np.random.default_rng(self.seed + 2),
+            )
+            p_value[:, others] = again.sets["modes"].p_value
+        attrs = {"units": "1", "long_name": "family-wise p value of what this mode adds to the leading one"}
+        return xr.DataArray(p_value, dims=("channel", "mode"), attrs=attrs)
+
+    def _screen_targets(self, readings: ClockedReadings) -> dict[str, xr.Dataset]:
+        """What every target and direction shows by itself, for cells and regions."""
+        targets = target_series(readings)
+        coords = {
+            "series": list(targets.names),
+            "series_direction": ("series", list(targets.directions)),
+            "series_target": ("series", targets.targets),
+        }
+        groups = {}
+        for name, group in (("cells", "targets"), ("regions", "target_regions")):
+            if name not in self.candidates.sets:
+                continue
+            screening = screen(
+                targets,
+                self.candidates.sets[name],
+                self.excitation,
+                lags_s=self.lags_s,
+                permutations=self.draws,
+                rng=np.random.default_rng(self.seed + 1),
+            )
+            quantities: _Quantities = {
+                "statistic": (
+                    screening.statistic,
+                    {"units": "1", "long_name": "likelihood ratio, whitening fixed under the null"},
+                ),
+                "p_value": (screening.p_value, {"units": "1", "long_name": "family-wise p value over all series"}),
+                "sensitivity": (screening.sensitivity, {"units": "um/K"}),
+                "sensitivity_u": (screening.sensitivity_u, {"units": "um/K"}),
+                "lag": (np.asarray(self.lags_s, float)[screening.lag_index], {"units": "s"}),
+            }
+            groups[group] = self.candidates.lay_out(name, "series", quantities).assign_coords(coords)
+        return groups
 
 
-def _session_verdict(found: AttributionResult, excitation: Excitation) -> int:
+def _naive_correlation(series: DriftSeries, field: FieldSeries) -> Array:
+    """Plain correlation (columns,) of a series with the field without lag: what a map without any of the above would show."""
+    regressors = series.sampling @ field.values
+    regressors = regressors - regressors.mean(axis=0)
+    values = series.values - series.values.mean()
+    size = np.sqrt((regressors**2).sum(axis=0) * (values**2).sum())
+    return (values @ regressors) / np.where(size > 0, size, 1.0)
+
+
+def _session_verdict(result: AttributionResult, excitation: Excitation) -> int:
     if excitation.warm_up_only:
         return NOT_SEPARABLE
-    passed = any((tested.p_value <= LEVEL).any() for tested in found.sets.values())
+    passed = any((test.p_value <= LEVEL).any() for test in result.sets.values())
     return ATTRIBUTABLE if passed else NOT_ATTRIBUTABLE
 
 
-def _naive(series: DriftSeries, film: FieldSeries) -> Array:
-    """Plain correlation (columns,) of a series with the unlagged film: what a map without any of the above would show."""
-    seen = series.sampling @ film.values
-    seen = seen - seen.mean(axis=0)
-    values = series.values - series.values.mean()
-    size = np.sqrt((seen**2).sum(axis=0) * (values**2).sum())
-    return (values @ seen) / np.where(size > 0, size, 1.0)
-
-
-def describe(
-    tested: FamilyTest,
-    series: Sequence[DriftSeries],
-    film: FieldSeries,
-    lags_s: Sequence[float],
-    excitation: Excitation,
-) -> Quantities:
-    """What the test found per channel and column, by name: values (channels, columns) and attributes with units."""
-    verdict = np.where(tested.p_value <= LEVEL, ATTRIBUTABLE, NOT_ATTRIBUTABLE)
-    if excitation.warm_up_only:
-        verdict = np.full_like(verdict, NOT_SEPARABLE)
-    naive = [_naive(one, film) for one in series]
-    naive += naive[:1] * (len(tested.names) - len(series))
-    per_kelvin = {"units": "um/K"}
+def _describe_set(test: FamilyTest) -> dict[str, tuple[tuple[str, ...], Any, dict[str, str]]]:
+    """Threshold per channel and false alarm rate of one set of candidates, as variables."""
     return {
-        "statistic": (tested.statistic, {"units": "1", "long_name": "profile likelihood ratio"}),
-        "p_value": (tested.p_value, {"units": "1", "long_name": "family-wise p value"}),
-        "q_value": (tested.q_value, {"units": "1", "long_name": "false-discovery rate"}),
-        "sensitivity": (tested.coefficient, {**per_kelvin, "long_name": "drift per rise of this place"}),
-        "sensitivity_u": (tested.coefficient_u, {**per_kelvin, "long_name": "standard uncertainty of the sensitivity"}),
-        "detectable_sensitivity": (
-            tested.detectable,
-            {**per_kelvin, "long_name": "sensitivity found with 80 % power at this place"},
-        ),
-        "lag": (
-            np.asarray(lags_s, float)[tested.lag_index],
-            {"units": "s", "long_name": "time constant of the response"},
-        ),
-        "verdict": (
-            verdict.astype(np.int8),
-            {"flag_values": np.array([0, 1, 2], np.int8), "flag_meanings": _FLAG_MEANINGS},
-        ),
-        "naive_correlation": (
-            np.stack(naive),
-            {"units": "1", "long_name": "plain correlation, for contrast only: two trending series always correlate"},
-        ),
+        "threshold": (("channel",), test.threshold, _THRESHOLD),
+        "false_alarm_rate": ((), test.false_alarm_rate, _RATE),
     }
 
 
-def _describe_set(tested: FamilyTest) -> dict[str, tuple[tuple[str, ...], Any, dict[str, str]]]:
-    """Threshold per channel and rate of false alarms of one set of candidates, as variables."""
-    return {
-        "threshold": (("channel",), tested.threshold, _THRESHOLD),
-        "false_alarm_rate": ((), tested.false_alarm_rate, _RATE),
-    }
-
-
-def describe_session(found: AttributionResult, excitation: Excitation) -> xr.Dataset:
-    """What holds for the whole session: thresholds, noise and unexplained drift per channel, false alarms, verdict."""
-    cells = found.sets["cells"]
-    nulls = list(found.banks) + [found.banks[0]] * (len(cells.names) - len(found.banks))
-    per_channel: dict[str, tuple[list[float], dict[str, Any]]] = {
-        "threshold": (cells.threshold.tolist(), _THRESHOLD),
-        "noise": ([bank.sigma for bank in nulls], {"units": "um", "long_name": "noise of one value of the channel"}),
+def _describe_session(result: AttributionResult, excitation: Excitation) -> xr.Dataset:
+    """What holds for the whole session: thresholds, noise and unexplained drift per channel, false alarm rates, verdict."""
+    cells = result.sets["cells"]
+    banks = list(result.banks) + [result.banks[0]] * (len(cells.names) - len(result.banks))
+    per_channel: dict[str, tuple[Any, dict[str, str]]] = {
+        "threshold": (cells.threshold, _THRESHOLD),
+        "noise": ([bank.sigma for bank in banks], {"units": "um", "long_name": "noise of one value of the channel"}),
         "unexplained_drift": (
-            [bank.drift_per_hour for bank in nulls],
+            [bank.drift_per_hour for bank in banks],
             {"units": "um", "long_name": "standard deviation over one hour of the drift that nothing explains"},
         ),
         "drift_order": (
-            [float(bank.fitted.order) for bank in nulls],
+            [float(bank.fitted.order) for bank in banks],
             {"units": "1", "long_name": "0 none, 1 random walk, 2 integrated random walk"},
         ),
     }
-    session = _session_verdict(found, excitation)
+    share = {"units": "1", "long_name": "share of the field's course that one warm-up explains"}
+    session = _session_verdict(result, excitation)
     return xr.Dataset(
         {name: (("channel",), values, attrs) for name, (values, attrs) in per_channel.items()}
         | {
-            "false_alarm_rate": ((), found.false_alarm_rate, _RATE),
+            "false_alarm_rate": ((), result.false_alarm_rate, _RATE),
             "cells_false_alarm_rate": ((), cells.false_alarm_rate, _RATE),
-            "warm_up_share": (
-                (),
-                excitation.warm_up_share,
-                {"units": "1", "long_name": "share of the field's course that one warm-up explains"},
-            ),
+            "warm_up_share": ((), excitation.warm_up_share, share),
         },
         coords={"channel": list(cells.names)},
         attrs={
             "verdict": _FLAG_MEANINGS.split()[session].replace("_", " "),
             "excitation": excitation.name,
-            "draws": found.draws,
+            "draws": result.draws,
         },
     )
-
-
-def _over_cells(
-    leading: str, quantities: Quantities, seen: NDArray[np.bool_], field: xr.DataArray
-) -> dict[str, xr.DataArray]:
-    """Quantities (leading, seen cells) as maps; cells that were not tested are NaN, flags there 0."""
-    maps = {}
-    for name, (values, attrs) in quantities.items():
-        flags = values.dtype.kind == "i"
-        whole = np.full((values.shape[0], seen.size), 0 if flags else np.nan, values.dtype)
-        whole[:, seen] = values if flags else np.where(np.isfinite(values), values, np.nan)
-        maps[name] = xr.DataArray(whole.reshape(-1, *field.shape[1:]), dims=(leading, "y", "x"), attrs=attrs)
-    return maps
-
-
-def _over_regions(leading: str, quantities: Quantities, regions: Sequence[Region]) -> xr.Dataset:
-    """Quantities (leading, regions), with the places of the regions."""
-    centre = np.array([region.centre_mm for region in regions]).reshape(-1, 2)
-    return (
-        _over_columns(leading, "region", quantities)
-        .assign(at_x=(("region",), centre[:, 0], {"units": "mm"}), at_y=(("region",), centre[:, 1], {"units": "mm"}))
-        .assign_coords(region=[region.name for region in regions])
-    )
-
-
-def _over_modes(quantities: Quantities, modes: Modes, seen: NDArray[np.bool_], field: xr.DataArray) -> xr.Dataset:
-    """Quantities (channel, modes), with the modes' patterns and their strongest cells."""
-    row, column = np.divmod(np.flatnonzero(seen)[modes.peaks], field.sizes["x"])
-    pattern = _over_cells("mode", {"pattern": (modes.patterns, {"units": "1"})}, seen, field)["pattern"]
-    return (
-        _over_columns("channel", "mode", quantities)
-        .assign(
-            pattern=pattern,
-            at_x=(("mode",), field["x"].values[column], {"units": "mm"}),
-            at_y=(("mode",), field["y"].values[row], {"units": "mm"}),
-        )
-        .assign_coords(mode=np.arange(1, modes.peaks.size + 1))
-    )
-
-
-def _over_columns(leading: str, trailing: str, quantities: Quantities) -> xr.Dataset:
-    return xr.Dataset(
-        {
-            name: (
-                (leading, trailing),
-                values if values.dtype.kind == "i" else np.where(np.isfinite(values), values, np.nan),
-                attrs,
-            )
-            for name, (values, attrs) in quantities.items()
-        }
-    )
-
-
-def _screen_targets(
-    table: tuple[list[str], Array, Array, Array],
-    film: FieldSeries,
-    excitation: Excitation,
-    lags_s: Sequence[float],
-    draws: int,
-    seed: int,
-) -> Quantities:
-    """Findings of every target and direction by itself, by name."""
-    _, values, seconds, sampling = table
-    rng = np.random.default_rng(seed)
-    found = screen(values, seconds, sampling, film, excitation, lags_s=lags_s, permutations=draws, rng=rng)
-    return {
-        "statistic": (found.statistic, {"units": "1", "long_name": "likelihood ratio, whitening fixed under the null"}),
-        "p_value": (found.p_value, {"units": "1", "long_name": "family-wise p value over all series"}),
-        "sensitivity": (found.sensitivity, {"units": "um/K"}),
-        "sensitivity_u": (found.sensitivity_u, {"units": "um/K"}),
-        "lag": (np.asarray(lags_s, float)[found.lag_index], {"units": "s"}),
-    }

@@ -1,17 +1,19 @@
-"""Which few contact sensors, placed where, would do as well as the camera, and what each missing one costs in um.
+"""Choose contact sensors in place of the camera: which few places predict the drift as well, and what fewer sensors lose.
 
-Camera (its thermal modes) and sensors (single cells with a contact sensor's noise) predict the drift channels by the same model: one
-lag, one prior for all sensitivities, and a drift of its own kind and size, all chosen by marginal likelihood. Everything, the places
-included, is chosen on three quarters of the cycles and predicts the quarter left out, a run of successive cycles; never random ones,
-which reward series that merely wander alike.
+Camera (its thermal modes) and sensors (single cells with the noise of a contact sensor) predict the drift channels by the same model: one
+lag, one prior for all sensitivities, and a drift of its own order and variance, all chosen by marginal likelihood. Everything, the places
+included, is chosen on three quarters of the cycles and predicts the held-out quarter, a run of successive cycles; never random ones, which
+favour series that are correlated by their slow drift alone.
 
-What the sensors lose beside the camera is not taken from two held-out errors: both contain the drift that neither explains, whose
-chance fluctuation is larger than what is asked. It is taken from where the two predictions differ: with their difference delta and
-what the camera leaves of the readings, e, both from their mean within each run, the sensors' mean square error exceeds the camera's by::
+The loss of the sensors is not the difference of two hold-out errors: both contain the drift that neither explains, whose chance
+fluctuation is larger than the loss. It follows from the difference of the two predictions. With this difference delta and the residual e of
+the camera, both minus their mean within each run, the mean square error of the sensors exceeds that of the camera by exactly::
 
     mean(delta^2) + 2 mean(delta e)
 
-exactly, and its uncertainty is what the drift and noise in e do to the second term.
+and the drift and noise in e give the uncertainty of the second term.
+
+Source: docs/method/attribution.md.
 """
 
 from __future__ import annotations
@@ -26,31 +28,32 @@ from threadpoolctl import threadpool_limits
 
 from fusion._typing import Array
 from fusion.alignment.first_order_lag import lag_operators
-from fusion.attribution.attribute import read_film
-from fusion.attribution.drift_channels import DriftSeries, read_clock, reduce_channels
+from fusion.attribution.attribute import flatten_field
+from fusion.attribution.drift_channels import DriftSeries, clock_readings, reduce_channels
 from fusion.attribution.family_wise import LAGS_S
 from fusion.attribution.likelihood_ratio import Grid, null_bank, whitening_grid
 from fusion.attribution.warm_up import thermal_modes
 
 #: The camera is represented by at most this many thermal modes.
-CAMERA_MODES = 6
-#: Runs of successive cycles that are left out in turn.
+_CAMERA_MODES = 6
+#: Number of runs of successive cycles that are held out in turn.
 FOLDS = 4
-#: Prior spread of what one member explains, in units of the noise of one value.
+#: Prior standard deviations of the contribution of one temperature, in units of the noise of one value.
 _PRIORS = 3.0 ** np.arange(-1.0, 6.0)
 #: Log-likelihoods that differ by less than this cannot be told apart (chi-square, 1 degree of freedom, 0.95, halved).
-_ALIKE_NATS = 1.92
-#: An excess this many uncertainties above zero is decided.
+_EQUAL_NATS = 1.92
+#: A loss this many standard uncertainties above zero is significant.
 _DECIDED = 2.0
 
 
 @dataclass(frozen=True)
 class Excess:
-    """Mean square error of a prediction beyond the camera's, um^2, rms over all targets.
+    """Mean square error of a prediction minus that of the camera, mean over all targets.
 
     Attributes
     ----------
-    value, u : with its standard uncertainty; negative values occur where the difference is within u
+    value, u : float, um^2
+        Estimate and its standard uncertainty; negative values occur where the difference is within u.
     """
 
     value: float
@@ -58,23 +61,31 @@ class Excess:
 
     @property
     def um(self) -> float:
-        """The loss in um: root of the excess, 0 where it is not positive."""
+        """Loss: root of the excess, 0 where it is not positive, um."""
         return float(np.sqrt(max(self.value, 0.0)))
 
     @property
     def at_most_um(self) -> float:
-        """Upper end of the loss in um (two uncertainties)."""
+        """Upper limit of the loss (two standard uncertainties), um."""
         return float(np.sqrt(max(self.value, 0.0) + _DECIDED * self.u))
 
     @property
     def decided(self) -> bool:
-        """Whether the data show a loss at all."""
+        """Whether the loss is significant."""
         return self.value > _DECIDED * self.u
 
 
 @dataclass(frozen=True)
 class SensorSet:
-    """The best sensors of one size, in the order of their worth, and what they miss beside the camera."""
+    """The best set of sensors of one size.
+
+    Attributes
+    ----------
+    places_mm : tuple of (float, float), mm
+        Places (x, y) on the plan, in the order of their gain.
+    loss : Excess
+        What they lose against the camera.
+    """
 
     places_mm: tuple[tuple[float, float], ...]
     loss: Excess
@@ -82,13 +93,16 @@ class SensorSet:
 
 @dataclass(frozen=True)
 class SensorChoice:
-    """Contact sensors beside the camera.
+    """Contact sensors in place of the camera.
 
     Attributes
     ----------
-    sets : for 1, 2, ... sensors; empty where the field stands still
-    without : what is missed without any temperature: the worth of the camera itself
-    run_s : length of a run of cycles within which the losses hold, s
+    sets : tuple of SensorSet
+        For 1, 2, ... sensors; empty where the field does not change.
+    without : Excess
+        What is lost without any temperature: the gain by the camera itself.
+    run_s : float, s
+        Length of a held-out run of cycles, within which the losses hold.
     """
 
     sets: tuple[SensorSet, ...]
@@ -106,44 +120,57 @@ def choose_sensors(
     lags_s: Sequence[float] = LAGS_S,
     seed: int = 0,
 ) -> SensorChoice:
-    """Choose 1..most contact sensors on the plan.
+    """Choose 1 to `most` places of contact sensors on the plan.
 
     Parameters
     ----------
-    fused_readings, field : as for :func:`fusion.attribution.attribute.correlate`
+    fused_readings : Dataset
+        ``deviation`` (um) and ``time`` (UTC) over cycle, direction and target, and ``position`` (mm) over target.
+    field : DataArray, (time, y, x)
+        Temperature in degC or rise in K on the plan (mm), at least 12 frames; NaN where the plan is not seen.
     most : int
         Largest number of sensors.
-    contact_noise_K : float
-        Noise of a contact sensor's value per frame, added to the cells so that no set lives on differences that it could not see.
-    lags_s : sequence of float
-        Lags between temperature and drift, one for all members of a prediction.
+    contact_noise_K : float, K
+        Noise of the reading of a contact sensor at one frame, added to the cells so that no set relies on differences that contact sensors
+        cannot resolve.
+    lags_s : sequence of float, s
+        Time constants between temperature and drift, one for all temperatures of a prediction.
     seed : int
         Seed of that noise.
+
+    Returns
+    -------
+    SensorChoice
+
+    Raises
+    ------
+    CorrelationError, ChannelError
+        If no cell is seen, or too few frames or cycles remain.
     """
-    readings = read_clock(fused_readings, field["time"].values.astype("datetime64[ns]"))
-    film, seen = read_film(field, readings.frame_seconds)
-    series = [one for one in reduce_channels(readings) if one.name != "reversal"]
-    modes, _ = thermal_modes(film.values, limit=CAMERA_MODES)
+    readings = clock_readings(fused_readings, field["time"].values.astype("datetime64[ns]"))
+    cells, seen = flatten_field(field, readings.frame_seconds)
+    series = [channel for channel in reduce_channels(readings) if channel.name != "reversal"]
+    modes, _ = thermal_modes(cells.values, limit=_CAMERA_MODES)
     if modes.shape[1] == 0:
         return SensorChoice((), Excess(0.0, 0.0), 0.0)
-    # The camera sees its modes free of the single cells' noise; a contact sensor sees its cell with its own.
-    smooth = modes @ np.linalg.lstsq(modes, film.values, rcond=None)[0]
+    # The modes of the camera are free of the noise of single cells; a contact sensor adds its own noise to its cell.
+    smooth = modes @ np.linalg.lstsq(modes, cells.values, rcond=None)[0]
     contact = smooth + contact_noise_K * np.random.default_rng(seed).standard_normal(smooth.shape)
-    operators = lag_operators(film.seconds, lags_s)
+    operators = lag_operators(cells.seconds, lags_s)
     # Mean square over the targets of a shift, and of a stretch that is 1 at the ends of travel.
     weight = {"common": 1.0, "proportional": float((readings.design[:, 1] ** 2).mean())}
-    tasks = [_Task.build(one, operators) for one in series]
+    tasks = [_Task.build(channel, operators) for channel in series]
     most = min(most, contact.shape[1])
-    everything = [_Part(task, np.ones(task.series.values.size, bool)) for task in tasks]
-    chosen = _place(everything, [_fit(part, modes) for part in everything], contact, most)
+    whole = [_Part(task, np.ones(task.series.values.size, bool)) for task in tasks]
+    chosen = _place(whole, [_fit(part, modes) for part in whole], contact, most)
     rows, columns = np.divmod(np.flatnonzero(seen)[chosen], field.sizes["x"])
     places = tuple((float(field["x"][c]), float(field["y"][r])) for r, c in zip(rows, columns, strict=True))
-    predictions = _predict_left_out(tasks, modes, contact, most)
+    predictions = _predict_held_out(tasks, modes, contact, most)
     excess = [
         _total(
             [
-                (_exceed(task, one[0], one[1 + k]), weight[task.series.name])
-                for task, one in zip(tasks, predictions, strict=True)
+                (_exceed(task, prediction[0], prediction[1 + k]), weight[task.series.name])
+                for task, prediction in zip(tasks, predictions, strict=True)
             ]
         )
         for k in range(most + 1)
@@ -154,7 +181,7 @@ def choose_sensors(
 
 @dataclass(frozen=True)
 class _Task:
-    """One channel, and how it sees the film under every lag, (lags, n, frames)."""
+    """One drift channel, and how it samples the field under every lag, (lags, n, frames)."""
 
     series: DriftSeries
     responses: Array
@@ -165,7 +192,7 @@ class _Task:
 
 
 class _Part:
-    """The values of one channel that a prediction may be fitted to, whitened under every drift of the grid."""
+    """The values of one channel that a prediction may be fitted to, whitened at every grid point."""
 
     def __init__(self, task: _Task, kept: NDArray[np.bool_]) -> None:
         series = task.series
@@ -177,16 +204,21 @@ class _Part:
         self.penalty = np.array([point.log_penalty for point in self.grid.whitenings])
         self.white = self.projects @ self.values
 
-    def columns(self, film: Array) -> Array:
-        """Members (frames, members) as the kept values see them under every lag, (lags, n, members)."""
-        return np.asarray(self.task.responses[:, self.kept] @ film, float)
+    def columns(self, temperatures: Array) -> Array:
+        """Regressors of the kept values under every lag, (lags, n, p), from temperatures (frames, p)."""
+        return np.asarray(self.task.responses[:, self.kept] @ temperatures, float)
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """The model of highest marginal likelihood: place in the drift grid, lag, prior variance of a sensitivity over noise variance.
+    """The model of highest marginal likelihood.
 
-    `score` is the negative logarithm of that likelihood per degree of freedom, doubled.
+    Attributes
+    ----------
+    drift, lag : indices of the drift in the grid and of the lag
+    prior : prior variance of a sensitivity over the variance of the noise, 1/K^2
+    coefficients : (p,) sensitivities, um/K
+    score : minus twice the logarithm of the likelihood, over the degrees of freedom
     """
 
     drift: int
@@ -196,17 +228,17 @@ class _Fit:
     score: float
 
 
-def _fit(part: _Part, members: Array) -> _Fit:
-    """Fit sensitivities of members (frames, p) that share one lag and one prior."""
-    columns = part.columns(members)
+def _fit(part: _Part, temperatures: Array) -> _Fit:
+    """Fit the sensitivities to temperatures (frames, p) that share one lag and one prior."""
+    columns = part.columns(temperatures)
     size = float(np.sqrt((columns[0] ** 2).mean())) + 1e-30
     freedom = part.grid.freedom
-    found = _Fit(0, 0, 0.0, np.zeros(members.shape[1]), np.inf)
+    best = _Fit(0, 0, 0.0, np.zeros(temperatures.shape[1]), np.inf)
     for drift, (project, white) in enumerate(zip(part.projects, part.white, strict=True)):
-        moved = project @ columns
-        power, vectors = np.linalg.eigh(moved.transpose(0, 2, 1) @ moved)
+        whitened = project @ columns
+        power, vectors = np.linalg.eigh(whitened.transpose(0, 2, 1) @ whitened)
         power = np.maximum(power, 0.0)
-        along = np.einsum("lpk,lp->lk", vectors, np.einsum("lnp,n->lp", moved, white))
+        along = np.einsum("lpk,lp->lk", vectors, np.einsum("lnp,n->lp", whitened, white))
         whole = float(white @ white)
         for spread in _PRIORS:
             prior = (spread / size) ** 2
@@ -214,68 +246,68 @@ def _fit(part: _Part, members: Array) -> _Fit:
             rss = np.maximum(whole - (along**2 * shrunk).sum(axis=1), 1e-30)
             score = np.log(rss) + (np.log1p(prior * power).sum(axis=1)) / freedom + part.penalty[drift]
             lag = int(np.argmin(score))
-            if score[lag] < found.score:
-                found = _Fit(drift, lag, prior, vectors[lag] @ (shrunk[lag] * along[lag]), float(score[lag]))
-    return found
+            if score[lag] < best.score:
+                best = _Fit(drift, lag, prior, vectors[lag] @ (shrunk[lag] * along[lag]), float(score[lag]))
+    return best
 
 
 def _place(parts: Sequence[_Part], fits: Sequence[_Fit], contact: Array, most: int) -> list[int]:
-    """Choose cells one by one: each raises the marginal likelihood of all channels most, under the drift and lag of the camera's fit."""
+    """Choose cells one by one: each raises the marginal likelihood of all channels most, under drift and lag of the camera fit."""
     chosen: list[int] = []
     swing = contact.std(axis=0)
-    left = []
+    states = []
     for part, fit in zip(parts, fits, strict=True):
         project = part.projects[fit.drift]
-        left.append((project.T @ project, part.columns(contact)[fit.lag]))
+        states.append((project.T @ project, part.columns(contact)[fit.lag]))
     for _ in range(most):
         gain = np.zeros(contact.shape[1])
-        for part, fit, (inverse, columns) in zip(parts, fits, left, strict=True):
+        for part, fit, (inverse, columns) in zip(parts, fits, states, strict=True):
             moved = inverse @ columns
             informed = 1.0 + fit.prior * np.einsum("ij,ij->j", columns, moved)
             whole = float(part.values @ inverse @ part.values)
             share = fit.prior * (part.values @ moved) ** 2 / informed / whole
             gain -= part.grid.freedom * np.log1p(-np.minimum(share, 1.0 - 1e-9)) + np.log(informed)
         gain[chosen] = -np.inf
-        # Among cells that these data cannot tell apart the one that warms most shows the most beside its noise.
-        chosen.append(int(np.where(gain >= gain.max() - _ALIKE_NATS, swing, -1.0).argmax()))
-        for k, (fit, (inverse, columns)) in enumerate(zip(fits, left, strict=True)):
+        # Among cells that these data cannot tell apart, the one that warms most has the highest signal over its noise.
+        chosen.append(int(np.where(gain >= gain.max() - _EQUAL_NATS, swing, -1.0).argmax()))
+        for k, (fit, (inverse, columns)) in enumerate(zip(fits, states, strict=True)):
             moved = inverse @ columns[:, chosen[-1]]
             informed = 1.0 + fit.prior * float(columns[:, chosen[-1]] @ moved)
-            left[k] = (inverse - fit.prior * np.outer(moved, moved) / informed, columns)
+            states[k] = (inverse - fit.prior * np.outer(moved, moved) / informed, columns)
     return chosen
 
 
-def _predict_left_out(tasks: Sequence[_Task], modes: Array, contact: Array, most: int) -> list[Array]:
-    """Predictions per channel, (2 + most, n): the camera, nothing, and 1..most sensors; each run by what the others teach."""
+def _predict_held_out(tasks: Sequence[_Task], modes: Array, contact: Array, most: int) -> list[Array]:
+    """Predictions per channel, (2 + most, n): the camera, nothing, and 1 to `most` sensors; each run from a fit to the others."""
     predictions = [np.zeros((2 + most, task.series.values.size)) for task in tasks]
     # Channels share their cycles, so that runs are the same stretch of the session in all of them.
     for run in _runs(tasks[0].series.values.size):
         parts = [_Part(task, ~np.isin(np.arange(task.series.values.size), run)) for task in tasks]
         camera = [_fit(part, modes) for part in parts]
         chosen = _place(parts, camera, contact, most)
-        for task, part, seen, out in zip(tasks, parts, camera, predictions, strict=True):
-            out[0, run] = (task.responses[seen.lag][run] @ modes) @ seen.coefficients
+        for task, part, by_camera, out in zip(tasks, parts, camera, predictions, strict=True):
+            out[0, run] = (task.responses[by_camera.lag][run] @ modes) @ by_camera.coefficients
             least = np.inf
             for k in range(1, most + 1):
-                few = contact[:, chosen[:k]]
-                fit = _fit(part, few)
-                # A sensor that the other runs cannot make use of is there, but not used.
+                sensors = contact[:, chosen[:k]]
+                fit = _fit(part, sensors)
+                # A sensor that does not improve the fit to the other runs is not used.
                 out[1 + k, run] = out[k, run] if k > 1 else 0.0
                 if fit.score < least:
                     least = fit.score
-                    out[1 + k, run] = (task.responses[fit.lag][run] @ few) @ fit.coefficients
+                    out[1 + k, run] = (task.responses[fit.lag][run] @ sensors) @ fit.coefficients
     return predictions
 
 
 def _exceed(task: _Task, camera: Array, other: Array) -> Excess:
-    """Mean square error of a prediction (n,) beyond the camera's within the runs, from where the two differ."""
+    """Mean square error of a prediction (n,) minus that of the camera within the runs, from the difference of the two."""
     series = task.series
-    left = series.values - camera
+    residual = series.values - camera
     delta = _within_runs(camera - other)
-    rest = null_bank(left, series.seconds, series.variance, np.ones((left.size, 1)))
-    white = rest.fitted.project @ left
+    rest = null_bank(residual, series.seconds, series.variance, np.ones((residual.size, 1)))
+    white = rest.fitted.project @ residual
     noise = float(np.sqrt(white @ white / rest.freedom))
-    value = float((delta**2).mean() + 2.0 * (delta * _within_runs(left)).mean())
+    value = float((delta**2).mean() + 2.0 * (delta * _within_runs(residual)).mean())
     return Excess(value, 2.0 * noise * float(np.sqrt(((delta @ rest.fitted.colour) ** 2).sum())) / delta.size)
 
 
@@ -284,11 +316,11 @@ def _runs(values: int) -> list[NDArray[np.int64]]:
 
 
 def _within_runs(series: Array) -> Array:
-    """A series (n,) from its mean within each run."""
+    """A series (n,) minus its mean within each run."""
     return np.concatenate([series[run] - series[run].mean() for run in _runs(series.size)])
 
 
 def _total(parts: Sequence[tuple[Excess, float]]) -> Excess:
     """Sum over channels with their weights."""
-    value = sum(weight * one.value for one, weight in parts)
-    return Excess(float(value), float(np.sqrt(sum((weight * one.u) ** 2 for one, weight in parts))))
+    value = sum(weight * excess.value for excess, weight in parts)
+    return Excess(float(value), float(np.sqrt(sum((weight * excess.u) ** 2 for excess, weight in parts))))

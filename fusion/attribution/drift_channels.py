@@ -1,9 +1,8 @@
-"""Readings reduced to drift channels per cycle, and the film sampled the way each channel samples time.
+"""Reduce the readings of every cycle to drift channels, and sample the temperature field as each channel samples time.
 
-Every cycle's readings are explained by a common shift, a stretch proportional to position, and a reversal (half the difference of
-the directions' levels, full value = forward minus backward). The reduction is least squares on the readings that exist, after each
-target's and direction's own mean; what it does to the readings it also does to the temperature at each reading's own time, so a
-channel and its regressor always share the same instants.
+The readings of a cycle are explained by a common shift, a stretch proportional to position, and a reversal (positive minus negative
+direction). The reduction is least squares on the readings that exist, after the mean of each target and direction has been subtracted.
+The same weights are applied to the temperature at the time of each reading, so that a channel and its regressor share their instants.
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ from numpy.typing import NDArray
 from fusion._typing import Array
 from fusion.errors import FusionError
 
-CHANNELS = ("common", "proportional", "reversal")
-#: Backfitting stops when no target's mean moves by more than this share of the spread of the readings.
+_CHANNELS = ("common", "proportional", "reversal")
+#: Backfitting stops when no mean of a target changes by more than this share of the standard deviation of the readings.
 _TOLERANCE = 1e-9
 _MAX_ROUNDS = 500
 #: Fewest cycles with all channels that a drift model can be fitted to.
@@ -26,21 +25,27 @@ MIN_CYCLES = 12
 
 
 class ChannelError(FusionError):
-    """The readings cannot be reduced to drift channels; the message names the cycles and what to do."""
+    """Readings that cannot be reduced to drift channels; the message names the cycles and what to do."""
 
 
 @dataclass(frozen=True)
 class DriftSeries:
-    """One drift series and how it samples the film.
+    """One drift channel with one value per cycle, and how it samples the field.
 
     Attributes
     ----------
-    name : what the series is, e.g. ``"common"`` or ``"positive 3"``
-    values : (n,) drift in um
-    variance : (n,) relative variance of each value (noise of a single reading = 1)
-    seconds : (n,) time since the film's first frame in s
-    cycle : (n,) cycle numbers
-    sampling : (n, frames) weights that turn the film (frames, cells) into the temperature that the series saw
+    name : str
+        ``"common"``, ``"proportional"`` or ``"reversal"``.
+    values : (n,) ndarray, um
+        Drift.
+    variance : (n,) ndarray
+        Variance of each value over that of a single reading.
+    seconds : (n,) ndarray, s
+        Mean instant of each cycle, since the first frame.
+    cycle : (n,) ndarray of int
+        Numbers of the cycles.
+    sampling : (n, frames) ndarray
+        Weights that turn temperatures (frames, columns) into the regressors of this channel, (n, columns).
     """
 
     name: str
@@ -53,14 +58,26 @@ class DriftSeries:
 
 @dataclass(frozen=True)
 class ClockedReadings:
-    """Deviations flattened to (cycle, reading), with the times in s since the film's first frame.
+    """Deviations flattened to (cycle, reading), with their times since the first frame; readings are directions times targets.
 
     Attributes
     ----------
-    deviation, seconds : (cycle, 2 * targets), NaN where missing or outside the film
-    design : (2 * targets, 3) common, proportional (+-1 at the ends of travel), reversal (+-1/2)
-    frame_seconds : (frames,)
-    outside_film : readings left out because no frame surrounds them
+    deviation : (cycle, readings) ndarray, um
+        NaN where missing, or outside the frames' time.
+    seconds : (cycle, readings) ndarray, s
+        NaN at the same places.
+    design : (readings, 3) ndarray
+        Common (1), proportional (-1 to +1 over the travel), reversal (+1/2 and -1/2).
+    cycle : (cycle,) ndarray of int
+        Numbers of the cycles.
+    directions : tuple of str
+        Names of the directions, in the order of the readings.
+    targets : (targets,) ndarray of int
+        Numbers of the targets.
+    frame_seconds : (frames,) ndarray, s
+        Times of the frames since the first one.
+    outside_frames : int
+        Number of readings left out because no frame was taken around them.
     """
 
     deviation: Array
@@ -70,24 +87,71 @@ class ClockedReadings:
     directions: tuple[str, ...]
     targets: NDArray[np.int64]
     frame_seconds: Array
-    outside_film: int
+    outside_frames: int
 
 
-def read_clock(fused: xr.Dataset, frame_time: NDArray[np.datetime64]) -> ClockedReadings:
-    """Put deviations (cycle, direction, target) on the film's clock; readings outside the film are left out and counted."""
+@dataclass(frozen=True)
+class TargetSeries:
+    """The readings of every target and direction as series of their own, over the cycles.
+
+    Attributes
+    ----------
+    directions : tuple of str, (series,)
+        Direction of each series.
+    targets : (series,) ndarray of int
+        Number of its target.
+    values : (series, cycle) ndarray, um
+        Deviations, NaN where missing.
+    seconds : (cycle,) ndarray, s
+        Mean instant of each cycle, since the first frame.
+    sampling : (cycle, frames) ndarray
+        Weights that turn temperatures (frames, columns) into temperatures at these instants.
+    """
+
+    directions: tuple[str, ...]
+    targets: NDArray[np.int64]
+    values: Array
+    seconds: Array
+    sampling: Array
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Direction and number of the target, e.g. ``"positive 3"``."""
+        return tuple(f"{direction} {target}" for direction, target in zip(self.directions, self.targets, strict=True))
+
+
+def clock_readings(fused: xr.Dataset, frame_time: NDArray[np.datetime64]) -> ClockedReadings:
+    """Place deviations on the clock of the frames; readings outside the frames' time are left out and counted.
+
+    Parameters
+    ----------
+    fused : Dataset
+        ``deviation`` (um) and ``time`` over cycle, direction and target, and ``position`` (mm) over target.
+    frame_time : (frames,) ndarray of datetime64[ns]
+        Times of the frames, increasing.
+
+    Returns
+    -------
+    ClockedReadings
+
+    Raises
+    ------
+    ChannelError
+        If there are fewer than 12 frames, or they are not in order of time.
+    """
     start = frame_time[0]
     frame_seconds = (frame_time - start) / np.timedelta64(1, "s")
     if frame_seconds.size < MIN_CYCLES or (np.diff(frame_seconds) <= 0).any():
         raise ChannelError(
-            f"the film has {frame_seconds.size} frames in order of time; correlation needs at least {MIN_CYCLES}, each "
-            "later than the one before: check the times in the frames"
+            f"{frame_seconds.size} frames; correlation needs at least {MIN_CYCLES} in order of time, each later than the one before: "
+            "check the times in the frames"
         )
     ordered = fused.transpose("cycle", "direction", "target", ...)
     deviation = ordered["deviation"].values.astype(float)
     seconds = (ordered["time"].values - start) / np.timedelta64(1, "s")
     cycles, directions, targets = deviation.shape
     seen = np.isfinite(deviation) & np.isfinite(seconds)
-    # A reading in the same frame interval beyond either end is held at that end's temperature; further out nothing is known.
+    # A reading up to one frame interval beyond either end gets the temperature of that end; further out nothing is known.
     slack = float(np.median(np.diff(frame_seconds)))
     inside = (seconds >= -slack) & (seconds <= frame_seconds[-1] + slack)
     outside = int((seen & ~inside).sum())
@@ -105,23 +169,23 @@ def read_clock(fused: xr.Dataset, frame_time: NDArray[np.datetime64]) -> Clocked
         directions=tuple(str(name) for name in ordered["direction"].values),
         targets=ordered["target"].values.astype(np.int64),
         frame_seconds=frame_seconds,
-        outside_film=outside,
+        outside_frames=outside,
     )
 
 
 def _usable_design(readings: ClockedReadings) -> tuple[Array, tuple[str, ...]]:
-    """Columns that these readings can tell apart: one direction alone has no reversal, one target no proportional part."""
+    """Channels that these readings determine: one direction alone has no reversal, one target no proportional part."""
     observed = np.isfinite(readings.deviation).any(axis=0)
     kept: list[int] = []
-    for column in range(len(CHANNELS)):
+    for column in range(len(_CHANNELS)):
         trial = readings.design[observed][:, [*kept, column]]
         if observed.any() and np.linalg.matrix_rank(trial) == len(kept) + 1:
             kept.append(column)
-    return readings.design[:, kept], tuple(CHANNELS[column] for column in kept)
+    return readings.design[:, kept], tuple(_CHANNELS[column] for column in kept)
 
 
 def _backfit(deviation: Array, reducers: list[Array], design: Array) -> Array:
-    """Each target's mean (readings,) after every cycle's channels are taken out; exact at once for complete data."""
+    """Mean of each target and direction (readings,) without the channels of the cycles; one round is exact for complete data."""
     observed = np.isfinite(deviation)
     counts = np.maximum(observed.sum(axis=0), 1)
     filled = np.where(observed, deviation, 0.0)
@@ -140,12 +204,26 @@ def _backfit(deviation: Array, reducers: list[Array], design: Array) -> Array:
 def reduce_channels(readings: ClockedReadings) -> list[DriftSeries]:
     """Return the drift channels that the readings determine, one value per cycle.
 
-    Cycles in which the channels cannot be told apart (too few readings) are left out of every channel.
+    Parameters
+    ----------
+    readings : ClockedReadings
+        Deviations on the clock of the frames.
+
+    Returns
+    -------
+    list of DriftSeries
+        Common, proportional and reversal, as far as there are several targets and both directions. Cycles with too few readings for all
+        of them are left out of each.
 
     Raises
     ------
     ChannelError
-        if fewer than 12 cycles remain.
+        If fewer than 12 cycles remain.
+
+    Notes
+    -----
+    Model: deviation = mean of its target and direction + design @ channels of its cycle + noise. Means and channels are estimated in
+    turn by least squares (backfitting; Buja, Hastie and Tibshirani 1989, Ann. Stat. 17, 453) until they settle.
     """
     design, names = _usable_design(readings)
     observed = np.isfinite(readings.deviation)
@@ -157,7 +235,7 @@ def reduce_channels(readings: ClockedReadings) -> list[DriftSeries]:
         reducers.append(np.linalg.pinv(part))
     if complete.sum() < MIN_CYCLES:
         raise ChannelError(
-            f"only {int(complete.sum())} of {observed.shape[0]} cycles hold enough readings inside the film; correlation "
+            f"only {int(complete.sum())} of {observed.shape[0]} cycles hold enough readings inside the frames' time; correlation "
             f"needs {MIN_CYCLES}: measure more cycles, or check the clock offset between camera and laser"
         )
     kept = np.flatnonzero(complete)
@@ -182,36 +260,49 @@ def reduce_channels(readings: ClockedReadings) -> list[DriftSeries]:
     return series
 
 
-def target_table(readings: ClockedReadings) -> tuple[list[str], Array, Array, Array]:
-    """Every direction and target with at least 12 readings as a row over the cycles' mean instants.
+def target_series(readings: ClockedReadings) -> TargetSeries:
+    """Return every direction and target with at least 12 readings as a series over the cycles.
+
+    Parameters
+    ----------
+    readings : ClockedReadings
+        Deviations on the clock of the frames.
 
     Returns
     -------
-    names, values (series, cycle) in um with NaN where missing, seconds (cycle,), sampling (cycle, frames)
+    TargetSeries
+        All series at the mean instant of each cycle, so that they share one sampling of the field.
+
+    Raises
+    ------
+    ChannelError
+        If no target has 12 readings inside the frames' time.
     """
     seen = np.isfinite(readings.deviation)
     kept = np.flatnonzero(seen.any(axis=1))
     columns = np.flatnonzero(seen.sum(axis=0) >= MIN_CYCLES)
     if not columns.size:
         raise ChannelError(
-            f"no target has readings in {MIN_CYCLES} cycles inside the film; measure more cycles, or check the clock offset"
+            f"no target has readings in {MIN_CYCLES} cycles inside the frames' time; measure more cycles, or check the clock offset"
         )
     seconds = np.nanmean(readings.seconds[kept], axis=1)
-    names = [
-        f"{readings.directions[column // readings.targets.size]} {readings.targets[column % readings.targets.size]}"
-        for column in columns
-    ]
-    sampling = _sample(seconds[:, None], np.ones((seconds.size, 1)), readings.frame_seconds)
-    return names, readings.deviation[np.ix_(kept, columns)].T, seconds, sampling
+    direction, target = np.divmod(columns, readings.targets.size)
+    return TargetSeries(
+        directions=tuple(readings.directions[k] for k in direction),
+        targets=readings.targets[target],
+        values=readings.deviation[np.ix_(kept, columns)].T,
+        seconds=seconds,
+        sampling=_sample(seconds[:, None], np.ones((seconds.size, 1)), readings.frame_seconds),
+    )
 
 
 def _sample(seconds: Array, weights: Array, frame_seconds: Array) -> Array:
-    """Weights (n, frames) of linear interpolation at seconds (n, readings), summed over readings with their weights."""
-    known = np.isfinite(seconds)
-    clipped = np.clip(np.where(known, seconds, frame_seconds[0]), frame_seconds[0], frame_seconds[-1])
+    """Weights (n, frames) of linear interpolation at seconds (n, readings), summed over the readings with their weights."""
+    present = np.isfinite(seconds)
+    clipped = np.clip(np.where(present, seconds, frame_seconds[0]), frame_seconds[0], frame_seconds[-1])
     before = np.clip(np.searchsorted(frame_seconds, clipped, side="right") - 1, 0, frame_seconds.size - 2)
     share = (clipped - frame_seconds[before]) / np.diff(frame_seconds)[before]
-    weights = np.where(known, weights, 0.0)
+    weights = np.where(present, weights, 0.0)
     rows = np.broadcast_to(np.arange(seconds.shape[0])[:, None], seconds.shape)
     sampling = np.zeros((seconds.shape[0], frame_seconds.size))
     np.add.at(sampling, (rows, before), weights * (1.0 - share))

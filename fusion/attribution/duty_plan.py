@@ -1,9 +1,11 @@
-"""A duty schedule for a new test: which switching tells the machine's heat sources apart, in how much time, with what power.
+"""Plan the duty schedule of a new test: which switching separates the heat sources of the machine, in how much time, with what power.
 
-Power is computed, not promised: for schedules drawn from the law, the response of each source is whitened by the drift that the axis
-shows by itself; its size beside the noise decides whether the randomisation test will find it in one channel, and what of it the
-other sources' responses cannot imitate says whether it will be told from them. The proposed schedule is one plain draw from the law:
-a hand-picked one might separate better, but would no longer allow the exact test.
+For schedules drawn from the random law, the response of each source is whitened by the expected drift of the axis. Its size over the noise
+gives the power of the randomisation test in one channel, and the share of it that is not collinear with the responses of the other sources
+says whether it will be told from them. The proposed schedule is one plain draw from the law: a selected one might separate better, but
+would no longer allow the exact test.
+
+Source: docs/method/attribution.md.
 """
 
 from __future__ import annotations
@@ -18,35 +20,48 @@ from scipy import stats
 
 from fusion._typing import Array
 from fusion.alignment.first_order_lag import respond
-from fusion.attribution.randomised_duty import GRID_S, LEVEL, DutyLaw
+from fusion.attribution.family_wise import LEVEL
+from fusion.attribution.randomised_duty import GRID_S, DutyLaw
 from fusion.errors import FusionError
 from interferometry.drift.state_space import drift_system
 
 #: Candidate mean dwells, s, and test durations, h.
-DWELLS_S = (600.0, 1200.0, 1800.0, 3600.0, 5400.0)
-HOURS = (3.0, 5.0, 7.0, 10.0, 14.0, 20.0)
+_DWELLS_S = (600.0, 1200.0, 1800.0, 3600.0, 5400.0)
+_HOURS = (3.0, 5.0, 7.0, 10.0, 14.0, 20.0)
 _SCHEDULES = 24
-#: Searching the response bank costs about as much as this many independent tests per source.
+#: The search over the responses is worth about as many independent tests per source.
 _EFFECTIVE_RESPONSES = 4.0
 
 
 class DutyPlanError(FusionError):
-    """No schedule can be proposed; the message says why."""
+    """A schedule that cannot be proposed; the message says why."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What is known of the machine and the measurement before the test.
+    """Machine and measurement as expected before the test.
 
     Attributes
     ----------
-    sources : names of the heat sources that can be switched
-    time_constants_s : thermal time constant of each source
-    effect_um : drift that one source at full duty should at least cause to be found
-    drift_um_per_sqrt_h : random walk of the axis by itself (the report's unexplained drift)
-    noise_um : noise of one cycle's mean
-    cycle_s : length of one cycle
-    lag_s : mechanical lag behind the source's temperature
+    sources : tuple of str
+        Names of the heat sources that can be switched.
+    time_constants_s : tuple of float, s
+        Thermal time constant of each source.
+    effect_um : float, um
+        Smallest drift of one source at full duty that shall be detected.
+    drift_um_per_sqrt_h : float, um
+        Standard deviation over one hour of the random walk of the axis (the unexplained drift of the report).
+    noise_um : float, um
+        Standard uncertainty of the mean of one cycle.
+    cycle_s : float, s
+        Length of one cycle.
+    lag_s : float, s
+        Time constant between the temperature of a source and the drift.
+
+    Raises
+    ------
+    DutyPlanError
+        If sources and time constants differ in number, or a quantity is not greater than 0.
     """
 
     sources: tuple[str, ...]
@@ -71,8 +86,8 @@ def plan_duty(
     machine: Machine,
     *,
     power: float = 0.8,
-    hours: Sequence[float] = HOURS,
-    dwells_s: Sequence[float] = DWELLS_S,
+    hours: Sequence[float] = _HOURS,
+    dwells_s: Sequence[float] = _DWELLS_S,
     least_dwell_s: float = 300.0,
     seed: int = 0,
 ) -> xr.Dataset:
@@ -80,31 +95,32 @@ def plan_duty(
 
     Parameters
     ----------
+    machine : Machine
+        Sources, drift and noise.
     power : float
-        Wanted probability to name the weakest source.
-    hours, dwells_s : candidates
-    least_dwell_s : float
+        Required probability to detect the weakest source.
+    hours : sequence of float, h
+        Test durations to choose from.
+    dwells_s : sequence of float, s
+        Mean dwells to choose from.
+    least_dwell_s : float, s
         Shortest time between two switchings that the machine tolerates.
     seed : int
-        Seed of the schedule; another seed is another, equally valid schedule.
+        Seed of the schedule; another seed gives another, equally valid schedule.
 
     Returns
     -------
     Dataset
-        ``duty`` (time_s, source) of the shortest test whose power is enough (of the most powerful one if none is; attribute
-        ``enough``), ``power`` (hours, dwell) of the weakest source, ``separation`` (hours, dwell): share of each response's
-        information left beside the others, 0 (cannot be told apart) to 1; chosen ``test_hours``, ``mean_dwell`` (s).
+        ``duty`` (time_s, source) of the shortest test with enough power (of the most powerful one if none has; attribute ``enough``),
+        ``power`` (hours, dwell) for the weakest source, ``separation`` (hours, dwell): share of a response that is not collinear with the
+        others, from 0 to 1; the chosen ``test_hours`` (h), ``mean_dwell`` and ``least_dwell`` (s).
 
     Raises
     ------
     DutyPlanError
-        if no candidate dwell is longer than the least one.
+        If no mean dwell is longer than the least one.
     """
-    usable = [dwell for dwell in dwells_s if dwell > least_dwell_s]
-    if not usable:
-        raise DutyPlanError(
-            f"no mean dwell of {list(dwells_s)} s is longer than the least dwell of {least_dwell_s:g} s; allow longer ones"
-        )
+    usable = _usable_dwells(dwells_s, least_dwell_s)
     rng = np.random.default_rng(seed)
     table = np.zeros((len(hours), len(usable)))
     separation = np.zeros_like(table)
@@ -137,8 +153,28 @@ def plan_duty(
     )
 
 
+def _usable_dwells(dwells_s: Sequence[float], least_dwell_s: float) -> list[float]:
+    usable = [dwell for dwell in dwells_s if dwell > least_dwell_s]
+    if not usable:
+        raise DutyPlanError(
+            f"no mean dwell of {list(dwells_s)} s is longer than the least dwell of {least_dwell_s:g} s; allow longer ones"
+        )
+    return usable
+
+
 def switchings(plan: xr.Dataset) -> list[tuple[float, str, str]]:
-    """The proposed schedule as a list to work through: (minutes since the start, source, "on" or "off")."""
+    """Return the proposed schedule as a list of switchings.
+
+    Parameters
+    ----------
+    plan : Dataset
+        Result of `plan_duty`.
+
+    Returns
+    -------
+    list of (float, str, str)
+        Time since the start in min, source, and ``"on"`` or ``"off"``, sorted by time; the first states are at 0 min.
+    """
     events = []
     for name in plan["source"].values:
         course = plan["duty"].sel(source=name).values
@@ -155,7 +191,7 @@ def _assess(machine: Machine, hours: float, law: DutyLaw, rng: np.random.Generat
     system = drift_system(cycles, np.ones((cycles.size, 1)), order=1, ratios=np.array([ratio]))
     white, _ = system.whiten(np.eye(cycles.size))
     trend = white @ np.column_stack([np.ones_like(cycles), cycles - cycles.mean()])
-    # Responses (cycles, schedules, sources): each source behind its own body, all behind the structure's lag.
+    # Responses (cycles, schedules, sources): each source warms its own body, and the structure lags behind all of them.
     columns = np.stack(
         [_drift_responses(machine, tau, law, fine, cycles, rng) for tau in machine.time_constants_s], axis=2
     )
@@ -163,12 +199,11 @@ def _assess(machine: Machine, hours: float, law: DutyLaw, rng: np.random.Generat
     powers = np.zeros((_SCHEDULES, len(machine.sources)))
     separations = np.zeros_like(powers)
     for k in range(_SCHEDULES):
-        seen = white @ columns[:, k]
-        free = _left_over(seen, trend)
+        free = _without(white @ columns[:, k], trend)
         size = (free**2).sum(axis=0)
         powers[k] = stats.norm.sf(np.sqrt(threshold) - machine.effect_um * np.sqrt(size) / machine.noise_um)
         for j in range(size.size):
-            alone = _left_over(free[:, j], np.delete(free, j, axis=1)) if size.size > 1 else free[:, j]
+            alone = _without(free[:, j], np.delete(free, j, axis=1)) if size.size > 1 else free[:, j]
             separations[k, j] = (alone @ alone) / max(float(size[j]), 1e-30)
     return float(powers.mean(axis=0).min()), float(separations.mean(axis=0).min())
 
@@ -178,11 +213,11 @@ def _drift_responses(
 ) -> Array:
     """Drift per unit effect at the cycles under many schedules of one source, (cycles, schedules)."""
     courses = np.column_stack([law.course(fine, rng) for _ in range(_SCHEDULES)])
-    moved = respond(respond(courses, fine, time_constant_s=time_constant_s), fine, time_constant_s=machine.lag_s)
-    return moved[np.searchsorted(fine, cycles)]
+    drift = respond(respond(courses, fine, time_constant_s=time_constant_s), fine, time_constant_s=machine.lag_s)
+    return drift[np.searchsorted(fine, cycles)]
 
 
-def _left_over(columns: Array, others: Array) -> NDArray[np.float64]:
-    """Columns with everything that the others explain taken out."""
+def _without(columns: Array, others: Array) -> NDArray[np.float64]:
+    """Residuals of columns (n, ...) after regression on others (n, k)."""
     basis, _ = np.linalg.qr(others)
     return np.asarray(columns - basis @ (basis.T @ columns), float)

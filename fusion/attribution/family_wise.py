@@ -1,7 +1,8 @@
-"""The test behind the maps: many temperatures as sources of several drift series, with one family-wise error.
+"""Test many temperatures as sources of several drift series, with one family-wise error probability.
 
-Temperatures come in sets (cells, thermal modes, regions). All sets share the redrawn nulls and one error probability: for every set
-and series the maximum statistic is measured in units of its own null, and the largest of these is compared with its null.
+Temperatures come in sets (cells, thermal modes, regions). All sets share the series simulated under the null hypothesis and one error
+probability: for every set and series the maximum statistic is measured in units of its own null distribution, and the largest of these is
+compared with its null distribution.
 
 Sources: Westfall and Young (1993), *Resampling-based multiple testing* (maxima over tests of different kind); Benjamini and
 Hochberg (1995), J. R. Stat. Soc. B 57, 289.
@@ -32,32 +33,34 @@ from fusion.attribution.likelihood_ratio import (
     tiles,
     whiten_series,
 )
-from fusion.attribution.warm_up import Excitation, warm_up_columns
+from fusion.attribution.warm_up import Excitation, nuisance_columns
 
-#: Time constants of the first-order lags, s.
+#: Time constants of the first-order lags between temperature and drift, s.
 LAGS_S = (0.0, 600.0, 1200.0, 2400.0, 3600.0, 5400.0)
-#: Fresh nulls on which the rate of false alarms is measured.
+#: Number of simulated series on which the false alarm rate is measured.
 CHECKS = 199
 #: Family-wise level of the verdicts.
 LEVEL = 0.05
-#: Standard normal quantile of 0.8: an effect is found with 80 % power this many uncertainties above the threshold.
+#: Standard normal quantile of 0.8: an effect this many standard uncertainties above the threshold is detected with 80 % power.
 _POWER_80 = 0.8416
-#: Bins of the pooled null distribution of one cell's statistic.
+#: Bins of the pooled null distribution of the statistic of one cell.
 _BINS = np.concatenate([np.arange(0.0, 40.0, 0.1), [np.inf]])
 
-#: Mean length of the runs of whitened residuals that stay together when they are put into other orders, as a share of the session.
-#: Switched loads leave traces of several cycles in the residuals; single values in free order gave twice the promised false alarms there.
+#: Mean length of the blocks of whitened residuals that are permuted, as a share of the session. Switched loads leave traces of several
+#: cycles in the residuals; permuting single values gave twice the nominal rate of false alarms there.
 _RUN_SHARE = 0.1
 
 
 @dataclass(frozen=True)
 class FieldSeries:
-    """Temperatures to test: columns over time.
+    """Temperatures to test, one candidate per column.
 
     Attributes
     ----------
-    seconds : (frames,) s since the first frame
-    values : (frames, columns) temperature minus its mean over time, K
+    seconds : (frames,) ndarray, s
+        Time since the first frame.
+    values : (frames, columns) ndarray, K
+        Temperature minus its mean over time.
     """
 
     seconds: Array
@@ -66,16 +69,28 @@ class FieldSeries:
 
 @dataclass(frozen=True)
 class FamilyTest:
-    """What the test of one set of temperatures found; columns are cells, modes or regions.
+    """Result for one set of temperatures; columns are cells, modes or regions.
 
     Attributes
     ----------
-    names : (channels,) with "joint" (common and proportional together) last where both exist
-    statistic, lag_index : (channels, columns) likelihood ratio and the lag that it was reached at
-    p_value, q_value : (channels, columns) family-wise over everything tested, and false-discovery rate within the channel
-    coefficient, coefficient_u, detectable : (channels, columns) um per K
-    threshold : (channels,) of the statistic at the family-wise level
-    false_alarm_rate : share of fresh nulls in which anything of this set passed its threshold
+    names : tuple of str, (channels,)
+        Drift channels, with ``"joint"`` (common and proportional together) last where both exist.
+    statistic : (channels, columns) ndarray
+        Profile likelihood ratio at the best lag.
+    lag_index : (channels, columns) ndarray of int
+        Index of that lag.
+    p_value : (channels, columns) ndarray
+        Family-wise p-value over everything tested.
+    q_value : (channels, columns) ndarray
+        False-discovery rate within the channel.
+    coefficient, coefficient_u : (channels, columns) ndarray, um/K
+        Sensitivity of the drift and its standard uncertainty; of the joint channel at the far end of travel.
+    detectable : (channels, columns) ndarray, um/K
+        Detection limit: the sensitivity that is detected with 80 % power.
+    threshold : (channels,) ndarray
+        Statistic at the family-wise level.
+    false_alarm_rate : float
+        Share of the fresh simulated series in which any column of this set passed its threshold; NaN without such series.
     """
 
     names: tuple[str, ...]
@@ -92,14 +107,18 @@ class FamilyTest:
 
 @dataclass(frozen=True)
 class AttributionResult:
-    """What the test of all sets found.
+    """Result for all sets together.
 
     Attributes
     ----------
-    sets : findings per set, in the order given
-    banks : fitted null of every series
-    draws : redrawn nulls behind the p values
-    false_alarm_rate : share of fresh nulls in which anything of any set passed
+    sets : mapping of str to FamilyTest
+        Result per set, in the order given.
+    banks : tuple of NullBank
+        Fitted null model of every series.
+    draws : int
+        Number of simulated series behind the p-values.
+    false_alarm_rate : float
+        Share of the fresh simulated series in which any column of any set passed.
     """
 
     sets: Mapping[str, FamilyTest]
@@ -109,9 +128,9 @@ class AttributionResult:
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
-def evaluate_films(
+def evaluate_candidates(
     series: Sequence[DriftSeries],
-    films: Mapping[str, FieldSeries],
+    candidates: Mapping[str, FieldSeries],
     excitation: Excitation,
     *,
     lags_s: Sequence[float] = LAGS_S,
@@ -122,67 +141,121 @@ def evaluate_films(
     rng: np.random.Generator,
     progress: Callable[[float], None] | None = None,
 ) -> AttributionResult:
-    """Test all columns of all films as sources of all series, with one family-wise error over films, columns, lags and series.
-
-    The first two series, where they are "common" and "proportional", are also tested together at the same lag. The first `draws`
-    nulls (the series' own whitened residuals in other orders) set the thresholds, `checks` fresh ones (Gaussian) measure what passes.
+    """Test all columns of all sets as sources of all series, with one family-wise error over sets, columns, lags and series.
 
     Parameters
     ----------
-    series : drift series, all on the films' clock
-    films : sets of temperatures by name, all at the same instants
-    favour : sets that get a larger share of the error probability, by how much sooner they pass: in units of the distance from the
-        median of a set's null maxima to their 95 % point
-    beside : for every series, columns (n, k) that every hypothesis contains as well: sources that are taken as given
+    series : sequence of DriftSeries
+        Drift channels on the clock of the field. The first two, where they are ``"common"`` and ``"proportional"``, are also tested
+        together at the same lag.
+    candidates : mapping of str to FieldSeries
+        Sets of temperatures by name, all at the same instants.
+    excitation : Excitation
+        How the field was excited; decides whether a warm-up is part of every hypothesis.
+    lags_s : sequence of float, s
+        Time constants of the first-order lags.
+    draws : int
+        Number of simulated series that set the thresholds (the whitened residuals of the series, block-permuted).
+    checks : int
+        Number of fresh simulated series (Gaussian innovations) on which the false alarm rate is measured.
+    favour : mapping of str to float
+        Sets with a larger share of the error probability: by how much sooner they pass, in units of the distance from the median of
+        their null maxima to the 95 % point.
+    beside : sequence of (n, k) ndarray, K
+        For every series, regressors that every hypothesis contains as well: sources that are taken as given.
+    rng : Generator
+        Source of the simulated series.
+    progress : callable, optional
+        Called with the finished share, 0 to 1.
+
+    Returns
+    -------
+    AttributionResult
     """
-    seconds = next(iter(films.values())).seconds
-    operators = lag_operators(seconds, lags_s)
-    given = beside or [np.empty((one.values.size, 0)) for one in series]
-    banks = tuple(
-        null_bank(
-            one.values, one.seconds, one.variance, np.column_stack([nuisance_columns(one.seconds, excitation), columns])
-        )
-        for one, columns in zip(series, given, strict=True)
-    )
-    sources = [
-        _Source(bank, whiten_series(bank, stack), _seen_through(one, operators))
-        for one, bank, stack in zip(series, banks, _draw(series, banks, draws, checks, rng), strict=True)
-    ]
-    names = [one.name for one in series]
+    sources = _prepare_sources(series, candidates, excitation, lags_s, beside, draws, checks, rng)
+    names = [channel.name for channel in series]
     if names[:2] == ["common", "proportional"]:
         names.append("joint")
-    whole = sum(film.values.shape[1] for film in films.values())
+    columns = sum(field.values.shape[1] for field in candidates.values())
     tallies, done = [], 0
-    for film in films.values():
-        tallies.append(_Tally(len(names), film.values.shape[1], draws + checks))
-        for cells in _test_film(sources, film, len(lags_s), tallies[-1]):
+    for field in candidates.values():
+        tallies.append(_Tally(len(names), field.values.shape[1], draws + checks))
+        for cells in _test_field(sources, field, len(lags_s), tallies[-1]):
             if progress is not None:
-                progress((done + cells.stop) / whole)
-        done += film.values.shape[1]
+                progress((done + cells.stop) / columns)
+        done += field.values.shape[1]
+    return _conclude(names, tallies, candidates, favour, sources, draws, checks)
+
+
+def _prepare_sources(
+    series: Sequence[DriftSeries],
+    candidates: Mapping[str, FieldSeries],
+    excitation: Excitation,
+    lags_s: Sequence[float],
+    beside: Sequence[Array],
+    draws: int,
+    checks: int,
+    rng: np.random.Generator,
+) -> list[_Source]:
+    """Fit the null model of every series, simulate under it, and prepare the regressors."""
+    operators = lag_operators(next(iter(candidates.values())).seconds, lags_s)
+    given = beside or [np.empty((channel.values.size, 0)) for channel in series]
+    banks = [
+        null_bank(
+            channel.values,
+            channel.seconds,
+            channel.variance,
+            np.column_stack([nuisance_columns(channel.seconds, excitation), columns]),
+        )
+        for channel, columns in zip(series, given, strict=True)
+    ]
+    return [
+        _Source(bank, whiten_series(bank, stack), _lagged_sampling(channel, operators))
+        for channel, bank, stack in zip(series, banks, _draw(series, banks, draws, checks, rng), strict=True)
+    ]
+
+
+def _conclude(
+    names: Sequence[str],
+    tallies: Sequence[_Tally],
+    candidates: Mapping[str, FieldSeries],
+    favour: Mapping[str, float],
+    sources: Sequence[_Source],
+    draws: int,
+    checks: int,
+) -> AttributionResult:
+    """Turn the tallies of all sets into p-values, thresholds and false alarm rates."""
     maxima = np.concatenate([tally.maxima for tally in tallies])
-    ease = np.repeat([favour.get(name, 0.0) for name in films], len(names))
+    ease = np.repeat([favour.get(name, 0.0) for name in candidates], len(names))
     p_values, thresholds = _family_wise([row for tally in tallies for row in tally.statistic], maxima[:, :draws], ease)
-    alarms = (maxima[:, draws:] > thresholds[:, None]).reshape(len(films), len(names), checks)
-    rows = [slice(k * len(names), (k + 1) * len(names)) for k in range(len(films))]
+    alarms = (maxima[:, draws:] > thresholds[:, None]).reshape(len(candidates), len(names), checks)
+    rows = [slice(k * len(names), (k + 1) * len(names)) for k in range(len(candidates))]
     return AttributionResult(
         sets={
             name: tally.finish(names, np.stack(p_values[row]), thresholds[row], _rate(alarms[k]))
-            for k, (name, tally, row) in enumerate(zip(films, tallies, rows, strict=True))
+            for k, (name, tally, row) in enumerate(zip(candidates, tallies, rows, strict=True))
         },
-        banks=banks,
+        banks=tuple(source.bank for source in sources),
         draws=draws,
-        false_alarm_rate=_rate(alarms.reshape(len(films) * len(names), checks)),
+        false_alarm_rate=_rate(alarms.reshape(len(candidates) * len(names), checks)),
     )
 
 
 def _rate(alarms: NDArray[np.bool_]) -> float:
-    """Share of the nulls (rows, nulls) in which any row raised an alarm; NaN without nulls."""
+    """Share of the simulated series (rows, series) in which any row raised an alarm; NaN without series."""
     return float(alarms.any(axis=0).mean()) if alarms.size else float("nan")
 
 
 @dataclass(frozen=True)
 class _Source:
-    """One series ready to be tested: its nulls, all its draws whitened, and how it sees the film under every lag."""
+    """One drift series ready to be tested.
+
+    Attributes
+    ----------
+    bank : null models of the series
+    whitened : the series and its simulated ones, whitened
+    response : (lags, n, frames) from temperatures to the regressors under every lag
+    """
 
     bank: NullBank
     whitened: Whitened
@@ -190,18 +263,18 @@ class _Source:
 
 
 class _Tally:
-    """Running results over the tiles."""
+    """Running results of one set over its tiles."""
 
     def __init__(self, channels: int, columns: int, nulls: int) -> None:
         self.statistic = np.zeros((channels, columns))
         self.lag_index = np.zeros((channels, columns), np.int64)
         self.maxima = np.zeros((channels, nulls))
         self.pooled = np.zeros((channels, _BINS.size - 1))
-        # Coefficient, its uncertainty, and its uncertainty under the fitted null.
+        # Coefficient, its standard uncertainty, and its standard uncertainty under the fitted null model.
         self.effects = np.zeros((3, channels, columns))
 
     def finish(self, names: Sequence[str], p_value: Array, threshold: Array, false_alarm_rate: float) -> FamilyTest:
-        """Findings of the set, once its p values (channels, columns) and thresholds (channels,) are known."""
+        """Result of the set, from its p-values (channels, columns) and thresholds (channels,)."""
         return FamilyTest(
             names=tuple(names),
             statistic=self.statistic,
@@ -216,7 +289,7 @@ class _Tally:
         )
 
     def add(self, channel: int, cells: slice, ratio: Array32, chosen: NDArray[np.int64], effects: Array) -> None:
-        """Enter ratios (1 + nulls, cells, lags) of one channel, the chosen lags (cells,) and the effects there (3, cells)."""
+        """Enter ratios (1 + simulated, cells, lags) of one channel, the chosen lags (cells,) and the effects there (3, cells)."""
         best = ratio.max(axis=2)
         self.statistic[channel, cells] = best[0]
         self.lag_index[channel, cells] = chosen
@@ -227,34 +300,34 @@ class _Tally:
             self.pooled[channel] += np.bincount(bins.ravel(), minlength=_BINS.size - 1)
 
 
-def _seen_through(series: DriftSeries, operators: Sequence[Array]) -> Array32:
-    """How a series sees the film under every lag, (lags, n, frames)."""
+def _lagged_sampling(series: DriftSeries, operators: Sequence[Array]) -> Array32:
+    """How a series samples the field under every lag, (lags, n, frames)."""
     return np.stack([series.sampling @ operator for operator in operators]).astype(np.float32)
 
 
-def _test_film(sources: Sequence[_Source], film: FieldSeries, lags: int, tally: _Tally) -> Iterator[slice]:
-    """Test a film tile by tile; yields each slice of columns that is done."""
-    values = film.values.astype(np.float32)
+def _test_field(sources: Sequence[_Source], field: FieldSeries, lags: int, tally: _Tally) -> Iterator[slice]:
+    """Test a set tile by tile; yields each slice of columns that is done."""
+    values = field.values.astype(np.float32)
     for tile in tiles(values.shape[1] * lags, lags):
         cells = slice(tile.start // lags, tile.stop // lags)
         _test_tile(sources, values[:, cells], cells, lags, tally)
         yield cells
 
 
-def _test_tile(sources: Sequence[_Source], film32: Array32, cells: slice, lags: int, tally: _Tally) -> None:
+def _test_tile(sources: Sequence[_Source], field: Array32, cells: slice, lags: int, tally: _Tally) -> None:
     """Test a tile of cells against every series, and the first two together where the tally has room for that."""
     count = cells.stop - cells.start
-    regressors = [_respond_tile(source.response, film32) for source in sources]
+    regressors = [_respond_tile(source.response, field) for source in sources]
     ratios = [
-        likelihood_ratios(source.bank, source.whitened, moved).reshape(-1, count, lags)
-        for source, moved in zip(sources, regressors, strict=True)
+        likelihood_ratios(source.bank, source.whitened, columns).reshape(-1, count, lags)
+        for source, columns in zip(sources, regressors, strict=True)
     ]
-    members = [[k] for k in range(len(sources))]
+    summed = [[k] for k in range(len(sources))]
     if tally.statistic.shape[0] > len(sources):
         ratios.append(ratios[0] + ratios[1])
         # The joint effect is that at the far end of travel: common plus proportional at +1.
-        members.append([0, 1])
-    for channel, (ratio, together) in enumerate(zip(ratios, members, strict=True)):
+        summed.append([0, 1])
+    for channel, (ratio, together) in enumerate(zip(ratios, summed, strict=True)):
         chosen = ratio[0].argmax(axis=1)
         columns = np.arange(count) * lags + chosen
         parts = np.stack([_stack(estimate_effects(sources[k].bank, regressors[k][:, columns])) for k in together])
@@ -265,33 +338,25 @@ def _stack(estimate: Estimate) -> Array:
     return np.stack([estimate.coefficient, estimate.coefficient_u, estimate.null_u])
 
 
-def nuisance_columns(seconds: Array, excitation: Excitation) -> Array:
-    """Columns of every hypothesis: level and trend, and where a warm-up dominates also free exponentials."""
-    centred = (seconds - seconds.mean()) / max(float(np.ptp(seconds)), 1e-9)
-    columns = np.column_stack([np.ones_like(seconds), centred])
-    if not excitation.protected:
-        return columns
-    return np.column_stack([columns, warm_up_columns(seconds)])
-
-
 def _draw(
     series: Sequence[DriftSeries], banks: Sequence[NullBank], draws: int, checks: int, rng: np.random.Generator
 ) -> list[Array]:
-    """The measured series, `draws` nulls with its residuals in other orders, and `checks` nulls with Gaussian ones, stacked."""
-    longest = max(one.values.size for one in series)
+    """The measured series, `draws` simulated with its permuted residuals, and `checks` with Gaussian ones, stacked."""
+    longest = max(channel.values.size for channel in series)
     orders = np.stack([_shuffle_blocks(longest, rng) for _ in range(draws)]) if draws else np.empty((0, longest), int)
     stacks = []
-    for one, bank in zip(series, banks, strict=True):
-        n = one.values.size
+    for channel, bank in zip(series, banks, strict=True):
+        n = channel.values.size
         # A shorter series keeps the order of those places that it has.
-        own = orders if n == longest else np.stack([order[order < n] for order in orders])
+        shared = orders if n == longest else np.stack([order[order < n] for order in orders])
         fresh = np.empty((checks, n), np.int64)
-        stacks.append(np.vstack([one.values, resample(bank, own, rng), resample(bank, fresh, rng, gaussian=True)]))
+        permuted = resample(bank, shared, rng=rng)
+        stacks.append(np.vstack([channel.values, permuted, resample(bank, fresh, rng=rng, gaussian=True)]))
     return stacks
 
 
 def _shuffle_blocks(length: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """A new order of 0..length-1 that keeps runs together: what one event does to its neighbours stays with it."""
+    """A permutation of 0..length-1 in blocks, so that the effect of one event on its neighbours stays with it."""
     cuts = np.flatnonzero(rng.random(length) < 1.0 / (_RUN_SHARE * length))
     turned = np.roll(np.arange(length), int(rng.integers(length)))
     blocks = np.split(turned, cuts[cuts > 0])
@@ -299,18 +364,18 @@ def _shuffle_blocks(length: int, rng: np.random.Generator) -> NDArray[np.int64]:
 
 
 def _respond_tile(response: Array32, cells: Array32) -> Array32:
-    """Regressors (n, cells * lags), lags innermost, of film cells (frames, cells) under responses (lags, n, frames)."""
-    seen = np.tensordot(response, cells, axes=(2, 0))
-    return np.ascontiguousarray(seen.transpose(1, 2, 0)).reshape(seen.shape[1], -1)
+    """Regressors (n, cells * lags), lags innermost, of cells (frames, cells) under responses (lags, n, frames)."""
+    lagged = np.tensordot(response, cells, axes=(2, 0))
+    return np.ascontiguousarray(lagged.transpose(1, 2, 0)).reshape(lagged.shape[1], -1)
 
 
 def _family_wise(statistics: Sequence[Array], maxima: Array, ease: Array) -> tuple[list[Array], Array]:
-    """Family-wise p of every row of statistics, and thresholds (rows,), from the rows' maxima (rows, draws) in the same nulls.
+    """Family-wise p-value of every row of statistics, and thresholds (rows,), from the maxima (rows, draws) of the simulated series.
 
-    A row is one series in one set. Rows of very different length have one error probability together because each is measured in its own
-    unit, the distance from the median of its maxima to their 95 % point; the largest such value over the rows is ranked. Measured and
-    redrawn maxima set the units together, so that the rank is exact for any number of draws. `ease` (rows,) is added to a row's values:
-    it gives the row a larger share of the error probability, at the others' cost.
+    A row is one series in one set. Rows of very different length share one error probability because each is measured in its own unit,
+    the distance from the median of its maxima to their 95 % point; the largest such value over the rows is ranked. Measured and simulated
+    maxima set the units together, so that the rank is exact for any number of draws. `ease` (rows,) is added to the values of a row: it
+    gives the row a larger share of the error probability, at the cost of the others.
     """
     draws = maxima.shape[1]
     measured = np.array([values.max() for values in statistics])
@@ -322,13 +387,13 @@ def _family_wise(statistics: Sequence[Array], maxima: Array, ease: Array) -> tup
     for values, centre, step in zip(statistics, middle, unit, strict=True):
         reached = draws - np.searchsorted(largest, (values - centre) / step, side="left")
         p_values.append((reached + 1.0) / (draws + 1.0))
-    # What passes exceeds all but the share LEVEL of the nulls.
+    # What passes exceeds all but the share LEVEL of the simulated series.
     limit = largest[draws - max(int(np.floor(LEVEL * (draws + 1))), 1)]
     return p_values, middle + limit * unit
 
 
 def _false_discovery(statistic: Array, counts: Array) -> Array:
-    """Benjamini-Hochberg q values of one channel from the pooled null distribution of one cell's statistic."""
+    """Benjamini-Hochberg q-values of one channel from the pooled null distribution of the statistic of one cell."""
     above = np.cumsum(counts[::-1])[::-1]
     place = np.clip(np.searchsorted(_BINS, statistic, side="right") - 1, 0, counts.size - 1)
     p = (above[place] + 1.0) / (counts.sum() + 1.0)

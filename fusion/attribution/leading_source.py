@@ -1,7 +1,7 @@
-"""The session's answer: which source goes with the drift, where it is, what else explains it as well, and what would tell.
+"""Name the leading source of a session: which candidate goes with the drift, where it is, and which places explain the drift as well.
 
-Thermal modes speak first: they have the power that single cells lack, and a mode is one place. Where no mode passes, the strongest
-cell or region does. Everything was tested under one family-wise error, so the order costs nothing.
+Thermal modes are asked first: they have the power that single cells lack, and a mode is one place. Where no mode passes, the strongest
+cell or region leads. All candidates were tested under one family-wise error probability, so that the order costs nothing.
 """
 
 from __future__ import annotations
@@ -18,32 +18,44 @@ from fusion.attribution.family_wise import LEVEL
 
 #: A place explains the drift as well as the leading one if its likelihood ratio is lower by no more than this (chi-square, 1
 #: degree of freedom, 0.95).
-EQUAL_RATIO = 3.84
-#: Cells that take at least this share of a mode belong to its place.
-IN_MODE = 0.5
-#: Pieces of a mode that reach this share of its height apart from each other are places of their own.
+_EQUAL_RATIO = 3.84
+#: Cells that reach at least this share of the peak of a mode belong to its place.
+_IN_MODE = 0.5
+#: Separate pieces of a mode that reach this share of its peak are places of their own.
 _PEAK = 0.7
 _QUANTITIES = ("p_value", "statistic", "sensitivity", "sensitivity_u", "lag", "detectable_sensitivity", "threshold")
-#: Kinds of candidates in the order in which they are asked.
+#: Sets of candidates in the order in which they are asked, and the kind of each.
 _SETS = (("modes", "mode"), ("cells", "cell"), ("regions", "region"))
 
 
 @dataclass(frozen=True)
-class Found:
-    """The candidate that leads, whether it passes or not.
+class LeadingSource:
+    """The leading candidate of a session, whether it passes or not.
 
     Attributes
     ----------
-    verdict : "attributable", "not attributable" or "not separable"
-    kind, name : "mode", "cell" or "region", and which one
-    channel : part of the drift that it goes with
-    x_mm, y_mm : place on the plan
-    p_value : family-wise over everything that was tested
-    sensitivity_um_per_K, sensitivity_u_um_per_K : drift per rise, at the far end of travel for common and growing drift together
-    lag_s : time constant between temperature and drift
-    detectable_um_per_K : what would have been found here with 80 % power
-    width_mm : how far the leading place reaches
-    others_mm : other places (x, y) that explain the drift as well: these data cannot tell them from the leading one
+    verdict : {"attributable", "not attributable", "not separable"}
+        Verdict of the session.
+    kind : {"mode", "cell", "region"}
+        What the candidate is.
+    name : str
+        Number of the mode, name of the region, empty for a cell.
+    channel : str
+        Part of the drift that it goes with.
+    x_mm, y_mm : float, mm
+        Place on the plan.
+    p_value : float
+        Family-wise over everything that was tested.
+    sensitivity_um_per_K, sensitivity_u_um_per_K : float, um/K
+        Drift per temperature rise and its standard uncertainty; for common and growing drift together at the far end of travel.
+    lag_s : float, s
+        Time constant between temperature and drift.
+    detectable_um_per_K : float, um/K
+        Detection limit here, with 80 % power.
+    width_mm : float, mm
+        Largest distance of a cell of the leading place from (x, y).
+    others_mm : tuple of (float, float), mm
+        Other places (x, y) that explain the drift as well: these data cannot tell them from the leading one.
     """
 
     verdict: str
@@ -61,25 +73,35 @@ class Found:
     others_mm: tuple[tuple[float, float], ...]
 
 
-def find_source(maps: xr.DataTree) -> Found:
-    """Return the leading candidate of :func:`fusion.attribution.attribute.correlate` with the session's verdict."""
+def find_source(maps: xr.DataTree) -> LeadingSource:
+    """Return the leading candidate of a session.
+
+    Parameters
+    ----------
+    maps : DataTree
+        Result of `fusion.attribution.attribute.correlate`.
+
+    Returns
+    -------
+    LeadingSource
+        The first of modes, cells and regions that passes, by its smallest p-value; where none passes, the candidate of smallest p-value
+        of all.
+    """
     sets = {name: kind for name, kind in _SETS if name == "cells" or name in maps.children}
-    leading = {name: _leader(maps, name) for name in sets}
-    smallest = {name: float(one["p_value"]) for name, one in leading.items()}
+    leaders = {name: _leader(maps, name) for name in sets}
+    smallest = {name: float(leader["p_value"]) for name, leader in leaders.items()}
     passed = [name for name, p in smallest.items() if p <= LEVEL]
     chosen = passed[0] if passed else min(smallest, key=lambda name: smallest[name])
-    best, kind = leading[chosen], sets[chosen]
-    channel = str(best["channel"].values)
+    best, kind = leaders[chosen], sets[chosen]
     x_mm, y_mm = float(best["x"]), float(best["y"])
     inside, others = _surroundings(maps, chosen, best)
     plan = maps.to_dataset()
     y, x = np.meshgrid(plan["y"].values, plan["x"].values, indexing="ij")
-    name = "" if kind == "cell" else str(best[kind].values)
-    return Found(
+    return LeadingSource(
         verdict=str(maps.attrs["verdict"]),
         kind=kind,
-        name=name,
-        channel=channel,
+        name="" if kind == "cell" else str(best[kind].values),
+        channel=str(best["channel"].values),
         x_mm=x_mm,
         y_mm=y_mm,
         p_value=float(best["p_value"]),
@@ -93,15 +115,15 @@ def find_source(maps: xr.DataTree) -> Found:
 
 
 def _columns(maps: xr.DataTree, name: str) -> xr.Dataset:
-    """Findings of one set over channel and candidate, with the candidates' places as x and y."""
+    """Results of one set over channel and candidate, with the places of the candidates as x and y."""
     if name == "cells":
         return maps.to_dataset()[list(_QUANTITIES)].stack(candidate=("y", "x"))
-    few = maps.children[name].to_dataset()
-    return few[list(_QUANTITIES)].assign_coords(x=few["at_x"], y=few["at_y"])
+    columns = maps.children[name].to_dataset()
+    return columns[list(_QUANTITIES)].assign_coords(x=columns["at_x"], y=columns["at_y"])
 
 
 def _leader(maps: xr.DataTree, name: str) -> xr.Dataset:
-    """The candidate of smallest p; equal ones (the resolution of the draws) are told apart by statistic over threshold."""
+    """The candidate of smallest p-value; equal ones (the resolution of the draws) are ordered by statistic over threshold."""
     columns = _columns(maps, name)
     p_value = columns["p_value"].fillna(1.0).values
     ratio = (columns["statistic"] / columns["threshold"]).transpose(*columns["p_value"].dims).fillna(0.0).values
@@ -113,56 +135,70 @@ def _leader(maps: xr.DataTree, name: str) -> xr.Dataset:
 def _surroundings(
     maps: xr.DataTree, name: str, best: xr.Dataset
 ) -> tuple[NDArray[np.bool_], list[tuple[float, float]]]:
-    """Cells (y, x) of the leading place, and the other places that explain the drift as well."""
+    """Cells (y, x) of the leading place, and the other places (x, y in mm) that explain the drift as well."""
     channel, plan = best["channel"].values, maps.to_dataset()
     if name == "cells":
         statistic = np.nan_to_num(plan["statistic"].sel(channel=channel).values, nan=-np.inf)
-        return _split(statistic, statistic >= statistic.max() - EQUAL_RATIO, plan)
-    few = _columns(maps, name).sel(channel=channel)
+        return _split(statistic, statistic >= statistic.max() - _EQUAL_RATIO, plan)
+    columns = _columns(maps, name).sel(channel=channel)
     kind = dict(_SETS)[name]
-    alike = (few["statistic"] >= best["statistic"] - EQUAL_RATIO).values & (few[kind] != best[kind]).values
-    others = [(float(x), float(y)) for x, y in zip(few["x"].values[alike], few["y"].values[alike], strict=True)]
+    alike = (columns["statistic"] >= best["statistic"] - _EQUAL_RATIO).values & (columns[kind] != best[kind]).values
+    others = [(float(x), float(y)) for x, y in zip(columns["x"].values[alike], columns["y"].values[alike], strict=True)]
     if name == "regions":
         return np.zeros((plan.sizes["y"], plan.sizes["x"]), bool), others
     modes = maps.children["modes"].to_dataset()
     pattern = np.abs(np.nan_to_num(modes["pattern"].sel(mode=int(best["mode"])).values))
     _, elsewhere = _split(pattern, pattern >= _PEAK, plan)
-    inside, _ = _split(pattern, pattern >= IN_MODE, plan)
+    inside, _ = _split(pattern, pattern >= _IN_MODE, plan)
     return inside, [*elsewhere, *others]
 
 
 def _split(
     strength: Array, equal: NDArray[np.bool_], plan: xr.Dataset
 ) -> tuple[NDArray[np.bool_], list[tuple[float, float]]]:
-    """The connected piece of equal cells that holds the strongest one, and the strongest cell (x, y in mm) of every other piece."""
+    """The connected piece of equal cells with the strongest one, and the strongest cell (x, y in mm) of every other piece."""
     labels, count = ndimage.label(equal, np.ones((3, 3)))
     row, column = np.unravel_index(int(strength.argmax()), strength.shape)
-    own = int(labels[row, column])
+    leading = int(labels[row, column])
     others = []
     for label in range(1, count + 1):
-        if label == own:
+        if label == leading:
             continue
-        at = np.unravel_index(int(np.where(labels == label, strength, -np.inf).argmax()), strength.shape)
-        others.append((float(plan["x"][at[1]]), float(plan["y"][at[0]])))
-    return labels == own, others
+        place = np.unravel_index(int(np.where(labels == label, strength, -np.inf).argmax()), strength.shape)
+        others.append((float(plan["x"][place[1]]), float(plan["y"][place[0]])))
+    return labels == leading, others
 
 
-def would_tell(maps: xr.DataTree, found: Found) -> str:
-    """What would decide what these data leave open, with the numbers of this session; empty where nothing is open."""
+def recommend_measurement(maps: xr.DataTree, source: LeadingSource) -> str:
+    """Say which measurement would decide what these data leave open.
+
+    Parameters
+    ----------
+    maps : DataTree
+        Result of `fusion.attribution.attribute.correlate`.
+    source : LeadingSource
+        Its leading candidate.
+
+    Returns
+    -------
+    str
+        Sentences with the detection limit, noise and drift of this session. Even an attributable source leaves open whether it is a
+        cause, so that there is always a recommendation.
+    """
     session = maps.to_dataset()
     common = session.sel(channel="common") if "common" in session["channel"].values else session.isel(channel=0)
     plan = (
-        f"thermofuse plan --source NAME=TIME proposes when to switch each heat source at random; give it this session's noise and "
-        f'drift: --noise "{float(common["noise"]):.2g} um" --drift "{max(float(common["unexplained_drift"]), 0.01):.2g} um"'
+        f"thermofuse plan --source NAME=TIME proposes when to switch each heat source at random; give it the noise and drift of this "
+        f'session: --noise "{float(common["noise"]):.2g} um" --drift "{max(float(common["unexplained_drift"]), 0.01):.2g} um"'
     )
-    if found.verdict == "not separable":
+    if source.verdict == "not separable":
         return f"Switch the heat sources at random times instead of letting all of them warm up once. {plan}."
-    if found.verdict == "not attributable":
+    if source.verdict == "not attributable":
         return (
-            f"From {found.detectable_um_per_K:.2g} um/K on, a source at the best place would have been found in four sessions of five. For "
-            f"less: more cycles, or loads that switch more often. {plan}."
+            f"From {source.detectable_um_per_K:.2g} um/K on, a source at the best place would have been found in four sessions of five. "
+            f"For less: more cycles, or loads that switch more often. {plan}."
         )
-    if found.others_mm:
-        places = "; ".join(f"x {x:.0f} mm, y {y:.0f} mm" for x, y in found.others_mm[:4])
+    if source.others_mm:
+        places = "; ".join(f"x {x:.0f} mm, y {y:.0f} mm" for x, y in source.others_mm[:4])
         return f"Other places explain the drift as well ({places}): switch the heat sources there separately. {plan}."
-    return "A second session that finds the same place, or randomised duty, makes a cause of it. " + plan + "."
+    return f"A second session that finds the same place, or randomised duty, would establish causation. {plan}."

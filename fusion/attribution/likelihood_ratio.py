@@ -1,13 +1,14 @@
-"""Likelihood ratios of many regressors against one drift series, with the drift's size estimated anew under each.
+"""Profile likelihood ratios of many regressors against one drift series, with the drift variance estimated anew under each.
 
-A series with n values is explained by fixed nuisance columns, a drift of unknown size and kind (none, random walk, integrated random
-walk) and white noise. The drifts form a grid; for each of them the series and the regressors are whitened and freed of the nuisance
-columns once, so that one regressor costs one product per grid point, and a thousand resampled series cost one matrix product. With
-``c_g`` the determinant term of grid point g, the statistic of a regressor with whitened unit vector z_g is::
+A series with n values is explained by k nuisance regressors, a drift of unknown variance and order (none, random walk, integrated random
+walk) and white noise. The drifts form a grid. For every grid point the series and the regressors are whitened and freed of the nuisance
+regressors once, so that one regressor costs one product per grid point, and a thousand simulated series cost one matrix product. With
+``c_g`` the determinant term of grid point g, ``e_g`` the whitened series and ``z_g`` the whitened regressor of unit length, the statistic
+is::
 
     (n - k) * log( min_g c_g |e_g|^2  /  min_g c_g (|e_g|^2 - (z_g' e_g)^2) )
 
-which is the profile likelihood ratio (restricted for the nuisance columns). A grid of one point is the usual whitened regression.
+Source: restricted likelihood, Patterson and Thompson (1971), Biometrika 58, 545; docs/method/attribution.md.
 """
 
 from __future__ import annotations
@@ -24,27 +25,33 @@ from interferometry.drift.state_space import Order, drift_system
 
 Array32 = NDArray[np.float32]
 
-#: Drift over one hour in units of one value's noise: below the first nobody sees it, above the last it hides everything.
+#: Drift over one hour in units of the noise of one value: below the first it has no effect, above the last it hides every source.
 _WALK_PER_HOUR = 0.1 * 3.0 ** np.arange(8)
 _INTEGRATED_PER_HOUR = 0.1 * 3.0 ** np.arange(10)
-#: Columns of one tile: with a thousand resampled series the products of a tile stay in the second-level cache.
-TILE = 512
-#: A whitened regressor that keeps less than this share of its size beside the nuisance columns carries no information.
+#: Columns of one tile: with a thousand simulated series the products of a tile stay in the second-level cache.
+_TILE = 512
+#: A whitened regressor that keeps less than this share of its length beside the nuisance regressors carries no information.
 _VANISHING = 1e-5
 
 
 @dataclass(frozen=True)
 class Whitening:
-    """One grid point: a drift of known kind and size.
+    """One grid point: a drift of given order and variance.
 
     Attributes
     ----------
-    order : 0 no drift, 1 random walk, 2 integrated random walk
-    per_hour : standard deviation of the drift's increment over one hour, in units of one value's noise
-    project, project32 : (n, n) whitens and removes the nuisance columns, in double and single precision
-    colour : (n, n) inverse of the whitening
-    basis : (n, k) orthonormal columns that the whitened nuisance columns span
-    log_penalty : log-determinant terms of the restricted likelihood divided by the degrees of freedom
+    order : int
+        0 no drift, 1 random walk, 2 integrated random walk.
+    per_hour : float
+        Standard deviation of the increment of the drift over one hour, over the noise of one value.
+    project, project32 : (n, n) ndarray
+        Whitens and removes the nuisance regressors, in double and single precision.
+    colour : (n, n) ndarray
+        Inverse of the whitening.
+    basis : (n, k) ndarray
+        Orthonormal basis of the whitened nuisance regressors.
+    log_penalty : float
+        Log-determinant terms of the restricted likelihood over the degrees of freedom.
     """
 
     order: int
@@ -58,15 +65,22 @@ class Whitening:
 
 @dataclass(frozen=True)
 class NullBank:
-    """All grid points for one series.
+    """The null models of one series at all grid points.
 
     Attributes
     ----------
-    freedom : number of values minus nuisance columns
-    values : (n,) the series
-    best : grid point with the highest restricted likelihood without any regressor
-    sigma : noise of one value at that point (values of relative variance 1)
-    log_likelihood : (grid,) restricted log-likelihood of the null at every grid point
+    whitenings : tuple of Whitening
+        The grid points.
+    freedom : int
+        Degrees of freedom: number of values minus nuisance regressors.
+    values : (n,) ndarray, um
+        The series.
+    best : int
+        Index of the grid point of highest restricted likelihood without any regressor.
+    sigma : float, um
+        Noise of a value of relative variance 1 at that point.
+    log_likelihood : (grid,) ndarray
+        Restricted log-likelihood of the null model at every grid point.
     """
 
     whitenings: tuple[Whitening, ...]
@@ -78,12 +92,12 @@ class NullBank:
 
     @property
     def fitted(self) -> Whitening:
-        """The null model with the highest likelihood."""
+        """The null model of highest restricted likelihood."""
         return self.whitenings[self.best]
 
     @property
     def drift_per_hour(self) -> float:
-        """Fitted drift over one hour in the unit of the series."""
+        """Standard deviation of the fitted drift over one hour, um."""
         return self.fitted.per_hour * self.sigma
 
 
@@ -109,12 +123,16 @@ def _invert_lower(lower: Array) -> Array:
 
 @dataclass(frozen=True)
 class Grid:
-    """Whitenings under every drift of the grid, for all series that share instants, variances and nuisance columns.
+    """Whitenings at every grid point, for all series that share instants, variances and nuisance regressors.
 
     Attributes
     ----------
-    freedom : number of values minus nuisance columns
-    scale : variance of an ordinary value
+    whitenings : tuple of Whitening
+        The grid points.
+    freedom : int
+        Degrees of freedom: number of values minus nuisance regressors.
+    scale : float
+        Median relative variance of the values.
     """
 
     whitenings: tuple[Whitening, ...]
@@ -123,12 +141,23 @@ class Grid:
 
 
 def whitening_grid(seconds: Array, variance: Array, nuisance: Array, *, integrated: bool = True) -> Grid:
-    """Whiten under every drift of the grid, with or without integrated walks.
+    """Compute the whitening at every grid point.
 
     Parameters
     ----------
-    seconds, variance : (n,) times in s (increasing), relative variances
-    nuisance : (n, k) columns that every hypothesis contains
+    seconds : (n,) ndarray, s
+        Times of the values, increasing.
+    variance : (n,) ndarray
+        Relative variances of the values; the noise of one value is that of relative variance 1.
+    nuisance : (n, k) ndarray
+        Regressors that every hypothesis contains.
+    integrated : bool
+        Whether the grid contains integrated random walks besides random walks.
+
+    Returns
+    -------
+    Grid
+        19 grid points, or 9 without integrated random walks.
     """
     n = seconds.size
     scale = float(np.median(variance))
@@ -150,7 +179,19 @@ def whitening_grid(seconds: Array, variance: Array, nuisance: Array, *, integrat
 
 
 def fit_null(grid: Grid, values: Array) -> NullBank:
-    """Fit the null to a series (n,): the grid point of highest restricted likelihood."""
+    """Fit the null model to a series: the grid point of highest restricted likelihood.
+
+    Parameters
+    ----------
+    grid : Grid
+        Whitenings for the instants of the series.
+    values : (n,) ndarray, um
+        The series.
+
+    Returns
+    -------
+    NullBank
+    """
     rss = np.array([((point.project @ values) ** 2).sum() for point in grid.whitenings])
     score = np.log(np.maximum(rss, 1e-300)) + np.array([point.log_penalty for point in grid.whitenings])
     best = int(np.argmin(score))
@@ -159,18 +200,45 @@ def fit_null(grid: Grid, values: Array) -> NullBank:
 
 
 def null_bank(values: Array, seconds: Array, variance: Array, nuisance: Array, *, integrated: bool = True) -> NullBank:
-    """Whiten one series (n,) under every drift of the grid and fit the null; see :func:`whitening_grid`."""
-    return fit_null(whitening_grid(seconds, variance, nuisance, integrated=integrated), values)
-
-
-def resample(bank: NullBank, orders: NDArray[np.int64], rng: np.random.Generator, *, gaussian: bool = False) -> Array:
-    """Draw series (draws, n) from the null: drift sizes by their likelihood, whitened residuals put into other orders.
+    """Compute the whitenings for one series and fit the null model to it; see `whitening_grid` and `fit_null`.
 
     Parameters
     ----------
-    orders : (draws, n) one order of the residuals per draw; the same orders for several series keep what they share
-    rng : generator for the drift sizes (and for the innovations if gaussian)
-    gaussian : Gaussian innovations instead of the residuals' own
+    values : (n,) ndarray, um
+        The series.
+    seconds : (n,) ndarray, s
+        Times of the values, increasing.
+    variance : (n,) ndarray
+        Relative variances of the values.
+    nuisance : (n, k) ndarray
+        Regressors that every hypothesis contains.
+    integrated : bool
+        Whether the grid contains integrated random walks besides random walks.
+
+    Returns
+    -------
+    NullBank
+    """
+    return fit_null(whitening_grid(seconds, variance, nuisance, integrated=integrated), values)
+
+
+def resample(bank: NullBank, orders: NDArray[np.int64], *, rng: np.random.Generator, gaussian: bool = False) -> Array:
+    """Simulate series under the null hypothesis: drift variances drawn by their likelihood, whitened residuals permuted.
+
+    Parameters
+    ----------
+    bank : NullBank
+        Null models of the measured series.
+    orders : (draws, n) ndarray of int
+        One permutation of the residuals per simulated series; the same permutations for several series keep their correlation.
+    rng : Generator
+        Source of the drift variances (and of the innovations if `gaussian`).
+    gaussian : bool
+        Gaussian innovations instead of the residuals.
+
+    Returns
+    -------
+    (draws, n) ndarray, um
     """
     weight = np.exp(bank.log_likelihood - bank.log_likelihood.max())
     chosen = rng.choice(weight.size, size=orders.shape[0], p=weight / weight.sum())
@@ -183,17 +251,31 @@ def resample(bank: NullBank, orders: NDArray[np.int64], rng: np.random.Generator
         if gaussian:
             innovations = spread * rng.standard_normal((rows.size, residual.size))
         else:
-            # What the nuisance columns took out of the residuals is put back at random: without it, orders that keep runs together
-            # would lack slow parts, and their maxima would be too small.
-            taken = spread * rng.standard_normal((rows.size, null.basis.shape[1])) @ null.basis.T
-            innovations = np.take_along_axis(residual + taken, orders[rows], axis=1)
+            # What the nuisance regressors removed from the residuals is put back at random: without it, block permutations would
+            # lack slow variation, and their maxima would be too small.
+            removed = spread * rng.standard_normal((rows.size, null.basis.shape[1])) @ null.basis.T
+            innovations = np.take_along_axis(residual + removed, orders[rows], axis=1)
         series[rows] = innovations @ null.colour.T
     return series
 
 
 @dataclass(frozen=True)
 class Whitened:
-    """Series ready for the products: per grid point the whitened series (draws, n), their squares and penalties."""
+    """Series whitened at every grid point; the measured series is the first of the draws.
+
+    Attributes
+    ----------
+    series : (grid, draws, n) ndarray
+        Whitened series.
+    penalised : (grid, draws) ndarray
+        Sums of squares times the penalty.
+    penalty : (grid,) ndarray
+        Determinant terms, ``exp(log_penalty)`` up to a common factor.
+    null_score : (draws,) ndarray
+        Smallest `penalised` over the grid.
+    freedom : int
+        Degrees of freedom.
+    """
 
     series: Array32
     penalised: Array32
@@ -203,7 +285,19 @@ class Whitened:
 
 
 def whiten_series(bank: NullBank, series: Array) -> Whitened:
-    """Whiten series (draws, n) at every grid point of the bank."""
+    """Whiten series at every grid point.
+
+    Parameters
+    ----------
+    bank : NullBank
+        Null models of the measured series.
+    series : (draws, n) ndarray, um
+        The measured series and simulated ones.
+
+    Returns
+    -------
+    Whitened
+    """
     projected = np.stack([series @ point.project.T for point in bank.whitenings])
     log_penalty = np.array([point.log_penalty for point in bank.whitenings])
     squares = (projected**2).sum(axis=2)
@@ -220,19 +314,19 @@ def whiten_series(bank: NullBank, series: Array) -> Whitened:
     )
 
 
-def unit_regressors(project: Array32, regressors: Array32) -> tuple[Array32, Array32]:
+def _unit_regressors(project: Array32, regressors: Array32) -> tuple[Array32, Array32]:
     """Whitened regressors (n, columns) of length one, and their lengths (columns,); those without information are zero."""
-    moved = project @ regressors
-    length = np.sqrt(np.einsum("ij,ij->j", moved, moved))
+    white = project @ regressors
+    length = np.sqrt(np.einsum("ij,ij->j", white, white))
     size = np.sqrt(np.einsum("ij,ij->j", regressors, regressors))
     useful = length > _VANISHING * np.maximum(size, np.float32(1e-30)) * np.abs(project).max()
-    moved *= np.where(useful, 1.0 / np.where(useful, length, 1.0), 0.0).astype(np.float32)
-    return moved, np.where(useful, length, np.float32(0.0))
+    white *= np.where(useful, 1.0 / np.where(useful, length, 1.0), 0.0).astype(np.float32)
+    return white, np.where(useful, length, np.float32(0.0))
 
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "ninf", "nsz"})
 def _take_best(products: Array32, penalised: Array32, penalty: np.float32, best: Array32) -> None:
-    """Lower best (draws, columns) to this grid point's penalised residual squares where they are smaller."""
+    """Lower best (draws, columns) to the penalised residual squares of this grid point where they are smaller."""
     draws, columns = products.shape
     for b in range(draws):
         whole = penalised[b]
@@ -251,12 +345,27 @@ def _log_ratio(null_score: Array32, best: Array32, freedom: float) -> None:
 
 
 def likelihood_ratios(bank: NullBank, whitened: Whitened, regressors: Array32) -> Array32:
-    """Profile likelihood ratios (draws, columns) of regressors (n, columns) for every series."""
+    """Return the profile likelihood ratio of every regressor for every series.
+
+    Parameters
+    ----------
+    bank : NullBank
+        Null models of the measured series.
+    whitened : Whitened
+        The measured series and simulated ones.
+    regressors : (n, columns) ndarray of float32, K
+        Temperatures at the instants of the series.
+
+    Returns
+    -------
+    (draws, columns) ndarray of float32
+        Twice the gain in restricted log-likelihood, 0 for a regressor without information.
+    """
     draws = whitened.series.shape[1]
     best = np.empty((draws, regressors.shape[1]), np.float32)
     best[:] = whitened.null_score[:, None]
     for g, point in enumerate(bank.whitenings):
-        unit, _ = unit_regressors(point.project32, regressors)
+        unit, _ = _unit_regressors(point.project32, regressors)
         products = whitened.series[g] @ unit
         _take_best(products, whitened.penalised[g], whitened.penalty[g], best)
     _log_ratio(whitened.null_score, best, float(whitened.freedom))
@@ -265,23 +374,43 @@ def likelihood_ratios(bank: NullBank, whitened: Whitened, regressors: Array32) -
 
 @dataclass(frozen=True)
 class Estimate:
-    """Effect of each regressor at the grid point where its likelihood is highest, (columns,) each."""
+    """Effect of each regressor at the grid point where its likelihood is highest.
+
+    Attributes
+    ----------
+    coefficient, coefficient_u : (columns,) ndarray, um/K
+        Estimate and its standard uncertainty.
+    null_u : (columns,) ndarray, um/K
+        Standard uncertainty at the fitted null model, from which the detection limit follows.
+    """
 
     coefficient: Array
     coefficient_u: Array
-    #: Standard uncertainty that the coefficient would have at the fitted null, used for the smallest effect that would be found.
     null_u: Array
 
 
 def estimate_effects(bank: NullBank, regressors: Array32) -> Estimate:
-    """Coefficients of regressors (n, columns) with uncertainty, drift size profiled."""
+    """Estimate the coefficient of every regressor, with the drift variance profiled.
+
+    Parameters
+    ----------
+    bank : NullBank
+        Null models of the measured series.
+    regressors : (n, columns) ndarray of float32, K
+        Temperatures at the instants of the series.
+
+    Returns
+    -------
+    Estimate
+        The uncertainty is infinite for a regressor without information.
+    """
     columns = regressors.shape[1]
     best = np.full(columns, np.inf)
     coefficient = np.zeros(columns)
     uncertainty = np.full(columns, np.inf)
     null_u = np.full(columns, np.inf)
     for g, point in enumerate(bank.whitenings):
-        unit, length = unit_regressors(point.project32, regressors)
+        unit, length = _unit_regressors(point.project32, regressors)
         series = point.project @ bank.values
         product = (series.astype(np.float32) @ unit).astype(float)
         rss = float(series @ series) - product**2
@@ -299,6 +428,18 @@ def estimate_effects(bank: NullBank, regressors: Array32) -> Estimate:
 
 
 def tiles(columns: int, group: int) -> Sequence[slice]:
-    """Slices of whole groups of columns, about :data:`TILE` wide."""
-    step = max(TILE // group, 1) * group
+    """Return slices of whole groups of columns, about 512 wide.
+
+    Parameters
+    ----------
+    columns : int
+        Number of columns.
+    group : int
+        Number of neighbouring columns that stay together (the lags of one cell).
+
+    Returns
+    -------
+    sequence of slice
+    """
+    step = max(_TILE // group, 1) * group
     return [slice(start, min(start + step, columns)) for start in range(0, columns, step)]

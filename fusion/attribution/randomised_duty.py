@@ -1,9 +1,10 @@
-"""The test that randomised duty allows: was it this schedule that moved the axis, or would any other have looked the same?
+"""Randomisation test: does the drift follow the schedule by which the heat sources were switched at random?
 
-Where the heat load of every source was switched by a known law of chance, schedules drawn anew from that law are as likely as the one
-that was run. A statistic that is larger for the real schedule than for 95 % of the others therefore rejects chance exactly, whatever
-the drift does by itself, warm-up included; the drift model behind the statistic only buys power. Fisher (1935), *The design of
-experiments*; for slow series Harris (2020), bioRxiv 2020.11.29.402719 ("pseudosession method").
+Where the duty of every source was drawn from a known random law, other schedules drawn from that law are as likely as the one that was
+run. A statistic that is larger for the real schedule than for 95 % of the others therefore rejects the null hypothesis exactly, whatever
+the drift does by itself, warm-up included; the drift model behind the statistic only adds power. A significant source is a cause.
+
+Sources: Fisher (1935), *The design of experiments*; for slow series Harris (2020), bioRxiv 2020.11.29.402719 ("pseudosession method").
 """
 
 from __future__ import annotations
@@ -19,33 +20,35 @@ from threadpoolctl import threadpool_limits
 
 from fusion._typing import Array
 from fusion.alignment.first_order_lag import respond
-from fusion.attribution.drift_channels import DriftSeries, read_clock, reduce_channels
+from fusion.attribution.drift_channels import DriftSeries, clock_readings, reduce_channels
+from fusion.attribution.family_wise import LEVEL
 from fusion.attribution.likelihood_ratio import NullBank, estimate_effects, likelihood_ratios, null_bank, whiten_series
 from fusion.errors import FusionError
 
-#: Time constants of the responses to duty, s: one body, or one body behind another of the second constant.
-RESPONSES_S = tuple((first, second) for second in (0.0, 1800.0) for first in (600.0, 1800.0, 3600.0, 7200.0))
-#: Step of the schedule's time grid, s.
+#: Time constants of the responses to duty, s: one body, or one body followed by another of the second constant.
+_RESPONSES_S = tuple((first, second) for second in (0.0, 1800.0) for first in (600.0, 1800.0, 3600.0, 7200.0))
+#: Step of the time grid of schedules, s.
 GRID_S = 60.0
-LEVEL = 0.05
-#: A logged load within this share of the range from its lowest or highest value is at that level.
+#: A logged duty within this share of its range from its lowest or highest value is at that level.
 _LEVEL_TOLERANCE = 0.05
-#: A number of switchings that the stated law makes more rarely than this was made by another one.
+#: A number of switchings less probable than this under the stated law was drawn from another one.
 _IMPOSSIBLE = 1e-4
 
 
 class RandomisationError(FusionError):
-    """Duty cannot be tested; the message says what is missing."""
+    """A duty that cannot be tested; the message says what is missing."""
 
 
 @dataclass(frozen=True)
 class DutyLaw:
-    """Law of chance of one source's switching: on and off by turns, first state by a fair coin.
+    """Random law by which one source is switched on and off; the first state is either with probability 1/2.
 
     Attributes
     ----------
-    mean_dwell_s : mean time between switchings
-    least_dwell_s : shortest time between switchings; the rest is exponential
+    mean_dwell_s : float, s
+        Mean time between switchings.
+    least_dwell_s : float, s
+        Shortest time between switchings; what exceeds it is exponentially distributed.
     """
 
     mean_dwell_s: float
@@ -58,7 +61,7 @@ class DutyLaw:
             )
 
     def draw(self, duration_s: float, rng: np.random.Generator) -> tuple[bool, Array]:
-        """First state and the times of switching (s) within the duration."""
+        """Draw the first state (True is on) and the times of switching, s, within a duration of `duration_s`."""
         count = int(duration_s / self.mean_dwell_s * 2) + 20
         switching: Array = np.zeros(0)
         while switching.size == 0 or switching[-1] < duration_s:
@@ -68,30 +71,35 @@ class DutyLaw:
         return bool(rng.integers(2)), switching[switching < duration_s]
 
     def course(self, seconds: Array, rng: np.random.Generator) -> Array:
-        """One schedule, 0 or 1 at the given times (n,)."""
+        """Draw one schedule: 0 or 1 at the given times (n,), s."""
         first, switching = self.draw(float(seconds[-1] - seconds[0]) + GRID_S, rng)
         return (np.searchsorted(switching, seconds - seconds[0], side="right") + first) % 2.0
 
 
 def read_duty(drivers: xr.Dataset, names: Sequence[str], law: DutyLaw, *, source: str = "drivers") -> xr.DataArray:
-    """Return the switching states 0 and 1 (time, source) of logged columns, and refuse those that the law cannot have made.
+    """Read the switching states of logged columns, and check that the stated law can have made them.
 
     Parameters
     ----------
     drivers : Dataset
-        Logged columns over time.
+        Logged columns along ``time``, in any unit.
     names : sequence of str
         Columns that were switched at random.
     law : DutyLaw
-        The law that they were drawn from, as it is stated.
+        The law that they were drawn from, as stated in the campaign file.
     source : str
         Name of the file, for messages.
+
+    Returns
+    -------
+    DataArray, (time, source)
+        0 at the lower level and 1 at the upper one, at the times at which all columns have a value.
 
     Raises
     ------
     RandomisationError
-        if a column is not there, takes other than two levels, was switched before the least dwell was over, or so often or so
-        seldom as the law makes it in less than one session in ten thousand.
+        If a column is missing, has other than two levels, was switched before the least dwell was over, or so often or so seldom as
+        the law makes it in less than one session in ten thousand.
     """
     unknown = [name for name in names if name not in drivers]
     if unknown:
@@ -113,14 +121,14 @@ def read_duty(drivers: xr.Dataset, names: Sequence[str], law: DutyLaw, *, source
                 "between two levels: take it out of drivers.randomised"
             )
         states.append(np.round(share))
-        _refuse_other_law(f"{source}: {name}", seconds, states[-1], law)
+        _check_law(f"{source}: {name}", seconds, states[-1], law)
     return xr.DataArray(
         np.column_stack(states), dims=("time", "source"), coords={"time": log["time"], "source": list(names)}
     )
 
 
-def _refuse_other_law(place: str, seconds: Array, states: Array, law: DutyLaw) -> None:
-    """Refuse a course (n,) of 0 and 1 that the law cannot have made, as far as its dwells and their number show."""
+def _check_law(place: str, seconds: Array, states: Array, law: DutyLaw) -> None:
+    """Raise if the law cannot have made a course (n,) of 0 and 1, as far as its dwells and their number show."""
     changes = seconds[np.flatnonzero(np.diff(states)) + 1]
     # A change is known to one step of the log, and between two changes both may be late or early.
     step = float(np.diff(seconds).max())
@@ -142,10 +150,23 @@ def _refuse_other_law(place: str, seconds: Array, states: Array, law: DutyLaw) -
 
 
 def duty_responses(seconds: Array, courses: Array) -> Array:
-    """Responses (n, columns, responses) of the bank to courses (n, columns) on an even grid."""
+    """Return the thermal responses to duty for every pair of time constants.
+
+    Parameters
+    ----------
+    seconds : (n,) ndarray, s
+        Times, increasing.
+    courses : (n, columns) ndarray
+        Duty, 0 to 1, of one source or schedule per column.
+
+    Returns
+    -------
+    (n, columns, 8) ndarray
+        Responses of a body of 600, 1800, 3600 or 7200 s alone, then of the same four followed by another body of 1800 s.
+    """
     bodies: dict[float, Array] = {}
     responses = []
-    for first, second in RESPONSES_S:
+    for first, second in _RESPONSES_S:
         if first not in bodies:
             bodies[first] = respond(courses, seconds, time_constant_s=first)
         responses.append(respond(bodies[first], seconds, time_constant_s=second))
@@ -165,67 +186,81 @@ def randomisation_test(
 
     Parameters
     ----------
-    fused_readings : as for :func:`fusion.attribution.attribute.correlate`
-    duty : DataArray
-        Switching state 0..1 as it was run, dims time, source; held between times.
+    fused_readings : Dataset
+        ``deviation`` (um) and ``time`` (UTC) over cycle, direction and target, and ``position`` (mm) over target.
+    duty : DataArray, (time, source)
+        Switching state 0 to 1 as it was run; held between times.
     law : DutyLaw
         The law that the schedule was drawn from, independently for every source.
     draws : int
-        Schedules drawn anew.
+        Number of schedules drawn anew.
+    seed : int
+        Seed of these schedules.
 
     Returns
     -------
     Dataset
-        Per source ``p_value`` (family-wise over sources, exact), ``statistic``, ``response`` (index into the bank, with
-        ``time_constant`` and ``second_time_constant`` in s), ``sensitivity`` and ``sensitivity_u`` (um for full duty, at the
-        far end of travel). Attribute ``source`` names the source found, or is empty.
+        Per source ``p_value`` (family-wise over sources, exact), ``statistic``, ``time_constant`` and ``second_time_constant`` (s) of the
+        best response, ``sensitivity`` and ``sensitivity_u`` (um at full duty, at the far end of travel). Attribute ``source`` names the
+        most significant source, or is empty.
 
     Raises
     ------
     RandomisationError
-        if a source was never switched, or duty has no time in common with the readings.
+        If a source was never switched.
+    ChannelError
+        If too few readings lie in the time of the log.
     """
     seconds, grid_time, courses = _hold(duty)
     names = [str(name) for name in duty["source"].values]
-    series = [one for one in reduce_channels(read_clock(fused_readings, grid_time)) if one.name != "reversal"]
+    channels = reduce_channels(clock_readings(fused_readings, grid_time))
+    series = [channel for channel in channels if channel.name != "reversal"]
     # The test is exact whatever the drift does: a model that could follow any smooth course would only cost power.
     banks = [
-        null_bank(one.values, one.seconds, one.variance, _level_and_trend(one.seconds), integrated=False)
-        for one in series
+        null_bank(
+            channel.values, channel.seconds, channel.variance, _level_and_trend(channel.seconds), integrated=False
+        )
+        for channel in series
     ]
     responses = duty_responses(seconds, courses)
     measured = _statistics(series, banks, responses)
     rng = np.random.default_rng(seed)
     fresh = np.column_stack([law.course(seconds, rng) for _ in range(draws * len(names))])
-    null = _statistics(series, banks, duty_responses(seconds, fresh)).max(axis=1).reshape(draws, -1)
-    best = measured.max(axis=1)
-    p_value = (1 + (null.max(axis=1)[:, None] >= best).sum(axis=0)) / (draws + 1)
-    chosen = measured.argmax(axis=1)
-    picked = responses[:, np.arange(len(names)), chosen]
+    null = _statistics(series, banks, duty_responses(seconds, fresh)).max(axis=1).reshape(draws, -1).max(axis=1)
+    best, chosen = measured.max(axis=1), measured.argmax(axis=1)
+    p_value = (1 + (null[:, None] >= best).sum(axis=0)) / (draws + 1)
+    size, size_u = _effects(series, banks, responses[:, np.arange(len(names)), chosen])
+    strongest = int(best.argmax())
+    attrs = {"source": names[strongest] if p_value[strongest] <= LEVEL else "", "draws": draws}
+    return _describe(names, p_value, best, np.array(_RESPONSES_S)[chosen], size, size_u).assign_attrs(attrs)
+
+
+def _effects(series: Sequence[DriftSeries], banks: Sequence[NullBank], responses: Array) -> tuple[Array, Array]:
+    """Drift at full duty at the far end of travel and its standard uncertainty, (sources,) um, from responses (grid, sources)."""
     effects = [
-        estimate_effects(bank, np.ascontiguousarray(one.sampling @ picked, np.float32))
-        for one, bank in zip(series, banks, strict=True)
+        estimate_effects(bank, np.ascontiguousarray(channel.sampling @ responses, np.float32))
+        for channel, bank in zip(series, banks, strict=True)
     ]
-    # At the far end of travel, what is common and what grows with position add up.
+    # At the far end of travel, the common drift and that proportional to position add up.
     size = np.sum([effect.coefficient for effect in effects], axis=0)
-    size_u = np.sqrt(np.sum([effect.coefficient_u**2 for effect in effects], axis=0))
-    found = names[int(best.argmax())] if p_value[int(best.argmax())] <= LEVEL else ""
-    constants = np.array(RESPONSES_S)[chosen]
+    return size, np.sqrt(np.sum([effect.coefficient_u**2 for effect in effects], axis=0))
+
+
+def _describe(
+    names: Sequence[str], p_value: Array, statistic: Array, time_constants_s: Array, size: Array, size_u: Array
+) -> xr.Dataset:
+    """The results of all sources as variables, (sources,) each; time constants (sources, 2)."""
+    size_name = "drift at the far end of travel at full duty"
     return xr.Dataset(
         {
             "p_value": (("source",), p_value, {"units": "1", "long_name": "family-wise p against redrawn schedules"}),
-            "statistic": (("source",), best, {"units": "1"}),
-            "time_constant": (("source",), constants[:, 0], {"units": "s"}),
-            "second_time_constant": (("source",), constants[:, 1], {"units": "s"}),
-            "sensitivity": (
-                ("source",),
-                size,
-                {"units": "um", "long_name": "drift at the far end of travel at full duty"},
-            ),
+            "statistic": (("source",), statistic, {"units": "1"}),
+            "time_constant": (("source",), time_constants_s[:, 0], {"units": "s"}),
+            "second_time_constant": (("source",), time_constants_s[:, 1], {"units": "s"}),
+            "sensitivity": (("source",), size, {"units": "um", "long_name": size_name}),
             "sensitivity_u": (("source",), size_u, {"units": "um"}),
         },
-        coords={"source": names},
-        attrs={"source": found, "draws": draws},
+        coords={"source": list(names)},
     )
 
 
@@ -251,7 +286,7 @@ def _statistics(series: Sequence[DriftSeries], banks: Sequence[NullBank], respon
     """Likelihood ratios (columns, responses) of responses (grid, columns, responses), summed over the series."""
     flat = responses.reshape(responses.shape[0], -1)
     total = np.zeros(flat.shape[1])
-    for one, bank in zip(series, banks, strict=True):
-        regressors = np.ascontiguousarray(one.sampling @ flat, np.float32)
-        total += likelihood_ratios(bank, whiten_series(bank, one.values[None, :]), regressors)[0]
+    for channel, bank in zip(series, banks, strict=True):
+        regressors = np.ascontiguousarray(channel.sampling @ flat, np.float32)
+        total += likelihood_ratios(bank, whiten_series(bank, channel.values[None, :]), regressors)[0]
     return total.reshape(responses.shape[1:])

@@ -1,12 +1,11 @@
-"""Regions and thermal modes of the film: fewer, quieter candidates for a source of the drift than single cells.
+"""Group the cells of the field: regions, localised thermal modes, and clusters of collinear cells.
 
-A region's temperature is the mean of its cells. Thermal modes are the film's leading spatial patterns, rotated until each lives in one
-place (varimax), so that a mode usually is one heat source with its halo; that finds weak and lagged sources where single cells do not.
+Regions and modes are fewer candidates for a source of the drift than single cells, with less noise. The temperature of a region is the mean
+of its cells. Thermal modes are the leading spatial patterns of the field, rotated until each is concentrated in one place (varimax), so
+that a mode usually is one heat source with its halo; this finds weak and lagged sources where single cells do not.
 
-Which places of the field these data cannot tell apart, whatever the drift does.
-
-Two places that warm alike explain the drift alike. Cells that take one course form one cluster, whatever their distance; and the
-condition number of the leading thermal modes says how many sources the session can tell apart at all.
+Cells of one cluster have collinear temperatures: whatever the drift does, these data cannot tell them apart. The condition number of the
+leading thermal modes says how many sources the session can separate at all.
 """
 
 from __future__ import annotations
@@ -22,8 +21,7 @@ from numpy.typing import NDArray
 from skimage.measure import points_in_poly
 
 from fusion._typing import Array
-from fusion.attribution.family_wise import nuisance_columns
-from fusion.attribution.warm_up import describe_excitation, thermal_modes
+from fusion.attribution.warm_up import describe_excitation, nuisance_columns, thermal_modes
 from fusion.errors import FusionError
 
 #: Rotation stops when the varimax criterion grows by less than this share.
@@ -31,6 +29,8 @@ _ROTATION_TOLERANCE = 1e-6
 _ROTATION_ROUNDS = 200
 #: Corners of a disc that is written as a polygon; its area is then within 0.3 % of the circle's.
 _DISC_CORNERS = 48
+#: Cells whose temperatures share at least this much of their variance are collinear.
+_SHARED_VARIANCE = 0.98
 _COLUMNS = ("name", "x_mm", "y_mm")
 
 
@@ -40,37 +40,69 @@ class RegionError(FusionError):
 
 @dataclass(frozen=True)
 class Region:
-    """A part of the plan, by the corners (corners, 2) of its outline in mm."""
+    """A named part of the plan.
+
+    Attributes
+    ----------
+    name : str
+        Name of the region.
+    corners_mm : (corners, 2) ndarray, mm
+        Corners (x, y) of its outline, in order.
+    """
 
     name: str
     corners_mm: NDArray[np.float64]
 
     def cells(self, plane: xr.DataArray) -> NDArray[np.bool_]:
-        """Which cells of a plane (..., y, x), flattened, have their centre inside."""
+        """Return which cells of a plane (..., y, x) have their centre inside, (y * x,) bool."""
         y, x = np.meshgrid(plane["y"].values, plane["x"].values, indexing="ij")
         return np.asarray(points_in_poly(np.column_stack([x.ravel(), y.ravel()]), self.corners_mm), bool)
 
     @property
     def centre_mm(self) -> tuple[float, float]:
-        """Mean of the corners, x and y in mm."""
+        """Mean of the corners (x, y), mm."""
         x, y = self.corners_mm.mean(axis=0)
         return float(x), float(y)
 
 
 def disc(name: str, x_mm: float, y_mm: float, radius_mm: float) -> Region:
-    """Return a round region."""
+    """Return a round region.
+
+    Parameters
+    ----------
+    name : str
+        Name of the region.
+    x_mm, y_mm : float, mm
+        Centre on the plan.
+    radius_mm : float, mm
+        Radius of the circle, which is approximated by a polygon of 48 corners.
+
+    Returns
+    -------
+    Region
+    """
     angle = np.linspace(0.0, 2.0 * np.pi, _DISC_CORNERS, endpoint=False)
     corners = np.column_stack([x_mm + radius_mm * np.cos(angle), y_mm + radius_mm * np.sin(angle)])
     return Region(name, corners)
 
 
 def read_regions(path: str | Path) -> list[Region]:
-    """Read named regions: one line ``name,x_mm,y_mm`` per corner, the corners of a region in order along its outline.
+    """Read named regions from a CSV file.
+
+    Parameters
+    ----------
+    path : str or Path
+        One line ``name,x_mm,y_mm`` per corner, the corners of a region in order along its outline.
+
+    Returns
+    -------
+    list of Region
+        In the order of their first corners.
 
     Raises
     ------
     RegionError
-        A column is missing, a coordinate is no number, or a region has fewer than three corners; with file, line and remedy.
+        If a column is missing, a coordinate is no number, or a region has fewer than three corners; with file, line and remedy.
     """
     path = Path(path)
     corners: dict[str, list[tuple[float, float]]] = {}
@@ -103,12 +135,27 @@ def read_regions(path: str | Path) -> list[Region]:
 
 
 def region_courses(values: Array, seen: NDArray[np.bool_], plane: xr.DataArray, regions: Sequence[Region]) -> Array:
-    """Mean temperatures (frames, regions) of regions from seen cells (frames, cells) of a plane.
+    """Return the mean temperature of every region.
+
+    Parameters
+    ----------
+    values : (frames, cells) ndarray, K
+        Temperatures of the seen cells.
+    seen : (y * x,) ndarray of bool
+        Which cells of the plane these are.
+    plane : DataArray, (..., y, x)
+        For the coordinates of the plan, mm.
+    regions : sequence of Region
+        Parts of the plan.
+
+    Returns
+    -------
+    (frames, regions) ndarray, K
 
     Raises
     ------
     RegionError
-        if a region holds no seen cell.
+        If a region contains no seen cell.
     """
     columns = []
     for region in regions:
@@ -128,9 +175,12 @@ class Modes:
 
     Attributes
     ----------
-    courses : (frames, modes) K at each mode's strongest cell
-    patterns : (modes, cells) share of that, 1 at the strongest cell
-    peaks : (modes,) index of the strongest cell
+    courses : (frames, modes) ndarray, K
+        Temperature of each mode at its strongest cell, minus the mean over time.
+    patterns : (modes, cells) ndarray
+        Temperature of each cell over that of the strongest cell.
+    peaks : (modes,) ndarray of int
+        Index of the strongest cell.
     """
 
     courses: Array
@@ -139,7 +189,24 @@ class Modes:
 
 
 def localise_modes(values: Array, *, limit: int = 6) -> Modes:
-    """Find the localised modes of a film (frames, cells), centred over time; none where it stands still."""
+    """Find the localised thermal modes of a field.
+
+    Parameters
+    ----------
+    values : (frames, cells) ndarray, K
+        Temperatures, each cell minus its mean over time.
+    limit : int
+        Largest number of modes.
+
+    Returns
+    -------
+    Modes
+        None of them where nothing stands above the noise.
+
+    Notes
+    -----
+    Principal components, rotated by the varimax criterion (Kaiser 1958, Psychometrika 23, 187).
+    """
     courses, patterns = thermal_modes(values, limit=limit)
     if courses.shape[1] == 0:
         return Modes(courses, patterns, np.zeros(0, np.int64))
@@ -152,7 +219,23 @@ def localise_modes(values: Array, *, limit: int = 6) -> Modes:
 
 
 def varimax(loadings: Array) -> NDArray[np.float64]:
-    """Rotation (k, k) that concentrates each column of loadings (n, k) on few rows (Kaiser 1958, Psychometrika 23, 187)."""
+    """Return the varimax rotation, which concentrates each column of loadings on few rows.
+
+    Parameters
+    ----------
+    loadings : (n, k) ndarray
+        Patterns as columns, in any unit.
+
+    Returns
+    -------
+    (k, k) ndarray
+        Orthogonal matrix; ``loadings @ rotation`` are the rotated patterns.
+
+    Notes
+    -----
+    Maximises the variance of the squared loadings of the columns (Kaiser 1958, Psychometrika 23, 187) by repeated singular value
+    decompositions.
+    """
     k = loadings.shape[1]
     rotation = np.eye(k)
     criterion = 0.0
@@ -167,42 +250,40 @@ def varimax(loadings: Array) -> NDArray[np.float64]:
     return rotation
 
 
-#: Courses that share at least this much of their variance count as one source.
-_SHARED_VARIANCE = 0.98
-
-
 def cluster_cells(field: xr.DataArray, *, shared_variance: float = _SHARED_VARIANCE, limit: int = 12) -> xr.Dataset:
-    """Group cells whose temperature takes one course, and give the condition number of the field's thermal modes.
-
-    Courses are compared as the test of the drift sees them: without trend and, where a warm-up dominates, without its exponentials.
+    """Group cells with collinear temperatures, and give the condition number of the thermal modes of the field.
 
     Parameters
     ----------
-    field : DataArray
-        Temperature, dims time, y, x.
+    field : DataArray, (time, y, x)
+        Temperature in degC or rise in K; cells with NaN are left out.
     shared_variance : float
-        Squared correlation from which two courses count as one.
+        Squared correlation from which the temperatures of two cells count as collinear.
     limit : int
-        Most clusters; the rest is 0.
+        Largest number of clusters.
 
     Returns
     -------
     Dataset
-        ``cluster`` (y, x): 0 none, 1 the largest course, ...; ``mode_size`` (eigenmode) in K rms; ``condition``: first over last mode.
+        ``cluster`` (y, x): 0 none, 1 the cluster of the strongest cell, ...; ``mode_size`` (eigenmode) in K rms; ``condition``: first over
+        last mode.
+
+    Notes
+    -----
+    Temperatures are compared as in the test of the drift: without trend and, where a warm-up dominates, without its exponentials. What
+    remains is projected on the modes above the noise, so that noise does not lower the correlation.
     """
     values = field.values.reshape(field.sizes["time"], -1).astype(float)
     seen = np.isfinite(values).all(axis=0)
     centred = values[:, seen] - values[:, seen].mean(axis=0)
-    # What the test of the drift leaves of a course is what places can be told apart by: no trend, and no warm-up where one dominates.
     seconds = (field["time"].values - field["time"].values[0]) / np.timedelta64(1, "s")
-    nuisance = nuisance_columns(seconds, describe_excitation(seconds, centred))
+    nuisance = nuisance_columns(seconds, describe_excitation(centred, seconds))
     centred = centred - nuisance @ np.linalg.lstsq(nuisance, centred, rcond=None)[0]
     courses, patterns = thermal_modes(centred, limit=limit)
-    # Courses are compared free of noise, in the space of the modes that stand above it.
     weights = np.sqrt((courses**2).sum(axis=0))
     scores = patterns * weights[:, None]
     size = np.sqrt((scores**2).sum(axis=0))
-    label = _lead(scores, size, shared_variance, limit)
+    label = _label_clusters(scores, size, shared_variance, limit)
     cluster = np.zeros(values.shape[1], np.int16)
     cluster[seen] = label
     mode_size = weights / np.sqrt(values.shape[0])
@@ -221,16 +302,16 @@ def cluster_cells(field: xr.DataArray, *, shared_variance: float = _SHARED_VARIA
     )
 
 
-def _lead(scores: Array, size: Array, shared_variance: float, limit: int) -> NDArray[np.int16]:
-    """Label cells (columns of scores) by the strongest cell whose course they share, at most `limit` labels."""
+def _label_clusters(scores: Array, size: Array, shared_variance: float, limit: int) -> NDArray[np.int16]:
+    """Label cells (columns of scores) by the strongest cell that they are collinear with, at most `limit` labels."""
     label = np.zeros(size.size, np.int16)
     unit = scores / np.where(size > 0, size, 1.0)
-    left = size > 0
+    unlabelled = size > 0
     for number in range(1, limit + 1):
-        if not left.any():
+        if not unlabelled.any():
             break
-        leader = int(np.argmax(np.where(left, size, -1.0)))
-        alike = left & ((unit[:, leader] @ unit) ** 2 >= shared_variance)
+        leader = int(np.argmax(np.where(unlabelled, size, -1.0)))
+        alike = unlabelled & ((unit[:, leader] @ unit) ** 2 >= shared_variance)
         label[alike] = number
-        left &= ~alike
+        unlabelled &= ~alike
     return label

@@ -1,7 +1,9 @@
-"""Two campaigns of one machine: a source is called a cause only where both agree.
+"""Compare two sessions of one machine: a source is called a cause only where both agree.
 
-One session may be fooled by two series that happen to wander alike; two independent sessions are fooled at the same place, with the
-same sign and size, far more rarely (a hundredth of the cases instead of a tenth; for two warm-ups nearly never).
+Within one session independent drifts can go with a temperature by chance. Two independent sessions do so at the same place, with the same
+sign and size, far more rarely (a hundredth of the cases instead of a tenth; for two warm-ups nearly never).
+
+Source: conjunction of two tests, Nichols et al. (2005), NeuroImage 25, 653 (the larger of both p-values); docs/method/attribution.md.
 """
 
 from __future__ import annotations
@@ -18,33 +20,38 @@ from fusion.attribution.family_wise import LEVEL
 from fusion.attribution.leading_source import find_source
 from fusion.errors import FusionError
 
-Mask = NDArray[np.bool_]
-#: Strongest candidates near every place, per session.
-Places = list[dict[str, Array]]
-
-#: Places of the two sessions count as the same within this distance: half the width of a heat source's halo.
-SAME_PLACE_MM = 50.0
-#: Quantities of a candidate, and what stands where there is none.
+#: Places of the two sessions count as the same within this distance: half the width of the halo of a heat source.
+_SAME_PLACE_MM = 50.0
+#: Quantities of a candidate, and their values where there is none.
 _BLANK = {"statistic": -1.0, "p_value": 1.0, "sensitivity": 0.0, "sensitivity_u": np.inf, "lag": 0.0}
 #: Sensitivities disagree where they differ by more than this many standard uncertainties.
 _DISAGREEMENT = 3.0
 
 
-class ConjunctionError(FusionError):
-    """Two campaigns cannot be compared; the message says in what they differ."""
+class SessionComparisonError(FusionError):
+    """Two campaigns that cannot be compared; the message says in what they differ."""
 
 
 @dataclass(frozen=True)
-class Common:
-    """Verdict on one channel from both sessions.
+class ChannelAgreement:
+    """Where the two sessions agree best on one part of the drift.
 
     Attributes
     ----------
-    verdict : "attributable", "not attributable" or "not separable"
-    x_mm, y_mm : where the weaker of the two statistics is strongest, midway between both sessions' places
-    p_value : the larger of both sessions' family-wise p there (a conjunction needs both)
-    sensitivity_um_per_K : of both sessions
-    reason : why, in words
+    channel : str
+        Part of the drift.
+    verdict : {"attributable", "not attributable", "not separable"}
+        Attributable where both sessions pass at one place with one sign and one size.
+    x_mm, y_mm : float, mm
+        Where the weaker of the two statistics is strongest, midway between the places of both sessions.
+    p_value : float
+        Larger of the family-wise p-values of both sessions there.
+    sensitivity_um_per_K : (float, float), um/K
+        Of both sessions.
+    lag_s : (float, float), s
+        Of both sessions.
+    reason : str
+        The verdict in words.
     """
 
     channel: str
@@ -59,16 +66,26 @@ class Common:
 
 @dataclass(frozen=True)
 class SourceAgreement:
-    """One source that either session shows, and what the other one shows there.
+    """One source that either session shows, and what the other session shows there.
 
     Attributes
     ----------
-    channel : part of the drift that it goes with
-    x_mm, y_mm : place in the session that shows it
-    shown_by : 0 first session, 1 second, or both
-    p_value, sensitivity_um_per_K, sensitivity_u_um_per_K, lag_s : of the first and the second session near that place
-    agrees : both sessions pass there, with one sign and one size
-    separate : it leads its session, or adds to what leads there; otherwise it may only warm with the leading source
+    channel : str
+        Part of the drift that the source drives.
+    x_mm, y_mm : float, mm
+        Place in the session that shows it.
+    shown_by : tuple of int
+        0 for the first session, 1 for the second, or both.
+    p_value : (float, float)
+        Family-wise p-values of the first and the second session near that place.
+    sensitivity_um_per_K, sensitivity_u_um_per_K : (float, float), um/K
+        Sensitivities of both sessions and their standard uncertainties.
+    lag_s : (float, float), s
+        Time constants of both sessions.
+    agrees : bool
+        Whether both sessions pass there, with one sign and one size.
+    separate : bool
+        Whether it leads its session, or adds to the leading source; otherwise it may only be collinear with it.
     """
 
     channel: str
@@ -88,57 +105,119 @@ class SourceAgreement:
         return self.agrees and self.separate
 
 
-def compare_sources(first: xr.DataTree, second: xr.DataTree) -> list[SourceAgreement]:
-    """Return every source that passes in either of two sessions, once, and whether the other session agrees.
+@dataclass(frozen=True)
+class SessionComparison:
+    """Agreement of two sessions of one machine.
 
-    A session's sources are its thermal modes that pass, each with the part of the drift that it goes with most; where none passes, its
-    leading cell. Sessions that are one warm-up show none.
+    Attributes
+    ----------
+    maps : Dataset
+        ``p_value`` (channel, y, x): larger of both sessions' smallest family-wise p-values within 50 mm; ``verdict`` as in the maps of one
+        session.
+    channels : list of ChannelAgreement
+        Best agreement on every part of the drift that both sessions have.
+    sources : list of SourceAgreement
+        Every source that either session shows, once.
+    """
+
+    maps: xr.Dataset
+    channels: list[ChannelAgreement]
+    sources: list[SourceAgreement]
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Strongest candidates within reach of every cell, (y, x) per quantity, of both sessions, for one channel."""
+
+    first: dict[str, Array]
+    second: dict[str, Array]
+
+    def at(self, quantity: str, row: int, column: int) -> tuple[float, float]:
+        """One quantity of both sessions at one place."""
+        return float(self.first[quantity][row, column]), float(self.second[quantity][row, column])
+
+    @property
+    def p_value(self) -> Array:
+        """Larger p-value of both sessions, (y, x)."""
+        return np.maximum(self.first["p_value"], self.second["p_value"])
+
+    @property
+    def consistent(self) -> NDArray[np.bool_]:
+        """Where the candidates of both sessions are one place with one sign, and sizes that agree within u, (y, x)."""
+        a, b = self.first["sensitivity"], self.second["sensitivity"]
+        u = np.hypot(self.first["sensitivity_u"], self.second["sensitivity_u"])
+        apart = np.hypot(self.first["x"] - self.second["x"], self.first["y"] - self.second["y"])
+        return np.asarray((a * b > 0) & (np.abs(a - b) <= _DISAGREEMENT * u) & (apart <= _SAME_PLACE_MM), bool)
+
+    @property
+    def agree(self) -> NDArray[np.bool_]:
+        """Where both sessions pass and are consistent, (y, x)."""
+        return np.asarray((self.p_value <= LEVEL) & self.consistent, bool)
+
+
+def compare_sessions(first: xr.DataTree, second: xr.DataTree) -> SessionComparison:
+    """Compare the sources of the drift in two sessions of one machine.
+
+    Parameters
+    ----------
+    first, second : DataTree
+        Results of `fusion.attribution.attribute.correlate` on the same plan grid.
+
+    Returns
+    -------
+    SessionComparison
+        The sources of a session are its thermal modes that pass, each with the part of the drift that it goes with most; where none
+        passes, its leading cell. A session that is one warm-up shows none, and two such sessions are not separable.
 
     Raises
     ------
-    ConjunctionError
-        if the grids differ.
+    SessionComparisonError
+        If the grids differ or no channel is common.
     """
-    _refuse_other_grids(first, second)
-    reach = _reach(first)
-    near = {
-        channel: [_strongest_nearby(_candidates(one, channel), reach) for one in (first, second)]
+    _check_grids(first, second)
+    reach = max(1, round(_SAME_PLACE_MM / float(np.median(np.diff(first.coords["x"].values)))))
+    pairs = {
+        channel: _Pair(*(_strongest_nearby(_candidates(session, channel), reach) for session in (first, second)))
         for channel in _shared_channels(first, second)
     }
-    found: list[SourceAgreement] = []
-    for at, session in enumerate((first, second)):
-        for channel, x_mm, y_mm, separate in _passing(session):
-            if channel not in near or _already(found, channel, x_mm, y_mm):
+    separable = any(session.attrs["excitation"] != "warm-up only" for session in (first, second))
+    return SessionComparison(
+        maps=_maps(first.to_dataset(), pairs, separable),
+        channels=[_conclude(channel, pair, separable) for channel, pair in pairs.items()],
+        sources=_list_sources(first, second, pairs),
+    )
+
+
+def _list_sources(first: xr.DataTree, second: xr.DataTree, pairs: dict[str, _Pair]) -> list[SourceAgreement]:
+    """Every source that either session shows, once."""
+    plan = first.to_dataset()
+    sources: list[SourceAgreement] = []
+    for number, session in enumerate((first, second)):
+        for channel, x_mm, y_mm, separate in _sources_of(session):
+            if channel not in pairs or _listed(sources, channel, x_mm, y_mm):
                 continue
-            row = int(np.argmin(np.abs(first.coords["y"].values - y_mm)))
-            column = int(np.argmin(np.abs(first.coords["x"].values - x_mm)))
-            places = near[channel]
-            p_value = _at(places, "p_value", row, column)
-            agrees = max(p_value) <= LEVEL and bool(_consistent(*places)[row, column])
-            found.append(
+            pair = pairs[channel]
+            place = int(np.argmin(np.abs(plan["y"].values - y_mm))), int(np.argmin(np.abs(plan["x"].values - x_mm)))
+            agrees = bool(pair.agree[place])
+            sources.append(
                 SourceAgreement(
                     channel=channel,
                     x_mm=x_mm,
                     y_mm=y_mm,
-                    shown_by=(0, 1) if agrees else (at,),
-                    p_value=p_value,
-                    sensitivity_um_per_K=_at(places, "sensitivity", row, column),
-                    sensitivity_u_um_per_K=_at(places, "sensitivity_u", row, column),
-                    lag_s=_at(places, "lag", row, column),
+                    shown_by=(0, 1) if agrees else (number,),
+                    p_value=pair.at("p_value", *place),
+                    sensitivity_um_per_K=pair.at("sensitivity", *place),
+                    sensitivity_u_um_per_K=pair.at("sensitivity_u", *place),
+                    lag_s=pair.at("lag", *place),
                     agrees=agrees,
                     separate=separate,
                 )
             )
-    return found
+    return sources
 
 
-def _at(places: Places, name: str, row: int, column: int) -> tuple[float, float]:
-    """One quantity of both sessions at one place."""
-    return float(places[0][name][row, column]), float(places[1][name][row, column])
-
-
-def _passing(session: xr.DataTree) -> list[tuple[str, float, float, bool]]:
-    """Part of the drift, place (x, y in mm), and whether it is told from the leading one, of every source that a session shows."""
+def _sources_of(session: xr.DataTree) -> list[tuple[str, float, float, bool]]:
+    """Part of the drift, place (x, y in mm), and whether it is told from the leading source, of every source of a session."""
     if session.attrs["verdict"] != "attributable":
         return []
     leading = find_source(session)
@@ -157,18 +236,20 @@ def _passing(session: xr.DataTree) -> list[tuple[str, float, float, bool]]:
     return sources
 
 
-def _already(found: list[SourceAgreement], channel: str, x_mm: float, y_mm: float) -> bool:
+def _listed(sources: list[SourceAgreement], channel: str, x_mm: float, y_mm: float) -> bool:
     """Whether a source at this place is listed as one on which both sessions agree."""
     return any(
-        one.agrees and one.channel == channel and np.hypot(one.x_mm - x_mm, one.y_mm - y_mm) <= SAME_PLACE_MM
-        for one in found
+        source.agrees
+        and source.channel == channel
+        and np.hypot(source.x_mm - x_mm, source.y_mm - y_mm) <= _SAME_PLACE_MM
+        for source in sources
     )
 
 
-def _refuse_other_grids(first: xr.DataTree, second: xr.DataTree) -> None:
+def _check_grids(first: xr.DataTree, second: xr.DataTree) -> None:
     for name in ("x", "y"):
         if first.sizes[name] != second.sizes[name] or not np.allclose(first.coords[name], second.coords[name]):
-            raise ConjunctionError(
+            raise SessionComparisonError(
                 f"the plan grids differ along {name}; give both campaigns the same [plan] size, cell_size and fiducials"
             )
 
@@ -176,84 +257,48 @@ def _refuse_other_grids(first: xr.DataTree, second: xr.DataTree) -> None:
 def _shared_channels(first: xr.DataTree, second: xr.DataTree) -> list[str]:
     channels = [str(name) for name in first.coords["channel"].values if name in second.coords["channel"].values]
     if not channels:
-        raise ConjunctionError("the two campaigns share no drift channel; both need readings at several targets")
+        raise SessionComparisonError("the two campaigns share no drift channel; both need readings at several targets")
     return channels
 
 
-def _reach(session: xr.DataTree) -> int:
-    """Cells within which places count as the same."""
-    return max(1, round(SAME_PLACE_MM / float(np.median(np.diff(session.coords["x"].values)))))
-
-
-def agree(first: xr.DataTree, second: xr.DataTree) -> tuple[xr.Dataset, list[Common]]:
-    """Join the maps of two campaigns.
-
-    Parameters
-    ----------
-    first, second : Datasets of :func:`fusion.attribution.attribute.correlate` on the same plan grid, from tests of the same machine.
-
-    Returns
-    -------
-    Dataset
-        ``p_value`` (channel, y, x): larger of both sessions' smallest family-wise p within 50 mm; ``verdict`` as in the single maps.
-    list of Common
-        One verdict per channel.
-
-    Raises
-    ------
-    ConjunctionError
-        if the grids differ or no channel is common.
-    """
-    _refuse_other_grids(first, second)
-    channels = _shared_channels(first, second)
-    reach = _reach(first)
-    separable = any(one.attrs["excitation"] != "warm-up only" for one in (first, second))
-    maps, verdicts, found = [], [], []
-    for channel in channels:
-        places = [_strongest_nearby(_candidates(one, channel), reach) for one in (first, second)]
-        joint_p = np.maximum(places[0]["p_value"], places[1]["p_value"])
-        verdict = np.where((joint_p <= LEVEL) & _consistent(*places), ATTRIBUTABLE, NOT_ATTRIBUTABLE)
-        maps.append(joint_p)
-        verdicts.append(verdict if separable else np.full_like(verdict, NOT_SEPARABLE))
-        found.append(_conclude(channel, places, separable))
+def _maps(plan: xr.Dataset, pairs: dict[str, _Pair], separable: bool) -> xr.Dataset:
+    """Larger p-value and verdict of both sessions over channel, y, x."""
     dims = ("channel", "y", "x")
-    joined = xr.Dataset(
-        {
-            "p_value": (
-                dims,
-                np.stack(maps),
-                {"units": "1", "long_name": "larger of both sessions' family-wise p values"},
-            ),
-            "verdict": (dims, np.stack(verdicts).astype(np.int8), dict(first.to_dataset()["verdict"].attrs)),
-        },
-        coords={"channel": channels, "y": first.coords["y"], "x": first.coords["x"]},
+    p_value = np.stack([pair.p_value for pair in pairs.values()])
+    agree = np.stack([pair.agree for pair in pairs.values()])
+    verdict = np.where(agree, ATTRIBUTABLE, NOT_ATTRIBUTABLE) if separable else np.full(agree.shape, NOT_SEPARABLE)
+    meaning = {"units": "1", "long_name": "larger of both sessions' family-wise p values"}
+    return xr.Dataset(
+        {"p_value": (dims, p_value, meaning), "verdict": (dims, verdict.astype(np.int8), dict(plan["verdict"].attrs))},
+        coords={"channel": list(pairs), "y": plan["y"], "x": plan["x"]},
     )
-    return joined, found
 
 
 def _candidates(session: xr.DataTree, channel: str) -> dict[str, Array]:
-    """Strongest candidate at every place, (y, x) each: the cell itself, or the thermal mode that has its height there.
+    """Strongest candidate at every place, (y, x) per quantity: the cell itself, or the thermal mode that has its peak there.
 
     The statistic is divided by its threshold, so that cells and modes compare.
     """
-    chosen = session.to_dataset().sel(channel=channel)
-    strongest = {name: np.nan_to_num(chosen[name].values, nan=none) for name, none in _BLANK.items()}
-    strongest["statistic"] = strongest["statistic"] / float(chosen["threshold"])
+    cells = session.to_dataset().sel(channel=channel)
+    strongest = {name: np.nan_to_num(cells[name].values, nan=blank) for name, blank in _BLANK.items()}
+    strongest["statistic"] = strongest["statistic"] / float(cells["threshold"])
     modes = session.children["modes"].to_dataset().sel(channel=channel) if "modes" in session.children else xr.Dataset()
     for k in range(modes.sizes.get("mode", 0)):
         mode = modes.isel(mode=k)
-        place = (int(np.argmin(np.abs(chosen["y"].values - float(mode["at_y"])))),
-                 int(np.argmin(np.abs(chosen["x"].values - float(mode["at_x"])))))  # fmt: skip
+        place = (
+            int(np.argmin(np.abs(cells["y"].values - float(mode["at_y"])))),
+            int(np.argmin(np.abs(cells["x"].values - float(mode["at_x"])))),
+        )
         ratio = float(mode["statistic"]) / float(mode["threshold"])
         if ratio > strongest["statistic"][place]:
             for name in _BLANK:
                 strongest[name][place] = ratio if name == "statistic" else float(mode[name])
-    y, x = np.meshgrid(chosen["y"].values, chosen["x"].values, indexing="ij")
+    y, x = np.meshgrid(cells["y"].values, cells["x"].values, indexing="ij")
     return strongest | {"x": x, "y": y}
 
 
 def _strongest_nearby(values: dict[str, Array], reach: int) -> dict[str, Array]:
-    """Quantities of the strongest place within reach (cells) of every cell, its own place included, (y, x) each."""
+    """Quantities of the strongest candidate within reach (cells) of every cell, its own place included, (y, x) each."""
     rows, columns = values["statistic"].shape
     padded = {name: np.pad(array, reach, constant_values=_BLANK.get(name, 0.0)) for name, array in values.items()}
     best = {name: array.copy() for name, array in values.items()}
@@ -268,30 +313,17 @@ def _strongest_nearby(values: dict[str, Array], reach: int) -> dict[str, Array]:
     return best
 
 
-def _consistent(first: dict[str, Array], second: dict[str, Array]) -> Mask:
-    """Where both sessions' strongest places nearby are one place, with sensitivities of one sign that agree within u, (y, x)."""
-    a, b = first["sensitivity"], second["sensitivity"]
-    u = np.hypot(first["sensitivity_u"], second["sensitivity_u"])
-    apart = np.hypot(first["x"] - second["x"], first["y"] - second["y"])
-    return np.asarray((a * b > 0) & (np.abs(a - b) <= _DISAGREEMENT * u) & (apart <= SAME_PLACE_MM), bool)
-
-
-def _conclude(
-    channel: str,
-    places: Places,
-    separable: bool,
-) -> Common:
-    """Verdict on one channel from the strongest places (per session) near every cell."""
-    joint_p = np.maximum(places[0]["p_value"], places[1]["p_value"])
-    consistent = _consistent(*places)
-    weaker = np.minimum(*[one["statistic"] for one in places])
-    candidates = (joint_p <= LEVEL) & consistent
-    row, column = np.unravel_index(int(np.where(candidates, weaker + 1e6, weaker).argmax()), weaker.shape)
-    p_value = float(joint_p[row, column])
-    sensitivity = (float(places[0]["sensitivity"][row, column]), float(places[1]["sensitivity"][row, column]))
+def _conclude(channel: str, pair: _Pair, separable: bool) -> ChannelAgreement:
+    """Where the sessions agree best on one channel, and the verdict."""
+    weaker = np.minimum(pair.first["statistic"], pair.second["statistic"])
+    # A place where both agree goes before any other, however strong.
+    place = np.unravel_index(int(np.where(pair.agree, weaker + 1e6, weaker).argmax()), weaker.shape)
+    row, column = int(place[0]), int(place[1])
+    p_value = float(pair.p_value[row, column])
+    sensitivity = pair.at("sensitivity", row, column)
     if not separable:
         verdict, reason = "not separable", "both sessions are one warm-up each: switch the heat sources at random times"
-    elif candidates.any():
+    elif pair.agree.any():
         verdict, reason = "attributable", "both sessions find this place, with one sign and one size"
     elif p_value <= LEVEL:
         verdict = "not attributable"
@@ -299,13 +331,13 @@ def _conclude(
         reason = f"both sessions find something near here, but not at one place with one size: {sizes}"
     else:
         verdict, reason = "not attributable", "no place is found by both sessions"
-    return Common(
+    return ChannelAgreement(
         channel=channel,
         verdict=verdict,
-        x_mm=float(np.mean([one["x"][row, column] for one in places])),
-        y_mm=float(np.mean([one["y"][row, column] for one in places])),
+        x_mm=float(np.mean(pair.at("x", row, column))),
+        y_mm=float(np.mean(pair.at("y", row, column))),
         p_value=p_value,
         sensitivity_um_per_K=sensitivity,
-        lag_s=(float(places[0]["lag"][row, column]), float(places[1]["lag"][row, column])),
+        lag_s=pair.at("lag", row, column),
         reason=reason,
     )

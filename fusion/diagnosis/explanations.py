@@ -393,7 +393,7 @@ def fit_profile(residual: Residual, columns: Array, rng: np.random.Generator) ->
     regressors = np.ascontiguousarray(columns[parts.rows], np.float32)
     # Gaussian draws need no orders of the residuals, but their number.
     orders = np.empty((_DRAWS, parts.mean.size), np.int64)
-    series = np.vstack([parts.mean, resample(bank, orders, rng, gaussian=True)])
+    series = np.vstack([parts.mean, resample(bank, orders, rng=rng, gaussian=True)])
     ratios = likelihood_ratios(bank, whiten_series(bank, series), regressors)
     largest = ratios.max(axis=1)
     best = int(ratios[0].argmax())

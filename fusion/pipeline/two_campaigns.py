@@ -1,4 +1,4 @@
-"""Two campaigns of one machine: run apart, then asked where they agree."""
+"""Compare the finished runs of two campaigns of one machine, in joint.json, joint.nc and both reports."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from fusion.attribution.two_sessions import Common, SourceAgreement, agree, compare_sources
+from fusion.attribution.two_sessions import ChannelAgreement, SourceAgreement, compare_sessions
 from fusion.products.store import read_dataset, read_tree, write_dataset, write_json, write_text
 from fusion.report.html import render_report
 from fusion.report.model_section import readable
 from fusion.report.plots_attribution import CHANNELS
 from fusion.report.wording import duration, measured, number, p_value
 
-READERS = {"fields": read_dataset, "deviations": read_dataset, "fusion": read_tree}
+_READERS = {"fields": read_dataset, "deviations": read_dataset, "fusion": read_tree}
 
 
 def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
-    """Compare the correlation of two finished runs and tell it in both reports.
+    """Compare the correlation of two finished runs and enter the comparison in both reports.
 
     Parameters
     ----------
@@ -35,33 +35,35 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
 
     Raises
     ------
-    ConjunctionError
+    SessionComparisonError
         If the campaigns cannot be compared.
     """
     products: list[dict[str, Any]] = [
-        {name: read(folder / f"{name}.nc") for name, read in READERS.items()} for folder in folders
+        {name: read(folder / f"{name}.nc") for name, read in _READERS.items()} for folder in folders
     ]
-    sessions = [product["fusion"].children["correlation"] for product in products]
-    maps, found = agree(*sessions)
-    sources = compare_sources(*sessions)
-    write_dataset(out / "joint.nc", maps)
+    comparison = compare_sessions(*(product["fusion"].children["correlation"] for product in products))
+    titles = [str(_read_json(folder, "results")["campaign"]) for folder in folders]
+    write_dataset(out / "joint.nc", comparison.maps)
     write_json(
         out / "joint.json",
         {
-            "campaigns": [_title(folder) for folder in folders],
-            "sources": [asdict(one) for one in found],
-            "agreement": [{**asdict(one), "cause": one.cause} for one in sources],
+            "campaigns": titles,
+            "sources": [asdict(channel) for channel in comparison.channels],
+            "agreement": [{**asdict(source), "cause": source.cause} for source in comparison.sources],
         },
     )
-    rows = [(CHANNELS.get(one.channel, one.channel), in_words(one)) for one in found]
-    causes = [f"x {one.x_mm:.0f} mm, y {one.y_mm:.0f} mm" for one in sources if one.cause]
-    table = [source_row(one, [_title(folder) for folder in folders]) for one in sources]
-    for at, folder in enumerate(folders):
-        joint = {"other": _title(folders[1 - at]), "rows": rows, "causes": causes, "sources": table}
-        write_text(
-            folder / "report.html",
-            render_report(_json(folder, "results"), _json(folder, "provenance"), products[at], joint=joint),
-        )
+    table = [source_row(source, titles) for source in comparison.sources]
+    joint = {
+        "rows": [
+            (CHANNELS.get(channel.channel, channel.channel), _channel_text(channel)) for channel in comparison.channels
+        ],
+        "causes": [f"x {source.x_mm:.0f} mm, y {source.y_mm:.0f} mm" for source in comparison.sources if source.cause],
+        "sources": table,
+    }
+    for folder, product, other in zip(folders, products, reversed(titles), strict=True):
+        results, provenance = _read_json(folder, "results"), _read_json(folder, "provenance")
+        report = render_report(results, provenance, product, joint={"other": other, **joint})
+        write_text(folder / "report.html", report)
     if not table:
         return [("sources", "neither session shows one")]
     return [
@@ -69,35 +71,48 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
     ]
 
 
-def source_row(one: SourceAgreement, titles: Sequence[str]) -> list[str]:
-    """Return one source as cells of a table: place, part of the drift, what each session shows there, and whether it is a cause."""
+def source_row(source: SourceAgreement, titles: Sequence[str]) -> list[str]:
+    """Return one source as the cells of a row of a table.
+
+    Parameters
+    ----------
+    source : SourceAgreement
+        What both sessions show at its place.
+    titles : sequence of str
+        Titles of the first and the second campaign.
+
+    Returns
+    -------
+    list of str
+        Place (x, y in mm), part of the drift, result of the first and of the second session, and whether the source is a cause.
+    """
     shown = [
         f"p {p_value(p)}, {measured(value, u, 'µm/K')}, lag {duration(lag)}"
         for p, value, u, lag in zip(
-            one.p_value, one.sensitivity_um_per_K, one.sensitivity_u_um_per_K, one.lag_s, strict=True
+            source.p_value,
+            source.sensitivity_um_per_K,
+            source.sensitivity_u_um_per_K,
+            source.lag_s,
+            strict=True,
         )
     ]
-    if one.cause:
+    if source.cause:
         verdict = "a cause: both agree"
-    elif one.agrees:
+    elif source.agrees:
         verdict = "both agree, but it may only warm with the leading source"
     else:
-        verdict = f"shown by {titles[one.shown_by[0]]} alone"
-    return [f"{one.x_mm:.0f}, {one.y_mm:.0f}", CHANNELS.get(one.channel, one.channel), *shown, verdict]
+        verdict = f"shown by {titles[source.shown_by[0]]} alone"
+    return [f"{source.x_mm:.0f}, {source.y_mm:.0f}", CHANNELS.get(source.channel, source.channel), *shown, verdict]
 
 
-def in_words(found: Common) -> str:
-    """Return one verdict of two sessions as a sentence."""
-    first, second = (number(value, 2) for value in found.sensitivity_um_per_K)
+def _channel_text(channel: ChannelAgreement) -> str:
+    """The agreement on one part of the drift as a sentence."""
+    first, second = (number(value, 2) for value in channel.sensitivity_um_per_K)
     return readable(
-        f"{found.verdict}: {found.reason}; x {found.x_mm:.0f} mm, y {found.y_mm:.0f} mm, larger p of both {p_value(found.p_value)}, "
-        f"{first} and {second} um/K"
+        f"{channel.verdict}: {channel.reason}; x {channel.x_mm:.0f} mm, y {channel.y_mm:.0f} mm, larger p of both "
+        f"{p_value(channel.p_value)}, {first} and {second} um/K"
     )
 
 
-def _title(folder: Path) -> str:
-    return str(_json(folder, "results")["campaign"])
-
-
-def _json(folder: Path, name: str) -> Mapping[str, Any]:
+def _read_json(folder: Path, name: str) -> Mapping[str, Any]:
     return json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.attribution.family_wise import LEVEL
-from fusion.attribution.leading_source import Found, find_source, would_tell
+from fusion.attribution.leading_source import LeadingSource, find_source, recommend_measurement
 from fusion.report.model_section import readable
 from fusion.report.plots_attribution import CHANNELS, caption_of, rate_text
 from fusion.report.wording import duration, join, measured, number, p_value
@@ -33,7 +33,7 @@ def describe_correlation(
     return {
         "headline": _headline(found),
         "sentences": [*_sentences(found), *_beside(maps, found), _worth(found, joint, duty)],
-        "tell": readable(would_tell(maps, found)),
+        "tell": readable(recommend_measurement(maps, found)),
         "captions": captions,
         "channels": [_channel_row(maps, str(channel)) for channel in maps.coords["channel"].values],
         "modes": _candidate_rows(maps, "modes", "mode"),
@@ -46,7 +46,7 @@ def describe_correlation(
     }
 
 
-def _headline(found: Found) -> str:
+def _headline(found: LeadingSource) -> str:
     if found.verdict == "not separable":
         return "These data cannot tell: the whole session is one warm-up, in which every temperature rises like every drift."
     if found.verdict == "not attributable":
@@ -57,7 +57,7 @@ def _headline(found: Found) -> str:
     )
 
 
-def _sentences(found: Found) -> list[str]:
+def _sentences(found: LeadingSource) -> list[str]:
     """Size, lag and place of the leading candidate, and what cannot be told from it."""
     what = (
         "a cell"
@@ -75,7 +75,7 @@ def _sentences(found: Found) -> list[str]:
     return sentences
 
 
-def _beside(maps: xr.DataTree, found: Found) -> list[str]:
+def _beside(maps: xr.DataTree, found: LeadingSource) -> list[str]:
     """Which other modes add to the leading one, and which pass but may only warm with it."""
     if found.verdict != "attributable" or found.kind != "mode":
         return []
@@ -102,7 +102,7 @@ def _beside(maps: xr.DataTree, found: Found) -> list[str]:
     return sentences
 
 
-def _worth(found: Found, joint: Mapping[str, Any] | None, duty: xr.Dataset | None) -> str:
+def _worth(found: LeadingSource, joint: Mapping[str, Any] | None, duty: xr.Dataset | None) -> str:
     """Whether this is a cause: where two sessions agree, or where the duty was randomised."""
     causes = [] if duty is None else [str(name) for name in duty["source"].values[(duty["p_value"] <= LEVEL).values]]
     if causes:

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from fusion.attribution.family_wise import CHECKS
+from fusion.attribution.family_wise import CHECKS, LEVEL
 from fusion.report.wording import duration, number, p_value
 from interferometry.figures import ARROWS, COLOURS, INK, MARKERS, MUTED, STYLE, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-LEVEL = 0.05
 #: Parts of the drift as the correlation names them, in plain words.
 CHANNELS = {
     "common": "drift common to all positions",

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from fusion.attribution.drift_channels import TargetSeries
 from fusion.attribution.family_wise import LAGS_S, FieldSeries
 from fusion.attribution.per_target import screen
 from fusion.attribution.warm_up import Excitation
@@ -42,10 +43,10 @@ def cost(work: Callable[[], object]) -> tuple[float, float]:
 def run(
     values: np.ndarray, seen: FieldSeries, permutations: int, lags: tuple[float, ...] = LAGS_S
 ) -> Callable[[], object]:
+    directions = ("positive",) * len(values)
+    series = TargetSeries(directions, np.arange(1, len(values) + 1), values, SECONDS, np.eye(CYCLES))
     return lambda: screen(
-        values,
-        SECONDS,
-        np.eye(CYCLES),
+        series,
         seen,
         VARIED,
         lags_s=lags,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from tests.fusion import film_simulator as simulator
+from tests.fusion import field_simulator as simulator
 
 #: Simulated cause -> cause that the diagnosis must name.
 CAUSES = {

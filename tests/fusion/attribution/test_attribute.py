@@ -9,7 +9,7 @@ from statsmodels.stats.proportion import proportion_confint
 
 from fusion.attribution.attribute import ATTRIBUTABLE, NOT_SEPARABLE, CorrelationError, correlate
 from fusion.attribution.leading_source import find_source
-from tests.fusion import film_simulator as simulator
+from tests.fusion import field_simulator as simulator
 
 #: Plain correlation beyond this is "significant" at 0.05 for 100 independent values.
 NAIVE_LIMIT = 0.1966

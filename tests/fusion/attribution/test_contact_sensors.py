@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fusion.attribution.contact_sensors import FOLDS, Excess, choose_sensors
-from tests.fusion import film_simulator as simulator
+from tests.fusion import field_simulator as simulator
 
 RUNS = int(os.environ.get("THERMOFUSE_RUNS", "100"))
 

@@ -82,7 +82,7 @@ def test_redrawn_series_have_the_fitted_drift(rng):
     values = np.cumsum(rng.standard_normal(100)) * 0.5 + 0.1 * rng.standard_normal(100)
     bank = null_bank(values, seconds, np.ones(100), np.ones((100, 1)))
     orders = np.argsort(rng.random((400, 100)), axis=1)
-    drawn = resample(bank, orders, rng)
+    drawn = resample(bank, orders, rng=rng)
     # Increments carry the drift: 99 measured ones know their size to 7 %, the draws add the spread of the grid (factor 3 in size).
     assert np.diff(drawn, axis=1).std() == pytest.approx(np.diff(values).std(), rel=0.35)
 

@@ -1,12 +1,12 @@
-"""Regions, modes, the session's answer and clusters of films of known truth."""
+"""Regions, thermal modes and clusters of fields of known truth."""
 
 import numpy as np
 import pytest
 
 from fusion.attribution.attribute import correlate
-from fusion.attribution.leading_source import find_source, would_tell
+from fusion.attribution.leading_source import find_source
 from fusion.attribution.thermal_modes import RegionError, cluster_cells, disc, localise_modes, read_regions, varimax
-from tests.fusion import film_simulator as simulator
+from tests.fusion import field_simulator as simulator
 
 SOURCES = [disc(f"source {k}", 10 * c + 5, 10 * r + 5, 30) for k, (r, c) in enumerate(simulator.SOURCES)]
 
@@ -38,40 +38,6 @@ def test_every_target_is_tested_against_every_region(maps):
     # Common and stretch add up at the far end and cancel at target 1, which then does not move with the source.
     assert float(p.sel(series="positive 16")) <= 0.05
     assert float(p.sel(series="positive 1")) > 0.05
-
-
-def test_the_answer_comes_from_the_mode_of_the_right_source(maps):
-    found = find_source(maps)
-    assert (found.verdict, found.kind) == ("attributable", "mode")
-    assert simulator.distance_cells(found.y_mm / 10 - 0.5, found.x_mm / 10 - 0.5, 1) <= 5
-    assert found.others_mm == ()
-    assert 20.0 < found.width_mm < 120.0
-    assert float(np.nanmax(maps["modes/pattern"])) == pytest.approx(1.0)
-    assert "A second session that finds the same place" in would_tell(maps, found)
-
-
-def test_without_a_finding_the_answer_says_what_would_tell(rng):
-    made = simulator.null_session("rw", rng)
-    maps = correlate(made.fused, made.field[:, ::4, ::4], draws=99, checks=1)
-    found = find_source(maps)
-    assert found.verdict == "not attributable" and found.p_value > 0.05
-    text = would_tell(maps, found)
-    assert f"From {found.detectable_um_per_K:.2g} um/K on" in text
-    assert f'--noise "{float(maps["noise"].sel(channel="common")):.2g} um"' in text
-
-
-def test_places_that_warm_alike_are_named_as_equal(rng):
-    """Two halos of one switched source: nothing can tell which of them drives the axis."""
-    course = simulator.source_responses("duty", rng)[1][:, 1]
-    row, column = np.mgrid[: simulator.ROWS, : simulator.COLUMNS]
-    halos = sum(np.exp(-((row - r) ** 2 + (column - c) ** 2) / 50.0) for r, c in simulator.SOURCES[1:])
-    film = 3.0 * np.multiply.outer(course, halos) + 0.03 * rng.standard_normal((simulator.CYCLES, *row.shape))
-    made = simulator.session(film, 3 * course, 3 * course, rng)
-    found = find_source(correlate(made.fused, made.field[:, ::2, ::2], draws=99, checks=1))
-    assert found.verdict == "attributable"
-    places = [(found.x_mm, found.y_mm), *found.others_mm]
-    for r, c in simulator.SOURCES[1:]:
-        assert min(np.hypot(x - (10 * c + 5), y - (10 * r + 5)) for x, y in places) <= 50.0
 
 
 def modes_of(film, driver, rng):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fusion.attribution.attribute import correlate
-from fusion.attribution.two_sessions import ConjunctionError, agree, compare_sources
-from tests.fusion import film_simulator as simulator
+from fusion.attribution.two_sessions import SessionComparisonError, compare_sessions
+from tests.fusion import field_simulator as simulator
 
 
 def maps_of(made):
@@ -17,23 +17,23 @@ def first():
     return maps_of(simulator.driven_session(np.random.default_rng(8), source=0))
 
 
-def verdict(found, channel="joint"):
-    return next(one for one in found if one.channel == channel)
+def verdict(comparison, channel="joint"):
+    return next(agreement for agreement in comparison.channels if agreement.channel == channel)
 
 
 def test_a_source_that_both_sessions_show_is_a_cause(first):
     second = maps_of(simulator.driven_session(np.random.default_rng(9), source=0))
-    joined, found = agree(first, second)
-    joint = verdict(found)
+    comparison = compare_sessions(first, second)
+    joint = verdict(comparison)
     assert joint.verdict == "attributable"
     assert joint.p_value <= 0.05
     assert simulator.distance_cells(joint.y_mm / 10 - 0.5, joint.x_mm / 10 - 0.5, 0) <= 7
-    assert (joined["p_value"].sel(channel="joint") <= 0.05).any()
+    assert (comparison.maps["p_value"].sel(channel="joint") <= 0.05).any()
 
 
 def test_each_source_is_listed_once_with_what_both_sessions_show(first):
     second = maps_of(simulator.driven_session(np.random.default_rng(9), source=0))
-    sources = compare_sources(first, second)
+    sources = compare_sessions(first, second).sources
     (cause,) = [one for one in sources if one.cause]
     assert cause.shown_by == (0, 1)
     assert simulator.distance_cells(cause.y_mm / 10 - 0.5, cause.x_mm / 10 - 0.5, 0) <= 5
@@ -45,7 +45,7 @@ def test_each_source_is_listed_once_with_what_both_sessions_show(first):
 
 def test_a_source_of_one_session_is_listed_as_its_own(first):
     second = maps_of(simulator.driven_session(np.random.default_rng(9), source=0, um_per_unit=0.0))
-    alone = compare_sources(first, second)
+    alone = compare_sessions(first, second).sources
     assert {one.shown_by for one in alone} == {(0,)}
     assert min(simulator.distance_cells(one.y_mm / 10 - 0.5, one.x_mm / 10 - 0.5, 0) for one in alone) <= 5
     assert all(one.p_value[0] <= 0.05 < one.p_value[1] for one in alone)
@@ -53,28 +53,28 @@ def test_a_source_of_one_session_is_listed_as_its_own(first):
 
 def test_what_only_one_session_shows_is_not(first):
     second = maps_of(simulator.driven_session(np.random.default_rng(9), source=0, um_per_unit=0.0))
-    _, found = agree(first, second)
-    assert {one.verdict for one in found} == {"not attributable"}
-    assert verdict(found).reason == "no place is found by both sessions"
+    comparison = compare_sessions(first, second)
+    assert {agreement.verdict for agreement in comparison.channels} == {"not attributable"}
+    assert verdict(comparison).reason == "no place is found by both sessions"
 
 
 def test_opposite_signs_do_not_agree(first):
     second = maps_of(simulator.driven_session(np.random.default_rng(9), source=0, um_per_unit=-3.0))
-    joint = verdict(agree(first, second)[1])
+    joint = verdict(compare_sessions(first, second))
     assert joint.verdict == "not attributable"
     assert joint.sensitivity_um_per_K[0] * joint.sensitivity_um_per_K[1] < 0
 
 
 def test_two_warm_ups_are_not_separable():
     sessions = [maps_of(simulator.null_session("warm", np.random.default_rng(seed))) for seed in (1, 2)]
-    assert {one.verdict for one in agree(*sessions)[1]} == {"not separable"}
+    assert {agreement.verdict for agreement in compare_sessions(*sessions).channels} == {"not separable"}
 
 
 def test_other_plans_are_refused(first):
-    with pytest.raises(ConjunctionError, match="the plan grids differ along x"):
-        agree(first, first.isel(x=slice(0, 5)))
+    with pytest.raises(SessionComparisonError, match="the plan grids differ along x"):
+        compare_sessions(first, first.isel(x=slice(0, 5)))
 
 
 def test_other_channels_are_refused(first):
-    with pytest.raises(ConjunctionError, match="share no drift channel"):
-        agree(first.sel(channel=["common"]), first.sel(channel=["reversal"]))
+    with pytest.raises(SessionComparisonError, match="share no drift channel"):
+        compare_sessions(first.sel(channel=["common"]), first.sel(channel=["reversal"]))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fusion.attribution.warm_up import describe_excitation, thermal_modes, warm_up_columns
-from tests.fusion import film_simulator as simulator
+from fusion.attribution.warm_up import Excitation, describe_excitation, nuisance_columns, thermal_modes, warm_up_columns
+from tests.fusion import field_simulator as simulator
 
 SECONDS = np.arange(simulator.CYCLES) * simulator.PERIOD_S
 
@@ -27,16 +27,16 @@ def test_modes_above_the_noise_are_counted_and_rebuild_the_film(rng):
 def test_noise_alone_has_no_modes(rng):
     noise = 0.03 * rng.standard_normal((100, 500))
     assert thermal_modes(noise - noise.mean(axis=0))[0].shape[1] == 0
-    found = describe_excitation(SECONDS, noise)
-    assert not found.warm_up_only
-    assert found.name == "varied"
+    excitation = describe_excitation(noise, SECONDS)
+    assert not excitation.warm_up_only
+    assert excitation.name == "varied"
 
 
 @pytest.mark.parametrize(("kind", "only"), [("warm", True), ("duty", False), ("rw", False)])
 def test_one_warm_up_is_told_from_switched_and_wandering_films(kind, only):
     for seed in range(5):
         film = simulator.film(kind, np.random.default_rng([seed, 6]))
-        assert describe_excitation(SECONDS, flat(film)).warm_up_only is only
+        assert describe_excitation(flat(film), SECONDS).warm_up_only is only
 
 
 def test_exponentials_of_other_constants_are_within_reach_of_the_columns():
@@ -46,3 +46,9 @@ def test_exponentials_of_other_constants_are_within_reach_of_the_columns():
         rest = course - columns @ np.linalg.lstsq(columns, course, rcond=None)[0]
         # Far less than the hundredth of the variance that decides between a warm-up and more.
         assert rest.var() < 1e-3 * course.var()
+
+
+def test_a_warm_up_that_dominates_becomes_part_of_every_hypothesis():
+    assert nuisance_columns(SECONDS, Excitation(0.94, False, 3)).shape == (100, 2)
+    protected = nuisance_columns(SECONDS, Excitation(0.96, False, 3))
+    np.testing.assert_array_equal(protected[:, 2:], warm_up_columns(SECONDS))

@@ -7,7 +7,7 @@ import pytest
 
 from fusion.diagnosis.diagnose import CHECKS, THRESHOLDS, diagnose
 from fusion.diagnosis.explanations import DiagnosisError
-from tests.fusion import film_simulator as simulator
+from tests.fusion import field_simulator as simulator
 from tests.fusion.residual_simulator import CAUSES, odd_position
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fusion.attribution.two_sessions import ConjunctionError, SourceAgreement
+from fusion.attribution.two_sessions import SessionComparisonError, SourceAgreement
 from fusion.pipeline.two_campaigns import join_campaigns, source_row
 from fusion.products.store import read_dataset, read_tree, write_dataset
 
@@ -43,7 +43,7 @@ def test_other_grids_are_refused(folders: list[Path], tmp_path: Path) -> None:
         if "x" in group.to_dataset(inherit=False).coords:
             group.coords["x"] = group["x"] + 7.0
     write_dataset(folders[1] / "fusion.nc", fusion)
-    with pytest.raises(ConjunctionError, match="the plan grids differ along x"):
+    with pytest.raises(SessionComparisonError, match="the plan grids differ along x"):
         join_campaigns(folders, tmp_path)
 
 

@@ -1,0 +1,45 @@
+"""A patch that switches like a reflection is found; heat, camera offsets and noise are not taken for one."""
+
+import numpy as np
+import pytest
+
+from fusion.alignment.reflection_patch import find_switching_patch
+
+FRAMES, ROWS, COLUMNS = 60, 12, 20
+
+
+@pytest.fixture
+def warming(rng):
+    """A table that warms from one corner, with the noise of a camera."""
+    row, column = np.mgrid[:ROWS, :COLUMNS]
+    halo = np.exp(-(row**2 + column**2) / 60.0)
+    course = 5.0 * (1.0 - np.exp(-np.arange(FRAMES) / 20.0))
+    return np.multiply.outer(course, halo) + 0.03 * rng.standard_normal((FRAMES, ROWS, COLUMNS))
+
+
+def test_a_switching_patch_is_found_with_its_size(warming):
+    on = np.zeros(FRAMES)
+    on[20:35] = 1.5
+    warming[:, 3:6, 8:12] += on[:, None, None]
+    warming[:, 0, 0] = np.nan
+    patch = find_switching_patch(warming)
+    assert patch is not None
+    assert patch.pattern[3:6, 8:12].mean() == pytest.approx(1.0, abs=0.1)
+    assert np.abs(patch.pattern[8:]).max() < 0.1 and patch.pattern[0, 0] == 0.0
+    # Noise of 0.03 K over 12 cells, added up over two jumps.
+    assert patch.course[25] == pytest.approx(1.5, abs=0.1)
+    assert patch.course[-1] == pytest.approx(0.0, abs=0.1)
+
+
+def test_heat_and_noise_are_no_patch(warming):
+    assert find_switching_patch(warming) is None
+
+
+def test_a_camera_offset_is_no_patch(warming):
+    warming[30:] += 1.0
+    assert find_switching_patch(warming) is None
+
+
+def test_a_short_recording_has_no_patch(warming):
+    warming[4:, 3:6, 8:12] += 2.0
+    assert find_switching_patch(warming[:8]) is None
