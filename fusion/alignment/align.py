@@ -149,6 +149,20 @@ def align(
     -----
     An axis that expands freely from its position 0 with coefficient alpha moves the reading at X by ``alpha`` times ``axis_integral``
     (docs/method/fields.md).
+
+    Examples
+    --------
+    >>> dims = ("cycle", "direction", "target")
+    >>> start = np.datetime64("2026-03-09T08:00", "ns")
+    >>> frames = np.stack([np.full((5, 15), 20.0), np.full((5, 15), 22.0)])  # the table warms by 2 K
+    >>> time = start + np.array([0, 660], "timedelta64[s]")
+    >>> plan = {"time": time, "y": 10.0 * np.arange(5), "x": 10.0 * np.arange(15)}
+    >>> fields = xr.Dataset({"frame_temperature": (("time", "y", "x"), frames)}, plan)
+    >>> deviations = xr.Dataset({name: (dims, np.zeros((2, 1, 2))) for name in ("deviation", "quality_flag")})
+    >>> deviations["time"] = dims, start + np.array([[[0, 60]], [[600, 660]]], "timedelta64[s]")
+    >>> deviations["position"] = "target", [0.0, 100.0]
+    >>> align(deviations, fields, AxisGeometry((20.0, 20.0), (1.0, 0.0)))["axis_integral"].values[-1, 0].round(6).tolist()
+    [0.0, 200.0]
     """
     frame_time = fields["time"].values.astype("datetime64[ns]")
     reading_time = deviations["time"].values.astype("datetime64[ns]")
@@ -158,12 +172,7 @@ def align(
 
     fused = deviations[["deviation", "time", "position", "quality_flag"]].copy()
     fused["inside_frames"] = (_DIMS, inside, {"long_name": "the reading lies between the first and the last frame"})
-    for name, values in series.items():
-        at_readings = interpolate_series(reading_time, frame_time, values)
-        fused[name] = (_DIMS, np.where(inside, at_readings, np.nan), _ATTRIBUTES[name])
-        dims = ("frame_time",) if values.ndim == 1 else ("frame_time", "target")
-        fused[f"{name}_series"] = (dims, values, _ATTRIBUTES[name])
-    fused = fused.assign_coords(frame_time=frame_time)
+    fused = _add_series(fused.assign_coords(frame_time=frame_time), series)
     for table, dim in ((environment, "environment_time"), (drivers, "driver_time")):
         if table is not None:
             fused = _add_table(fused, table, dim)
@@ -178,6 +187,21 @@ _ATTRIBUTES: dict[str, dict[str, str]] = {
     "patch_mean_rise": {"units": "K", "long_name": "share of a switching patch in the mean rise", **_DIFFERENCE},
     "patch_axis_integral": {"units": "K mm", "long_name": "share of a switching patch in the axis integral"},
 }
+
+
+def _add_series(fused: xr.Dataset, series: dict[str, Array]) -> xr.Dataset:
+    """Add every reduced field: at the readings inside the frames' time, and as a series on the times of the frames."""
+    for name, values in series.items():
+        at_readings = interpolate_series(fused["time"].values, fused["frame_time"].values, values)
+        inside = fused["inside_frames"].values
+        dims = ("frame_time",) if values.ndim == 1 else ("frame_time", "target")
+        fused = fused.assign(
+            {
+                name: (_DIMS, np.where(inside, at_readings, np.nan), _ATTRIBUTES[name]),
+                f"{name}_series": (dims, values, _ATTRIBUTES[name]),
+            }
+        )
+    return fused
 
 
 def _reduce_fields(fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -> dict[str, Array]:

@@ -148,11 +148,6 @@ class Readings:
         return np.searchsorted(self.targets, self.target)
 
     @property
-    def site(self) -> NDArray[np.int64]:
-        """Index of each reading's site, (n,): twice the index of the target, plus 1 for a negative approach."""
-        return self.target_index * 2 + (self.sign < 0)
-
-    @property
     def profile(self) -> Array:
         """Regressors of the static profile, (n, k): a constant per target, and a reversal per target with both approaches."""
         one_hot = (self.target_index[:, None] == np.arange(self.targets.size)).astype(float)

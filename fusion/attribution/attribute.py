@@ -114,13 +114,24 @@ def correlate(
     ------
     CorrelationError, ChannelError, RegionError
         If no cell is seen, too few frames or cycles remain, or a region contains no seen cell.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> time = np.datetime64("2026-03-09T08", "ns") + 300 * np.arange(40) * np.timedelta64(1, "s")
+    >>> plan = {"time": time, "y": [0.0, 10.0, 20.0], "x": [0.0, 10.0, 20.0, 30.0]}
+    >>> field = xr.DataArray(rng.normal(size=(40, 3, 4)).cumsum(axis=0), plan, tuple(plan))
+    >>> drift = field.sel(x=20, y=10).values + 0.1 * rng.normal(size=40)
+    >>> readings = xr.Dataset({"deviation": ("cycle", drift), "time": ("cycle", time)}).expand_dims(direction=["positive"], target=[1])
+    >>> maps = correlate(readings.assign(position=("target", [0.0]), cycle=range(40)), field, draws=99, checks=0)
+    >>> maps.attrs["verdict"], round(float(maps["sensitivity"].sel(channel="common", x=20, y=10)), 2)
+    ('attributable', 1.02)
     """
     if field.dims != ("time", "y", "x"):
         raise CorrelationError(f"field has dims {field.dims}; expected ('time', 'y', 'x')")
     readings = clock_readings(fused_readings, field["time"].values.astype("datetime64[ns]"))
-    session = _Session.prepare(
-        readings, _Candidates.collect(field, readings.frame_seconds, regions), lags_s, draws, seed
-    )
+    candidates = _Candidates.collect(field, readings.frame_seconds, regions)
+    session = _Session.prepare(readings, candidates, lags_s, draws, seed)
     return session.describe(session.evaluate(checks, progress), readings, per_target=per_target)
 
 
