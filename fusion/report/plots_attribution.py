@@ -117,14 +117,14 @@ def plot_region_targets(targets: xr.Dataset, region: str, position: xr.DataArray
     """Plot the sensitivity of every target and direction to one region, by itself, with its 95 % interval; filled where p is up to 0.05."""
     ax = new_axes(ax)
     one = targets.sel(region=region)
-    names = [str(name).split() for name in one["series"].values]
+    sides, targets_of = one["series_direction"].values, one["series_target"].values
     place = {int(target): float(mm) for target, mm in zip(position["target"].values, position.values, strict=True)}
     step = float(np.median(np.diff(np.sort(position.values)))) if position.size > 1 else 1.0
     for shift, direction in ((-0.1, "positive"), (0.1, "negative")):
-        rows = [k for k, (side, _) in enumerate(names) if side == direction]
-        if not rows:
+        rows = np.flatnonzero(sides == direction)
+        if not rows.size:
             continue
-        x = np.array([place[int(names[k][1])] for k in rows]) + shift * step
+        x = np.array([place[int(number)] for number in targets_of[rows]]) + shift * step
         value, u = one["sensitivity"].values[rows], one["sensitivity_u"].values[rows]
         passed = one["p_value"].values[rows] <= LEVEL
         colour = COLOURS[direction]
