@@ -8,7 +8,7 @@ import pytest
 
 from tests.thermography.plan_scene import DISCS, GRID, START, Scene, cell_truth, record
 from thermography.fields.still import reduce_frames
-from thermography.registration.displacement import image_shift, shifted
+from thermography.registration.displacement import image_shift, shift_registration
 from thermography.registration.register import register
 
 BARE = Scene(discs=())
@@ -34,7 +34,7 @@ def test_pictures_that_do_not_agree_give_no_shift(rng, registration):
 
 def test_shifted_registration_puts_the_plan_where_the_picture_went(registration):
     moved = replace(Scene(disc_K=-4.0), shift_px=(3.0, -2.0))
-    assert moved.registration_rms_mm(shifted(registration, np.array([3.0, -2.0]))) < 0.03
+    assert moved.registration_rms_mm(shift_registration(registration, np.array([3.0, -2.0]))) < 0.03
 
 
 def test_knock_while_the_discs_have_no_contrast_is_found_and_mended(rng, registration, tmp_path):
