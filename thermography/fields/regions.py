@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from thermography._typing import Array
 from thermography.fields.cycle_fields import pixel_noise
-from thermography.polygon import Polygon, PolygonError
+from thermography.registration.polygon import Polygon, PolygonError
 
 #: Cells of which more than this share lies in a region are included in its median, minimum and maximum.
 _INSIDE = 0.5

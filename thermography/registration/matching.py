@@ -158,7 +158,8 @@ def _support(matrices: Array, plan: Array, image: Array, fiducials: Sequence[Fid
     for start in range(0, len(matrices), _HYPOTHESES_AT_ONCE):
         part = slice(start, start + _HYPOTHESES_AT_ONCE)
         distance = np.linalg.norm(places[part, :, None, :] - image[None, None, :, :], axis=-1)
-        fits = np.abs(np.log(areas / expected[part, :, None])) < np.log(2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            fits = np.abs(np.log(areas / expected[part, :, None])) < np.log(2)
         relative = np.where(fits, distance, np.inf) / _ARRANGEMENT_TOLERANCE_PX
         support[part] = (1 - np.minimum(relative, 1).min(axis=2)).sum(axis=1)
     support[~in_front] = 0

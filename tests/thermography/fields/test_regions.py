@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from thermography.fields.regions import region_series
-from thermography.polygon import PolygonError
+from thermography.registration.polygon import PolygonError
 
 X, Y = np.arange(140) * 5.0 + 2.5, np.arange(36) * 5.0 + 2.5
 TIMES = np.datetime64("2026-03-09T06:00:00", "ns") + np.arange(4) * np.timedelta64(60, "s")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thermography.polygon import Polygon, PolygonError
+from thermography.registration.polygon import Polygon, PolygonError
 
 X, Y = np.arange(20) * 5.0 + 2.5, np.arange(10) * 5.0 + 2.5
 
