@@ -43,7 +43,7 @@ _ATTRIBUTES: dict[str, dict[str, Any]] = {
     },
     "temperature_u": {
         "long_name": "standard uncertainty of the mean temperature from pixel noise and registration",
-        "comment": "what all cells share (emissivity, reflections, the camera's scale) is not in it",
+        "comment": "errors common to all cells (emissivity, reflected apparent temperature, calibration of the camera) are not included",
         **_KELVIN,
     },
     "temperature_rise": {
@@ -67,15 +67,15 @@ _ATTRIBUTES: dict[str, dict[str, Any]] = {
     "count": {"long_name": "frames averaged", "units": "1"},
     "quality_flag": {
         "standard_name": "quality_flag",
-        "long_name": "what limits the temperature of the cell",
+        "long_name": "limitations of the temperature of the cell",
         "flag_masks": np.array(list(_FLAGS.values()), np.uint8),
         "flag_meanings": " ".join(_FLAGS),
     },
     "position_u": {
-        "long_name": "standard uncertainty of the place of a cell on the sensor, as length on the plan",
+        "long_name": "standard uncertainty of the position of a cell on the plan from the registration",
         "units": "mm",
     },
-    "coverage": {"long_name": "part of the cell's area that is seen unmasked", "units": "1"},
+    "coverage": {"long_name": "share of the cell's area that is seen unmasked", "units": "1"},
     "frame_temperature": {
         "standard_name": "surface_temperature",
         "long_name": "mean surface temperature over a frame or a short block of frames",

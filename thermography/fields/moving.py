@@ -48,7 +48,10 @@ _ATTRIBUTES: dict[str, dict[str, Any]] = {
         "long_name": "displacement of the table across the axis since the registered frame",
         "units": "mm",
     },
-    "table_discs": {"long_name": "fiducials that place the table in the frame, 0 where it is not found", "units": "1"},
+    "table_discs": {
+        "long_name": "fiducials that locate the table in the frame, 0 where it is not located",
+        "units": "1",
+    },
     "frame_time": {"standard_name": "time", "long_name": "time of the frame", "units_metadata": "leap_seconds: utc"},
 }
 

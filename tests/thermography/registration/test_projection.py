@@ -44,10 +44,10 @@ def test_centroid_of_a_disc_is_the_centre_of_its_conic():
     centre = np.linalg.solve(conic[:2, :2], -conic[:2, 2])
     shift = centre - tilted.to_sensor(np.array([x, y]))
     assert np.hypot(*shift) > 0.3
-    found = tilted.disc_centroids(np.array([[x, y]]), np.array([radius]))[0]
+    centroid = tilted.disc_centroids(np.array([[x, y]]), np.array([radius]))[0]
     # The inscribed polygon of 24 corners has (2 + cos 15 deg) / 3 of the circle's second moment, to which the shift is proportional.
     share = (2 + np.cos(2 * np.pi / 24)) / 3
-    np.testing.assert_allclose(found, centre - (1 - share) * shift, atol=1e-3 * np.hypot(*shift))
+    np.testing.assert_allclose(centroid, centre - (1 - share) * shift, atol=1e-3 * np.hypot(*shift))
 
 
 def test_exact_points_give_the_exact_projection_and_the_simplest_model():
