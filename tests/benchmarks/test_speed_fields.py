@@ -23,7 +23,7 @@ from thermography.io.flir import index_frames
 from thermography.io.flir_writer import write_sequence
 from thermography.io.frame import CameraIdentity, Frame
 from thermography.radiometry.planck import counts_from_temperature, override
-from thermography.registration.displacement import RegisteredFrom
+from thermography.registration.displacement import RegistrationSpan
 from thermography.registration.register import register
 
 pytestmark = pytest.mark.slow
@@ -164,7 +164,7 @@ def test_recalibration_of_100_cycles(film: Path, registration, tmp_path: Path) -
     again, whole = take_turns(
         lambda: recalibrate(
             tmp_path,
-            [RegisteredFrom(0, registration)],
+            [RegistrationSpan(0, registration)],
             GRID,
             100,
             lambda parameters: override(parameters, emissivity=0.9),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import cv2
@@ -14,6 +14,7 @@ from thermography.io.flir_writer import write_sequence
 from thermography.io.frame import CameraParameters, Frame
 from thermography.radiometry.planck import counts_from_temperature
 from thermography.registration.plan import Fiducial, PlanGrid
+from thermography.registration.register import Registration, register_points
 
 GRID = PlanGrid(700, 180, 5)
 PLACES = [
@@ -164,3 +165,11 @@ def cell_truth(field=smooth_field, grid=GRID):
     y = (np.arange(grid.shape[0] * 10) + 0.5) * fine
     values = field(*np.meshgrid(x, y))
     return values.reshape(grid.shape[0], 10, grid.shape[1], 10).mean(axis=(1, 3))
+
+
+def overhead(grid: PlanGrid, discs, *, shape, px_per_mm: float, origin_px=(0.0, 0.0)) -> Registration:
+    """Registration of a camera that looks straight down: plan (0, 0) at `origin_px`, no distortion; exact to 1e-9 px."""
+    corners = [(0, 0), (grid.width_mm, 0), (0, grid.height_mm), (grid.width_mm, grid.height_mm)]
+    listed = [Fiducial(f"C{i}", x, y, 1e-6) for i, (x, y) in enumerate(corners)]
+    picked = {c.name: (origin_px[0] + px_per_mm * c.x_mm, origin_px[1] + px_per_mm * c.y_mm) for c in listed}
+    return replace(register_points(picked, listed, shape), masked=tuple(discs))

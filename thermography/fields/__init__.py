@@ -1,1 +1,1 @@
-"""Frames become one temperature field per cycle (level 3): still and moving table, hotspots, series of regions."""
+"""Temperature fields on the table plan, one per measurement cycle, from frames of a still or a moving table; hotspots and regions."""

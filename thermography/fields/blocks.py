@@ -1,14 +1,15 @@
-"""Blocks of frames: cut, and reduced to the mean and variance of every pixel's temperature."""
+"""Blocks of consecutive frames: cut, and reduced to the mean and variance of every pixel's temperature."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from thermography._typing import Array
 from thermography.fields.cycle_fields import noise_of_differences
+from thermography.fields.inputs import FrameSeries
 from thermography.fields.resampling import PlanWeights
 from thermography.io.flir import FrameReference
 from thermography.io.frame import CameraParameters
@@ -22,29 +23,27 @@ from thermography.radiometry.averaging import (
     mean_temperature,
 )
 from thermography.radiometry.planck import calibrate
-from thermography.registration.displacement import RegisteredFrom, Watch
+from thermography.registration.displacement import FiducialMonitor, RegistrationSpan
 
-Override = Callable[[FrameReference], CameraParameters]
-
-#: Most frames of one block: what a cluster computes at once, and what is lost when a run is broken off.
+#: Largest number of frames of one block: the unit of work of a cluster, and what is lost when a run is interrupted.
 BLOCK_FRAMES = 512
-#: Corrections within a block differ by no more than this.
-CORRECTION_STEP_K = 2e-3
+#: Largest difference of the corrections within a block, K.
+_CORRECTION_STEP_K = 2e-3
 
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive frames that are reduced together: same cycle, registration and parameters, close in time.
+    """Consecutive frames that are reduced together: same cycle, registration and camera parameters, close in time.
 
     Attributes
     ----------
-    first, stop
-        Frames `first` to `stop` - 1, indices into the references.
-    cycle
-        Index of their cycle, `thermography.fields.cycle_fields.NOT_NUMBERED` for none.
-    span
-        Index of their registration.
-    parameters
+    first, stop : int
+        Frames `first` to ``stop - 1``.
+    cycle : int
+        Index of their cycle, `thermography.fields.inputs.NO_CYCLE` for none.
+    span : int
+        Index of their registration span.
+    parameters : CameraParameters
         To calibrate them with.
     """
 
@@ -56,16 +55,36 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Camera:
-    """What a registration makes of the sensor: the weights of the plan's cells and the watch on the fiducials."""
+class RegisteredSensor:
+    """What block reduction needs of a registration.
+
+    Attributes
+    ----------
+    weights : PlanWeights
+        From pixels to the cells of the plan.
+    monitor : FiducialMonitor
+        Of the fiducials within the window of `weights`.
+    """
 
     weights: PlanWeights
-    watch: Watch
+    monitor: FiducialMonitor
 
 
 @dataclass(frozen=True)
 class BlockResult:
-    """Temperature of the window's pixels over a block, the field on the plan, the shift of every frame, and the sums of the counts."""
+    """The reduction of one block.
+
+    Attributes
+    ----------
+    temperature : MeanTemperature
+        Mean and variance over the frames for the pixels of the window, degC.
+    cells : (y, x) ndarray, degC
+        Mean temperature on the plan.
+    shift_px : (frames, 2) ndarray, px
+        Shift (column, row) of the fiducials in every frame; NaN where they have no contrast.
+    statistics : CountStatistics or None
+        Sums of the counts, if they are kept.
+    """
 
     temperature: MeanTemperature
     cells: Array
@@ -74,86 +93,113 @@ class BlockResult:
 
 
 def cut_blocks(
-    references: Sequence[FrameReference],
-    times: Array,
-    cycles: Array,
-    spans: Sequence[RegisteredFrom],
-    correction_K: Array,
-    *,
-    override: Override,
-    block_s: float,
-    first: int = 0,
+    frames: FrameSeries, spans: Sequence[RegistrationSpan], *, block_s: float, first: int = 0
 ) -> list[Block]:
-    """Cut the frames from `first` on into blocks: the unit of memory, of `frame_temperature`, and of what a cluster computes."""
-    starts = np.array([span.first for span in spans])
-    span_of = np.searchsorted(starts, np.arange(len(references)), side="right") - 1
+    """Cut frames into blocks: the unit of memory, of `frame_temperature`, and of the work of a cluster.
+
+    Parameters
+    ----------
+    frames : FrameSeries
+    spans : sequence of RegistrationSpan
+        In order, the first one from frame 0 on.
+    block_s : float, s
+        Length of time of a block; 0 gives every frame a block of its own.
+    first : int
+        Frame to start at.
+
+    Returns
+    -------
+    list of Block
+        In order, without gaps, up to the last frame.
+    """
+    times, correction_K = frames.times, frames.correction_K
+    starts = np.array([span.first_frame for span in spans])
+    span_of = np.searchsorted(starts, np.arange(len(frames)), side="right") - 1
     longest = np.timedelta64(round(block_s * 1e9), "ns")
     blocks: list[Block] = []
-    for i in range(first, len(references)):
-        own = Block(i, i + 1, int(cycles[i]), int(span_of[i]), override(references[i]))
+    for i in range(first, len(frames)):
+        parameters = frames.override(frames.references[i])
+        single = Block(i, i + 1, int(frames.cycles[i]), int(span_of[i]), parameters)
         last = blocks[-1] if blocks else None
         if (
             last is not None
-            and (last.cycle, last.span, last.parameters) == (own.cycle, own.span, own.parameters)
+            and (last.cycle, last.span, last.parameters) == (single.cycle, single.span, single.parameters)
             and i - last.first < BLOCK_FRAMES
             and times[i] - times[last.first] < longest
-            and abs(correction_K[i] - correction_K[last.first]) <= CORRECTION_STEP_K
+            and abs(correction_K[i] - correction_K[last.first]) <= _CORRECTION_STEP_K
         ):
             blocks[-1] = replace(last, stop=i + 1)
         else:
-            blocks.append(own)
+            blocks.append(single)
     return blocks
 
 
 def reduce_block(
-    frames: Sequence[FrameReference], parameters: CameraParameters, camera: Camera, keep_statistics: bool = False
+    frames: Sequence[FrameReference],
+    parameters: CameraParameters,
+    sensor: RegisteredSensor,
+    keep_statistics: bool = False,
 ) -> BlockResult:
-    """Read the frames of a block and reduce them; counts are averaged, and calibrated one by one only where they vary too much."""
-    sums = Accumulator(camera.weights.used.shape)
+    """Read the frames of a block and reduce them.
+
+    Counts are averaged before they are calibrated; pixels whose counts vary too much for that are calibrated frame by frame.
+
+    Parameters
+    ----------
+    frames : sequence of FrameReference
+        Of one block.
+    parameters : CameraParameters
+        To calibrate them with.
+    sensor : RegisteredSensor
+        Of their registration.
+    keep_statistics : bool
+        Whether the result contains the sums of the counts.
+
+    Returns
+    -------
+    BlockResult
+    """
+    weights = sensor.weights
+    sums = Accumulator(weights.used.shape)
     shifts, noise = [], np.nan
-    # One buffer for all chunks: fresh memory for each costs more than reading into it.
-    buffer = np.empty((min(CHUNK_FRAMES, len(frames)), *camera.weights.used.shape), np.uint16)
-    with WindowReader(camera.weights.window) as reader:
+    # One buffer for all chunks: allocating memory for each costs more than reading into it.
+    buffer = np.empty((min(CHUNK_FRAMES, len(frames)), *weights.used.shape), np.uint16)
+    with WindowReader(weights.window) as reader:
         for start in range(0, len(frames), CHUNK_FRAMES):
             counts = reader.read(frames[start : start + CHUNK_FRAMES], buffer)
             sums.add(counts)
-            noise = noise_of_differences(counts[0], camera.weights.whole) if start == 0 else noise
-            shifts.append(camera.watch.shifts(counts, noise))
+            noise = noise_of_differences(counts[0], weights.interior) if start == 0 else noise
+            shifts.append(sensor.monitor.shifts(counts, noise))
     statistics = sums.statistics()
     if len(frames) == 1:
-        mean = calibrate(buffer[0], parameters).astype(float)
-        reduced = MeanTemperature(1, mean, np.zeros_like(mean), np.zeros_like(mean))
+        temperature = calibrate(buffer[0], parameters).astype(float)
+        mean = MeanTemperature(1, temperature, np.zeros_like(temperature), np.zeros_like(temperature))
     else:
-        reduced = mean_temperature(statistics, parameters, used=camera.weights.used)
-        _calibrate_one_by_one(
-            reduced,
-            (reduced.bound_K > AVERAGING_LIMIT_K) & camera.weights.used,
-            frames,
-            parameters,
-            camera.weights.window,
-        )
-    cells = camera.weights.resample(reduced.mean)
-    return BlockResult(reduced, cells, np.concatenate(shifts), statistics if keep_statistics else None)
+        mean = mean_temperature(statistics, parameters, used=weights.used)
+        varying = (mean.bound_K > AVERAGING_LIMIT_K) & weights.used
+        if varying.any():
+            _calibrate_per_frame(mean, varying, frames, parameters, weights.window)
+    cells = weights.resample(mean.mean)
+    return BlockResult(mean, cells, np.concatenate(shifts), statistics if keep_statistics else None)
 
 
-def _calibrate_one_by_one(
-    reduced: MeanTemperature,
-    wild: Array,
+def _calibrate_per_frame(
+    mean: MeanTemperature,
+    varying: Array,
     frames: Sequence[FrameReference],
     parameters: CameraParameters,
     window: tuple[slice, slice],
 ) -> None:
-    """Replace mean and variance of the pixels that vary too much for averaged counts, from a second reading of the block."""
-    if not wild.any():
-        return
-    total, squares = np.zeros(int(wild.sum())), np.zeros(int(wild.sum()))
-    reference = reduced.mean[wild]
-    buffer = np.empty((min(CHUNK_FRAMES, len(frames)), *wild.shape), np.uint16)
+    """Replace mean and variance of the varying pixels by those of their calibrated frames, which are read a second time."""
+    pixels = int(varying.sum())
+    total, squares = np.zeros(pixels), np.zeros(pixels)
+    reference = mean.mean[varying]
+    buffer = np.empty((min(CHUNK_FRAMES, len(frames)), *varying.shape), np.uint16)
     with WindowReader(window) as reader:
         for start in range(0, len(frames), CHUNK_FRAMES):
             counts = reader.read(frames[start : start + CHUNK_FRAMES], buffer)
-            step = calibrate(counts[:, wild], parameters).astype(float) - reference
-            total += step.sum(axis=0)
-            squares += (step**2).sum(axis=0)
-    reduced.mean[wild] = reference + total / len(frames)
-    reduced.variance[wild] = np.maximum(squares / len(frames) - (total / len(frames)) ** 2, 0.0)
+            deviation = calibrate(counts[:, varying], parameters).astype(float) - reference
+            total += deviation.sum(axis=0)
+            squares += (deviation**2).sum(axis=0)
+    mean.mean[varying] = reference + total / len(frames)
+    mean.variance[varying] = np.maximum(squares / len(frames) - (total / len(frames)) ** 2, 0.0)

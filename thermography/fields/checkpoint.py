@@ -1,4 +1,4 @@
-"""What a reduction has finished, on disk: to go on after a break, and to calibrate anew without the frames."""
+"""Finished cycles of a reduction on disk: to resume an interrupted run, and to calibrate again without the frames."""
 
 from __future__ import annotations
 
@@ -15,29 +15,39 @@ import xarray as xr
 
 from thermography._typing import Array
 from thermography.errors import ThermographyError
-from thermography.fields.cycle_fields import CyclePart, assemble, position_covariance
+from thermography.fields.cycle_fields import CyclePart, assemble_fields, position_covariance
+from thermography.fields.inputs import FrameSeries
 from thermography.fields.resampling import plan_weights
 from thermography.fields.scheduling import THREADS
 from thermography.io.frame import CameraParameters
 from thermography.radiometry.averaging import CountStatistics, MeanTemperature, mean_temperature
-from thermography.registration.displacement import RegisteredFrom
+from thermography.registration.displacement import RegistrationSpan
 from thermography.registration.plan import PlanGrid
 
 _DESCRIPTION = "reduction.json"
 _KNOCKS = "knocks.json"
-_OPEN = "open.sums"
+_OPEN_CYCLE = "open.sums"
 _PIXELS = ("mean", "variance", "bound_K")
 _CELLS = ("mean", "spread", "noise_variance", "fell_back", "count")
 _SUMS = ("total", "squares", "lowest", "highest")
 
 
 class CheckpointError(ThermographyError):
-    """A folder of finished cycles does not belong to this reduction; the message names it and what to do."""
+    """A checkpoint does not belong to this reduction or holds no sums; the message names it and the remedy."""
 
 
 @dataclass(frozen=True)
-class Group:
-    """Sums over the frames of a cycle that share their parameters, and the mean correction (K) added to their temperature."""
+class ParameterGroup:
+    """Sums over the frames of a cycle that share their camera parameters.
+
+    Attributes
+    ----------
+    parameters : CameraParameters
+    statistics : CountStatistics
+        Sums of the counts of every pixel.
+    correction_K : float, K
+        Mean correction added to their temperature.
+    """
 
     parameters: CameraParameters
     statistics: CountStatistics
@@ -45,8 +55,28 @@ class Group:
 
 
 @dataclass(frozen=True)
-class Finished:
-    """One cycle under one registration, so far or finished: its pixels or cells, its frames' fields and shifts, and its sums of counts."""
+class StoredCycle:
+    """The frames of one cycle under one registration, with those before it that belong to no cycle; finished or open.
+
+    Attributes
+    ----------
+    part : CyclePart
+        Cells of a finished cycle, or pixels of an open one.
+    first_frame, stop_frame : int
+        Frames `first_frame` to ``stop_frame - 1``.
+    blocks : (blocks, 4) ndarray of int
+        First frame, stop frame, cycle and registration span of every block.
+    stack : (blocks, y, x) ndarray of float32, degC
+        Field of every block.
+    shift_px : (frames,) ndarray, px
+        Shift of every frame against its registration; NaN where unchecked.
+    groups : tuple of ParameterGroup
+        Sums of counts.
+    shaken : tuple of int
+        Frames that were displaced alone.
+    baseline_px : (column, row), px
+        Bias of the fiducial monitor after the last frame.
+    """
 
     part: CyclePart
     first_frame: int
@@ -54,20 +84,20 @@ class Finished:
     blocks: Array
     stack: Array
     shift_px: Array
-    groups: tuple[Group, ...] = ()
+    groups: tuple[ParameterGroup, ...] = ()
     shaken: tuple[int, ...] = ()
     baseline_px: tuple[float, float] = (0.0, 0.0)
 
 
 class Checkpoint:
-    """A folder to which finished cycles are written, each file whole or absent.
+    """A folder to which finished cycles are written, each file complete or absent.
 
     Parameters
     ----------
-    folder
-        Made if it does not exist.
-    description
-        Everything on which the result depends; kept beside the cycles, and compared before any of them is used again.
+    folder : str or Path
+        Created if it does not exist.
+    description : dict
+        Everything on which the result depends, as JSON; stored beside the cycles, and compared before any of them is used again.
 
     Raises
     ------
@@ -89,13 +119,13 @@ class Checkpoint:
             )
         path.write_text(text, encoding="utf-8")
 
-    def save(self, finished: Finished) -> None:
-        """Write one finished cycle, or the one that is still open in the place of what was kept of it before."""
-        part = finished.part
+    def save(self, cycle: StoredCycle) -> None:
+        """Write a finished cycle, or replace the stored state of the open one."""
+        part = cycle.part
         source, names = (part, _CELLS) if part.pixels is None else (part.pixels, _PIXELS)
         arrays = {name: getattr(source, name) for name in names}
-        arrays |= {"blocks": finished.blocks, "stack": finished.stack, "shift_px": finished.shift_px}
-        for number, group in enumerate(finished.groups):
+        arrays |= {"blocks": cycle.blocks, "stack": cycle.stack, "shift_px": cycle.shift_px}
+        for number, group in enumerate(cycle.groups):
             arrays |= {f"{name}_{number}": getattr(group.statistics, name) for name in _SUMS}
         header = {
             "cycle": part.cycle,
@@ -103,123 +133,144 @@ class Checkpoint:
             "frames": part.frames,
             "first_time": str(part.first_time),
             "seconds": part.seconds,
-            "first_frame": finished.first_frame,
-            "stop_frame": finished.stop_frame,
-            "shaken": finished.shaken,
-            "baseline_px": finished.baseline_px,
+            "first_frame": cycle.first_frame,
+            "stop_frame": cycle.stop_frame,
+            "shaken": cycle.shaken,
+            "baseline_px": cycle.baseline_px,
             "groups": [
                 {"parameters": asdict(g.parameters), "frames": g.statistics.frames, "correction_K": g.correction_K}
-                for g in finished.groups
+                for g in cycle.groups
             ],
         }
-        name = f"frames_{finished.first_frame:08d}.sums" if part.pixels is None else _OPEN
+        name = f"frames_{cycle.first_frame:08d}.sums" if part.pixels is None else _OPEN_CYCLE
         _write(self.folder / name, header, arrays)
 
     def save_arrays(self, first: int, header: dict[str, Any], arrays: dict[str, Array]) -> None:
-        """Write arrays that belong to the blocks from `first` on."""
+        """Write arrays by name, and a JSON header, that belong to the blocks from index `first` on."""
         _write(self.folder / f"blocks_{first:08d}.sums", header, arrays)
 
     def load_arrays(self) -> list[tuple[dict[str, Any], dict[str, Array]]]:
-        """Everything that `save_arrays` has written, in the order of the blocks."""
+        """Headers and arrays that `save_arrays` has written, in the order of the blocks."""
         return [_read(path) for path in sorted(self.folder.glob("blocks_*.sums"))]
 
-    def note_knock(self, index: int, span: int, shift_px: list[float]) -> None:
-        """Remember that the plan was registered anew from a frame on."""
+    def save_knock(self, index: int, span: int, shift_px: list[float]) -> None:
+        """Store that the table was registered again from frame `index` on: the span before, and the shift (column, row) px."""
         knocks = self.knocks()
         if [index, span, shift_px] not in knocks:
             (self.folder / _KNOCKS).write_text(json.dumps([*knocks, [index, span, shift_px]]), encoding="utf-8")
 
     def knocks(self) -> list[list[Any]]:
-        """Knocks found so far: frame, span before, shift (px)."""
+        """Knocks stored so far: frame, span before, shift (column, row) px."""
         path = self.folder / _KNOCKS
         return list(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else []
 
-    def load(self) -> list[Finished]:
-        """Finished cycles in the order of time, as far as they follow each other without a gap of files."""
+    def load(self) -> list[StoredCycle]:
+        """Finished cycles in the order of time."""
         return [_load(path) for path in sorted(self.folder.glob("frames_*.sums"))]
 
-    def load_open(self) -> Finished | None:
-        """What was kept of the cycle that was open last, if there is any."""
-        path = self.folder / _OPEN
+    def load_open(self) -> StoredCycle | None:
+        """Stored state of the last open cycle, if there is one."""
+        path = self.folder / _OPEN_CYCLE
         return _load(path) if path.exists() else None
 
 
-def describe(
-    references: Sequence[Any], parameters: Sequence[CameraParameters], correction_K: Array, bounds: Array, grid: PlanGrid,
-    spans: Sequence[RegisteredFrom], block_s: float,
-) -> dict[str, Any]:  # fmt: skip
-    """Describe a reduction by what its result depends on; frames, parameters and corrections as a SHA-256."""
-    frames = hashlib.sha256()
-    for reference, own in zip(references, parameters, strict=True):
-        frames.update(f"{reference.path.name}#{reference.index}@{reference.time}|{own}".encode())
-    frames.update(np.ascontiguousarray(correction_K, float).tobytes())
-    places = [
-        {"first": span.first, "plan_to_sensor": span.registration.projection.plan_to_sensor.tolist()} for span in spans
+def describe_reduction(
+    frames: FrameSeries, grid: PlanGrid, spans: Sequence[RegistrationSpan], *, block_s: float
+) -> dict[str, Any]:
+    """Describe a reduction by everything on which its result depends.
+
+    Parameters
+    ----------
+    frames : FrameSeries
+        Names, times, camera parameters and corrections of the frames enter as SHA-256.
+    grid : PlanGrid
+    spans : sequence of RegistrationSpan
+        As given to the reduction, before knocks.
+    block_s : float, s
+        Length of time of a block.
+
+    Returns
+    -------
+    dict
+        As JSON.
+    """
+    digest = hashlib.sha256()
+    parameters = [frames.override(reference) for reference in frames.references]
+    for reference, camera in zip(frames.references, parameters, strict=True):
+        digest.update(f"{reference.path.name}#{reference.index}@{reference.time}|{camera}".encode())
+    digest.update(np.ascontiguousarray(frames.correction_K, float).tobytes())
+    registrations = [
+        {"first": span.first_frame, "plan_to_sensor": span.registration.projection.plan_to_sensor.tolist()}
+        for span in spans
     ]
     return {
-        "frames": frames.hexdigest(),
-        "cycles": np.asarray(bounds, "datetime64[ns]").astype(str).tolist(),
+        "frames": digest.hexdigest(),
+        "cycles": frames.bounds.astype(str).tolist(),
         "plan": asdict(grid),
-        "registrations": places,
+        "registrations": registrations,
         "block_s": block_s,
     }
 
 
 def recalibrate(
     folder: str | Path,
-    registrations: Sequence[RegisteredFrom],
+    spans: Sequence[RegistrationSpan],
     grid: PlanGrid,
     cycles: int,
     change: Callable[[CameraParameters], CameraParameters],
 ) -> xr.Dataset:
-    """Calibrate the cycles of a reduction anew from their stored sums, without the frames.
+    """Calibrate the cycles of a reduction again from their stored sums of counts, without the frames.
 
     Parameters
     ----------
-    folder
-        Checkpoint of a reduction that kept its statistics.
-    registrations, grid, cycles
-        As in that reduction, knocks included.
-    change
-        From the parameters used then to those to use now, for example another emissivity.
+    folder : str or Path
+        Checkpoint of a finished `thermography.fields.still.reduce_frames`.
+    spans : sequence of RegistrationSpan
+        Registrations of that reduction, including those after knocks.
+    grid : PlanGrid
+        The plan of that reduction.
+    cycles : int
+        Number of cycles of that reduction, with or without frames.
+    change : callable
+        From the camera parameters used then to those to use now, for example another emissivity.
 
     Returns
     -------
     xr.Dataset
-        The fields per cycle as `thermography.fields.still.reduce_frames` gives them, without the frame stack.
+        The fields per cycle as `reduce_frames` returns them, without the frame stack.
 
     Raises
     ------
     CheckpointError
-        The folder holds no sums.
+        The folder holds no finished cycle, or no sums.
     """
-    weights = [plan_weights(span.registration, grid) for span in registrations]
+    weights = [plan_weights(span.registration, grid) for span in spans]
 
     def calibrated(path: Path) -> CyclePart:
-        finished = _load(path)
-        if not finished.groups:
+        cycle = _load(path)
+        if not cycle.groups:
             raise CheckpointError(
                 f"{path}: holds no sums of counts; reduce the frames again with their statistics kept"
             )
-        part = finished.part
-        own = weights[part.span]
-        for group in finished.groups:
-            reduced = mean_temperature(group.statistics, change(group.parameters), used=own.used)
-            reduced.mean[...] += group.correction_K
-            part.pixels = reduced if part.pixels is None else part.pixels.merge(reduced)
-        part.finish(own)
+        part = cycle.part
+        plan = weights[part.span]
+        for group in cycle.groups:
+            mean = mean_temperature(group.statistics, change(group.parameters), used=plan.used)
+            mean.mean[...] += group.correction_K
+            part.pixels = mean if part.pixels is None else part.pixels.merge(mean)
+        part.finish(plan)
         return part
 
     with ThreadPoolExecutor(THREADS) as executor:
         parts = list(executor.map(calibrated, sorted(Path(folder).glob("frames_*.sums"))))
     if not parts:
         raise CheckpointError(f"{folder}: holds no finished cycle; reduce the frames first")
-    covariances = [position_covariance(span.registration, grid) for span in registrations]
-    return assemble(parts, cycles, grid, covariances, [one.coverage for one in weights])
+    covariances = [position_covariance(span.registration, grid) for span in spans]
+    return assemble_fields(parts, cycles, grid, covariances, [plan.coverage for plan in weights])
 
 
 def _write(path: Path, header: dict[str, Any], arrays: dict[str, Array]) -> None:
-    """Write a line of JSON, which names the arrays, their types and shapes, and then the arrays themselves, one after the other."""
+    """Write a line of JSON, which gives names, types and shapes of the arrays, then the arrays themselves, one after the other."""
     layout = {name: [array.dtype.str, array.shape] for name, array in arrays.items()}
     temporary = path.with_suffix(".part")
     with temporary.open("wb") as file:
@@ -238,7 +289,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
     return header, arrays
 
 
-def _load(path: Path) -> Finished:
+def _load(path: Path) -> StoredCycle:
     header, arrays = _read(path)
     part = CyclePart(
         header["cycle"], header["span"], header["frames"], np.datetime64(header["first_time"]), header["seconds"]
@@ -249,14 +300,21 @@ def _load(path: Path) -> Finished:
     else:
         part.pixels = MeanTemperature(part.frames, *(arrays[name] for name in _PIXELS))
     groups = tuple(
-        Group(
+        ParameterGroup(
             CameraParameters(**group["parameters"]),
             CountStatistics(group["frames"], *(arrays[f"{name}_{number}"] for name in _SUMS)),
             group["correction_K"],
         )
         for number, group in enumerate(header["groups"])
     )
-    return Finished(
-        part, header["first_frame"], header["stop_frame"], arrays["blocks"], arrays["stack"], arrays["shift_px"], groups,
-        tuple(header["shaken"]), tuple(header["baseline_px"]),
-    )  # fmt: skip
+    return StoredCycle(
+        part=part,
+        first_frame=header["first_frame"],
+        stop_frame=header["stop_frame"],
+        blocks=arrays["blocks"],
+        stack=arrays["stack"],
+        shift_px=arrays["shift_px"],
+        groups=groups,
+        shaken=tuple(header["shaken"]),
+        baseline_px=tuple(header["baseline_px"]),
+    )

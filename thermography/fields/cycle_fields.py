@@ -1,4 +1,4 @@
-"""One field per cycle: cells, their uncertainty and flags, as a Dataset with CF attributes."""
+"""Fields per cycle on the plan: mean, rise, rate, spread, uncertainty and quality flags, as a Dataset with CF attributes."""
 
 from __future__ import annotations
 
@@ -17,40 +17,44 @@ from thermography.radiometry.averaging import AVERAGING_LIMIT_K, MeanTemperature
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration
 
-#: Cycle index of a frame that lies in no cycle.
-NOT_NUMBERED = -1
 #: Bits of `quality_flag`.
-FLAGS = {
+_FLAGS = {
     "partly_seen": 1,
     "calibrated_per_frame": 2,
     "several_registrations": 4,
     "not_seen": 8,
     "no_frame": 16,
 }
-PARTLY_SEEN_BELOW = 0.99
-#: Of images larger than this, twice so many rows give the noise to a per cent.
-LARGE_PX, NOISE_ROWS = 60_000, 32
+#: Coverage below which a cell is flagged as partly seen.
+_PARTLY_SEEN_BELOW = 0.99
+#: In images of more pixels than this, ...
+_LARGE_PX = 60_000
+#: ... this number of rows on either side of the middle determines the noise to a per cent.
+_NOISE_ROWS = 32
 
-DEGREES = {"units": "degC", "units_metadata": "temperature: on_scale"}
-KELVIN = {"units": "K", "units_metadata": "temperature: difference"}
-ATTRIBUTES: dict[str, dict[str, Any]] = {
+_DEGREES = {"units": "degC", "units_metadata": "temperature: on_scale"}
+_KELVIN = {"units": "K", "units_metadata": "temperature: difference"}
+_ATTRIBUTES: dict[str, dict[str, Any]] = {
     "temperature": {
         "standard_name": "surface_temperature",
         "long_name": "mean surface temperature over the frames of the cycle",
         "ancillary_variables": "temperature_u count quality_flag",
-        **DEGREES,
+        **_DEGREES,
     },
     "temperature_u": {
         "long_name": "standard uncertainty of the mean temperature from pixel noise and registration",
-        "comment": "what all cells share (emissivity, reflections, the camera's scale) is not in it",
-        **KELVIN,
+        "comment": "errors common to all cells (emissivity, reflected apparent temperature, calibration of the camera) are not included",
+        **_KELVIN,
     },
     "temperature_rise": {
         "long_name": "rise of the mean temperature since the first cycle",
         "ancillary_variables": "temperature_rise_u count quality_flag",
-        **KELVIN,
+        **_KELVIN,
     },
-    "temperature_rise_u": {"long_name": "standard uncertainty of the rise from pixel noise and registration", **KELVIN},
+    "temperature_rise_u": {
+        "long_name": "standard uncertainty of the rise from pixel noise and registration",
+        **_KELVIN,
+    },
     "temperature_rate": {
         "long_name": "rate of the mean temperature over neighbouring cycles",
         "units": "K h-1",
@@ -58,24 +62,24 @@ ATTRIBUTES: dict[str, dict[str, Any]] = {
     },
     "temperature_spread": {
         "long_name": "standard deviation of a pixel's temperature over the frames of the cycle, root mean square over the cell",
-        **KELVIN,
+        **_KELVIN,
     },
     "count": {"long_name": "frames averaged", "units": "1"},
     "quality_flag": {
         "standard_name": "quality_flag",
-        "long_name": "what limits the temperature of the cell",
-        "flag_masks": np.array(list(FLAGS.values()), np.uint8),
-        "flag_meanings": " ".join(FLAGS),
+        "long_name": "limitations of the temperature of the cell",
+        "flag_masks": np.array(list(_FLAGS.values()), np.uint8),
+        "flag_meanings": " ".join(_FLAGS),
     },
     "position_u": {
-        "long_name": "standard uncertainty of the place of a cell on the sensor, as length on the plan",
+        "long_name": "standard uncertainty of the position of a cell on the plan from the registration",
         "units": "mm",
     },
-    "coverage": {"long_name": "part of the cell's area that is seen unmasked", "units": "1"},
+    "coverage": {"long_name": "share of the cell's area that is seen unmasked", "units": "1"},
     "frame_temperature": {
         "standard_name": "surface_temperature",
         "long_name": "mean surface temperature over a frame or a short block of frames",
-        **DEGREES,
+        **_DEGREES,
     },
     "frame_cycle": {"long_name": "cycle that the frames belong to, 0 for none", "units": "1"},
     "frame_shift": {
@@ -98,7 +102,29 @@ ATTRIBUTES: dict[str, dict[str, Any]] = {
 
 @dataclass
 class CyclePart:
-    """What the frames of one cycle under one registration add up to: pixels while it is open, cells once it is finished."""
+    """The frames of one cycle under one registration: means over pixels while it is open, cells of the plan once it is finished.
+
+    Attributes
+    ----------
+    cycle, span : int
+        Index of the cycle and of the registration span.
+    frames : int
+        Number of frames.
+    first_time : datetime64
+        Of the first frame.
+    seconds : float, s
+        Sum over the frames of the time since the first one.
+    pixels : MeanTemperature or None
+        Mean and variance of every pixel of the window; None before the first block and once finished.
+    mean, spread : (y, x) ndarray, degC and K
+        Mean temperature, and standard deviation of a pixel's temperature over the frames (root mean square over the cell).
+    noise_variance : (y, x) ndarray, K2
+        Variance of the mean from pixel noise.
+    fell_back : (y, x) ndarray of bool
+        Cells with pixels that were calibrated frame by frame.
+    count : (y, x) ndarray of int
+        Frames averaged.
+    """
 
     cycle: int
     span: int
@@ -113,7 +139,7 @@ class CyclePart:
     count: Array = field(default_factory=lambda: np.empty(0))
 
     def add(self, reduced: MeanTemperature, times: Array) -> None:
-        """Add a block of frames taken at `times`."""
+        """Add a block of frames: means over its pixels, and the times of its frames, (frames,) datetime64."""
         if self.pixels is None:
             self.first_time = times[0]
         self.pixels = reduced if self.pixels is None else self.pixels.merge(reduced)
@@ -121,46 +147,89 @@ class CyclePart:
         self.seconds += float(((times - self.first_time) / np.timedelta64(1, "ns")).sum()) / 1e9
 
     def finish(self, weights: PlanWeights) -> None:
-        """Turn pixels into cells."""
+        """Average pixels over the cells of the plan and release them."""
         assert self.pixels is not None
         pixels = self.pixels
         self.mean = weights.resample(pixels.mean)
         sample = pixels.frames / (pixels.frames - 1) if pixels.frames > 1 else np.nan
         self.spread = np.sqrt(weights.average(pixels.variance) * sample)
-        self.noise_variance = weights.noise_factor * noise_of_differences(pixels.mean, weights.whole) ** 2
-        wild = pixels.bound_K > AVERAGING_LIMIT_K
-        self.fell_back = weights.average(wild.astype(float)) > 0 if wild.any() else np.zeros(self.mean.shape, bool)
+        self.noise_variance = weights.noise_factor * noise_of_differences(pixels.mean, weights.interior) ** 2
+        varying = pixels.bound_K > AVERAGING_LIMIT_K
+        self.fell_back = (
+            weights.average(varying.astype(float)) > 0 if varying.any() else np.zeros(self.mean.shape, bool)
+        )
         self.count = np.where(np.isfinite(self.mean), self.frames, 0)
         self.pixels = None
 
 
 def pixel_noise(image: Array, used: NDArray[np.bool_]) -> float:
-    """Standard deviation of white noise in an image, from second differences of the used pixels; blind to smooth fields."""
-    whole = ndimage.binary_erosion(used, np.ones((3, 3)))
-    return noise_of_differences(image, whole)
+    """Standard deviation of white noise in an image, insensitive to smooth fields.
+
+    Parameters
+    ----------
+    image : (row, column) ndarray
+        Any unit.
+    used : (row, column) ndarray of bool
+        Pixels that take part, with all their neighbours.
+
+    Returns
+    -------
+    float
+        In the unit of `image`; NaN where fewer than 30 pixels have eight neighbours in use.
+
+    Notes
+    -----
+    Median absolute response to the Laplacian difference of J. Immerkaer, Fast noise variance estimation, Computer Vision and Image
+    Understanding 64 (1996) 300-302.
+    """
+    return noise_of_differences(image, ndimage.binary_erosion(used, np.ones((3, 3))))
 
 
-def noise_of_differences(image: Array, whole: NDArray[np.bool_]) -> float:
-    """As `pixel_noise`, at pixels of which all eight neighbours are known to be used; of large images, from the middle rows."""
-    if whole.sum() < 30:
+def noise_of_differences(image: Array, interior: NDArray[np.bool_]) -> float:
+    """As `pixel_noise`, for pixels whose neighbours are known to be in use.
+
+    Parameters
+    ----------
+    image : (row, column) ndarray
+        Any unit. Of images above 60,000 px the middle 64 rows are evaluated.
+    interior : (row, column) ndarray of bool
+        Pixels of which all eight neighbours are in use.
+
+    Returns
+    -------
+    float
+        In the unit of `image`; NaN for fewer than 30 interior pixels.
+    """
+    if interior.sum() < 30:
         return float("nan")
-    if image.size > LARGE_PX:
-        inner = np.flatnonzero(whole.any(axis=1))
-        middle = slice(max(int(inner.mean()) - NOISE_ROWS, 0), int(inner.mean()) + NOISE_ROWS)
-        image, whole = image[middle], whole[middle]
+    if image.size > _LARGE_PX:
+        rows = np.flatnonzero(interior.any(axis=1))
+        middle = slice(max(int(rows.mean()) - _NOISE_ROWS, 0), int(rows.mean()) + _NOISE_ROWS)
+        image, interior = image[middle], interior[middle]
     values = image.astype(float)
-    # Differences along one side, then along the other: the kernel of Immerkaer (1996), 6 times the noise of one pixel.
+    # Second differences down, then across: the sum of squared weights is 36, so that the noise is 6 times that of one pixel.
     down = values[:-2] - 2 * values[1:-1] + values[2:]
     both = down[:, :-2] - 2 * down[:, 1:-1] + down[:, 2:]
-    return 1.4826 * float(np.nanmedian(np.abs(both[whole[1:-1, 1:-1]]))) / 6
+    return 1.4826 * float(np.nanmedian(np.abs(both[interior[1:-1, 1:-1]]))) / 6
 
 
 def position_covariance(registration: Registration, grid: PlanGrid) -> Array:
-    """Covariance of every cell's place, shape (y, x, 2, 2), mm2."""
-    return registration.position_covariance(np.stack(np.meshgrid(grid.x_mm, grid.y_mm), axis=-1))
+    """Covariance of the position of every cell's centre.
+
+    Parameters
+    ----------
+    registration : Registration
+    grid : PlanGrid
+
+    Returns
+    -------
+    (y, x, 2, 2) ndarray, mm2
+        Of (x, y) on the plan.
+    """
+    return registration.position_covariance(grid.centres_mm)
 
 
-def assemble(
+def assemble_fields(
     parts: Sequence[CyclePart],
     cycles: int,
     grid: PlanGrid,
@@ -170,42 +239,57 @@ def assemble(
     frames: Mapping[str, Any] | None = None,
     frame_coordinates: Mapping[str, Any] | None = None,
 ) -> xr.Dataset:
-    """Put the cycles together: mean, rise, rate, spread, count, uncertainties and flags on the plan.
+    """Assemble the cycles to one Dataset: mean, rise, rate, spread, count, uncertainties and flags on the plan.
 
     Parameters
     ----------
-    parts
-        Finished, in the order of time.
-    cycles
-        How many cycles the campaign has, with frames or without.
-    grid
+    parts : sequence of CyclePart
+        Finished, in the order of time; at least one.
+    cycles : int
+        Number of cycles of the campaign, with or without frames.
+    grid : PlanGrid
         The plan.
-    covariances, coverages
-        Of every registration: `position_covariance`, and the part of every cell that is seen unmasked.
-    frames, frame_coordinates
-        What is known per frame or block of frames besides, as xarray takes it.
+    covariances : sequence of (y, x, 2, 2) ndarray, mm2
+        `position_covariance` of every registration span.
+    coverages : sequence of (y, x) ndarray
+        Share of every cell that is seen unmasked, of every registration span.
+    frames, frame_coordinates : mapping of str to variable, or None
+        Variables and coordinates per frame or block of frames to add, as xarray takes them.
+
+    Returns
+    -------
+    xr.Dataset
+        Variables of `thermography.contract.FIELDS` and `temperature_rate`, `quality_flag`, `position_u`, with the dimensions
+        (cycle, y, x), in degC, K and K/h.
+
+    Notes
+    -----
+    The uncertainty of a cell combines pixel noise with the position uncertainty of the registration through the gradient of the field
+    (law of propagation, JCGM 100:2008, 5.1.2); see ``docs/method/fields.md``.
     """
     fields = {name: np.full((cycles, *grid.shape), np.nan) for name in ("mean", "spread", "noise")}
     span_of = np.zeros(cycles, int)
     count = np.zeros((cycles, *grid.shape), np.int32)
-    flags = np.full((cycles, *grid.shape), FLAGS["no_frame"], np.uint8)
+    flags = np.full((cycles, *grid.shape), _FLAGS["no_frame"], np.uint8)
     time = np.full(cycles, np.datetime64("NaT"), "datetime64[ns]")
     for cycle in sorted({part.cycle for part in parts}):
-        own = [part for part in parts if part.cycle == cycle]
-        time[cycle] = own[0].first_time + np.timedelta64(_mean_nanoseconds(own), "ns")
-        together = _together(own)
-        for name, values in zip(fields, together, strict=True):
+        of_cycle = [part for part in parts if part.cycle == cycle]
+        time[cycle] = of_cycle[0].first_time + np.timedelta64(_mean_nanoseconds(of_cycle), "ns")
+        merged = _merge(of_cycle)
+        for name, values in zip(fields, merged, strict=True):
             fields[name][cycle] = values
-        span_of[cycle] = own[-1].span
-        count[cycle] = sum(part.count for part in own)
-        flags[cycle] = _flags(own, together[0], np.max([coverages[part.span] for part in own], axis=0))
+        span_of[cycle] = of_cycle[-1].span
+        count[cycle] = sum(part.count for part in of_cycle)
+        flags[cycle] = _flags(of_cycle, merged[0], np.max([coverages[part.span] for part in of_cycle], axis=0))
     plan = ("cycle", "y", "x")
     first = min(parts, key=lambda part: part.cycle)
-    place = np.full(count.shape, np.nan)
+    position = np.full(count.shape, np.nan)
     for span, covariance in enumerate(covariances):
-        place[span_of == span] = _gradient_variance(fields["mean"][span_of == span], covariance, grid)
-    rise_place = _gradient_variance(fields["mean"] - fields["mean"][first.cycle], covariances[first.span], grid)
-    temperatures = _temperatures(**fields, place=place, rise_place=rise_place, time=time, reference=first.cycle)
+        position[span_of == span] = _gradient_variance(fields["mean"][span_of == span], covariance, grid)
+    rise_position = _gradient_variance(fields["mean"] - fields["mean"][first.cycle], covariances[first.span], grid)
+    temperatures = _temperatures(
+        **fields, position=position, rise_position=rise_position, time=time, reference=first.cycle
+    )
     dataset = xr.Dataset(
         {name: (plan, array.astype(np.float32)) for name, array in temperatures.items()}
         | {
@@ -226,90 +310,96 @@ def assemble(
             "history": "counts averaged per cycle, calibrated, and averaged by area over the cells of the plan",
         },
     )  # fmt: skip
-    return annotate(dataset)
+    return _annotate(dataset)
 
 
-def _flags(own: Sequence[CyclePart], mean: Array, coverage: Array) -> NDArray[np.uint8]:
+def _flags(parts: Sequence[CyclePart], mean: Array, coverage: Array) -> NDArray[np.uint8]:
     """Quality flags of one cycle."""
-    found = {
-        "partly_seen": coverage < PARTLY_SEEN_BELOW,
-        "calibrated_per_frame": np.any([part.fell_back for part in own], axis=0),
-        "several_registrations": np.full(mean.shape, len(own) > 1),
+    limits = {
+        "partly_seen": coverage < _PARTLY_SEEN_BELOW,
+        "calibrated_per_frame": np.any([part.fell_back for part in parts], axis=0),
+        "several_registrations": np.full(mean.shape, len(parts) > 1),
         "not_seen": np.isnan(mean),
     }
-    return np.sum([np.where(where, FLAGS[name], 0) for name, where in found.items()], axis=0, dtype=np.uint8)
+    return np.sum([np.where(where, _FLAGS[name], 0) for name, where in limits.items()], axis=0, dtype=np.uint8)
 
 
 def _temperatures(
-    mean: Array, spread: Array, noise: Array, place: Array, *, rise_place: Array, time: Array, reference: int
+    mean: Array, spread: Array, noise: Array, position: Array, *, rise_position: Array, time: Array, reference: int
 ) -> dict[str, Array]:
-    """Temperature, rise since the reference cycle, rate, spread and uncertainties, (cycle, y, x)."""
-    # The noise of the first cycle is in every rise but its own, which is zero by definition.
+    """Temperature, rise since the reference cycle, rate, spread and uncertainties, (cycle, y, x).
+
+    `noise`, `position` and `rise_position` are variances of the mean and the rise from pixel noise and registration, K2.
+    """
+    # The noise of the reference cycle enters every rise but its own, which is zero by definition.
     rise_noise = np.where(np.arange(len(mean))[:, None, None] == reference, 0.0, noise + noise[reference])
     return {
         "temperature": mean,
-        "temperature_u": np.sqrt(noise + place),
+        "temperature_u": np.sqrt(noise + position),
         "temperature_rise": mean - mean[reference],
-        "temperature_rise_u": np.sqrt(rise_noise + rise_place),
+        "temperature_rise_u": np.sqrt(rise_noise + rise_position),
         "temperature_rate": _rate(mean, time),
         "temperature_spread": spread,
     }
 
 
-def annotate(dataset: xr.Dataset) -> xr.Dataset:
-    """Give every variable that is known its CF attributes, and coordinates no fill value."""
+def _annotate(dataset: xr.Dataset) -> xr.Dataset:
+    """Set the CF attributes of every listed variable, and no fill value for coordinates."""
     for name, variable in dataset.variables.items():
-        variable.attrs.update(ATTRIBUTES.get(str(name), {}))
+        variable.attrs.update(_ATTRIBUTES.get(str(name), {}))
         if name in dataset.coords:
             variable.encoding["_FillValue"] = None
     return dataset
 
 
-def _mean_nanoseconds(own: Sequence[CyclePart]) -> int:
+def _mean_nanoseconds(parts: Sequence[CyclePart]) -> int:
     """Mean time of all frames since the first one of the first part, ns."""
-    start = own[0].first_time
-    total = sum(part.seconds + part.frames * float((part.first_time - start) / np.timedelta64(1, "s")) for part in own)
-    return round(1e9 * total / sum(part.frames for part in own))
+    start = parts[0].first_time
+    total = sum(
+        part.seconds + part.frames * float((part.first_time - start) / np.timedelta64(1, "s")) for part in parts
+    )
+    return round(1e9 * total / sum(part.frames for part in parts))
 
 
-def _together(own: Sequence[CyclePart]) -> tuple[Array, Array, Array]:
-    """Mean, spread and noise variance of a cycle whose frames have one or, after a knock, several registrations."""
-    if len(own) == 1:
-        return own[0].mean, own[0].spread, own[0].noise_variance
-    frames = np.array([part.frames for part in own], float)
-    means = np.stack([part.mean for part in own])
+def _merge(parts: Sequence[CyclePart]) -> tuple[Array, Array, Array]:
+    """Mean, spread and noise variance of a cycle, weighted by frames where a knock divides it between several registrations."""
+    if len(parts) == 1:
+        return parts[0].mean, parts[0].spread, parts[0].noise_variance
+    frames = np.array([part.frames for part in parts], float)
+    means = np.stack([part.mean for part in parts])
     weight = np.where(np.isfinite(means), frames[:, None, None], 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         weight = weight / weight.sum(axis=0)
     mean = np.where(weight > 0, weight * np.nan_to_num(means), 0.0).sum(axis=0)
-    noise = (weight**2 * np.nan_to_num([part.noise_variance for part in own])).sum(axis=0)
-    spread = np.sqrt((weight * np.nan_to_num([part.spread**2 for part in own])).sum(axis=0))
-    nowhere = np.isnan(means).all(axis=0)
-    return tuple(np.where(nowhere, np.nan, field) for field in (mean, spread, noise))  # type: ignore[return-value]
+    noise = (weight**2 * np.nan_to_num([part.noise_variance for part in parts])).sum(axis=0)
+    spread = np.sqrt((weight * np.nan_to_num([part.spread**2 for part in parts])).sum(axis=0))
+    unseen = np.isnan(means).all(axis=0)
+    mean, spread, noise = (np.where(unseen, np.nan, field) for field in (mean, spread, noise))
+    return mean, spread, noise
 
 
 def _gradient_variance(fields_K: Array, covariance: Array, grid: PlanGrid) -> Array:
-    """Variance that the registration's uncertainty puts on fields, (cycle, y, x), through their gradients, K2."""
-    known = np.isfinite(fields_K)
+    """Variance of fields, (cycle, y, x), from the position uncertainty of the registration through their gradients, K2."""
+    seen = np.isfinite(fields_K)
     filled = np.zeros(fields_K.shape)
     nearest: Any = ()
-    for cycle, (field_K, seen) in enumerate(zip(fields_K, known, strict=True)):
-        if seen.any():
-            if cycle == 0 or not known[cycle - 1].any() or (seen != known[cycle - 1]).any():
-                nearest = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
+    for cycle, (field_K, cells) in enumerate(zip(fields_K, seen, strict=True)):
+        if cells.any():
+            if cycle == 0 or not seen[cycle - 1].any() or (cells != seen[cycle - 1]).any():
+                nearest = ndimage.distance_transform_edt(~cells, return_distances=False, return_indices=True)
             filled[cycle] = field_K[tuple(nearest)]
-    # Over 3 cells, so that the noise of single cells does not pass for a gradient.
+    # Smoothed over neighbouring cells, so that their noise is not taken for a gradient.
     smooth = ndimage.gaussian_filter(filled, (0, 1, 1), mode="nearest")
     down, across = np.gradient(smooth, grid.cell_size_mm, axis=(1, 2))
     xx, xy, yy = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
-    return np.where(known, across * (across * xx + 2 * down * xy) + down * down * yy, np.nan)
+    return np.where(seen, across * (across * xx + 2 * down * xy) + down * down * yy, np.nan)
 
 
 def _rate(mean: Array, time: Array) -> Array:
     """Central difference over the cycles that have a time, K/h; NaN where there are fewer than two."""
     rate = np.full(mean.shape, np.nan)
-    known = np.flatnonzero(~np.isnat(time))
-    if known.size >= 2:
-        hours = (time[known] - time[known[0]]) / np.timedelta64(1, "s") / 3600
-        rate[known] = np.gradient(mean[known], hours, axis=0)
+    timed = np.flatnonzero(~np.isnat(time))
+    if timed.size >= 2:
+        hours = (time[timed] - time[timed[0]]) / np.timedelta64(1, "s") / 3600
+        rate[timed] = np.gradient(mean[timed], hours, axis=0)
     return rate

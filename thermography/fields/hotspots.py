@@ -1,8 +1,7 @@
-"""Hotspots on the table plan: where a field rises above what surrounds it, followed over the cycles; isotherms."""
+"""Hotspots on the table plan: peaks of a temperature field that stand out from their surroundings and from its noise."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,10 +14,10 @@ from skimage import measure, morphology
 from thermography._typing import Array
 from thermography.errors import ThermographyError
 
-#: Smoothing before peaks are looked for, cells: single cells are noise.
-SMOOTHING_CELLS = 1.0
-#: A peak must stand out by this many times the noise of the smoothed field.
-LEAST_SIGNIFICANCE = 6.0
+#: Standard deviation of the Gaussian that smooths the field before peaks are searched, cells.
+_SMOOTHING_CELLS = 1.0
+#: The prominence of a peak must exceed this many standard deviations of the noise of the smoothed field.
+_LEAST_SIGNIFICANCE = 6.0
 
 
 @dataclass(frozen=True)
@@ -27,16 +26,16 @@ class Hotspot:
 
     Attributes
     ----------
-    x_mm, y_mm
-        The peak on the plan.
-    peak_rise_K
+    x_mm, y_mm : float, mm
+        Position of the peak on the plan.
+    peak_rise_K : float, K
         Rise at the peak.
-    prominence_K
-        How far the peak stands above the highest level at which it joins a higher peak, or above the plan's lowest rise.
-    area_mm2, centroid_x_mm, centroid_y_mm, mean_rise_K
+    prominence_K : float, K
+        Height of the peak above the highest level at which it is connected to a higher peak, or above the lowest rise on the plan.
+    area_mm2, centroid_x_mm, centroid_y_mm, mean_rise_K : float, mm2, mm, mm and K
         Of the connected zone above half the prominence.
-    at_edge
-        The zone reaches the edge of what is seen: its peak may lie outside.
+    at_edge : bool
+        The zone reaches the edge of the seen plan: the true peak may lie outside.
     """
 
     x_mm: float
@@ -51,26 +50,39 @@ class Hotspot:
 
 
 def detect_hotspots(rise: xr.DataArray, *, least_prominence_K: float = 0.1, limit: int = 20) -> list[Hotspot]:
-    """Find the peaks of one field that stand out from their surroundings and from its noise.
+    """Detect the peaks of one field that stand out from their surroundings and from its noise.
 
     Parameters
     ----------
-    rise
-        Temperature rise (y, x) in K with coordinates in mm; NaN where nothing is seen.
-    least_prominence_K
-        Peaks that stand out by less are not hotspots.
-    limit
-        Most hotspots to return.
+    rise : (y, x) DataArray, K
+        Temperature rise with coordinates in mm; NaN where the plan is not seen.
+    least_prominence_K : float, K
+        Smallest prominence of a hotspot; six standard deviations of the noise are required in any case.
+    limit : int
+        Largest number of hotspots to return.
 
     Returns
     -------
-    list[Hotspot]
+    list of Hotspot
         Most prominent first.
 
     Raises
     ------
     ThermographyError
         The field is not (y, x) with at least 3 x 3 cells.
+
+    Notes
+    -----
+    Extended maxima by h-maxima transform (P. Soille, Morphological Image Analysis, 2nd ed. (2003), ch. 6) of the smoothed field; the
+    position is the vertex of a paraboloid fitted to the 5 x 5 cells around the maximum.
+
+    Examples
+    --------
+    >>> x, y = np.arange(2.5, 300, 5), np.arange(2.5, 150, 5)
+    >>> peak = 2.0 * np.exp(-((x - 150) ** 2 + (y[:, None] - 70) ** 2) / (2 * 30**2))
+    >>> (spot,) = detect_hotspots(xr.DataArray(peak, dims=("y", "x"), coords={"y": y, "x": x}))
+    >>> round(spot.x_mm), round(spot.y_mm), round(spot.peak_rise_K, 1)
+    (150, 70, 2.0)
     """
     if rise.dims != ("y", "x") or min(rise.shape) < 3:
         raise ThermographyError(
@@ -80,84 +92,23 @@ def detect_hotspots(rise: xr.DataArray, *, least_prominence_K: float = 0.1, limi
     seen = np.isfinite(values)
     if not seen.any():
         return []
-    smooth = smooth_seen(values, SMOOTHING_CELLS)
+    smooth = _smooth_seen(values, _SMOOTHING_CELLS)
     floor = float(smooth[seen].min())
     field = np.where(seen, smooth, floor)
-    least = max(least_prominence_K, LEAST_SIGNIFICANCE * _noise(values - smooth, seen))
+    least = max(least_prominence_K, _LEAST_SIGNIFICANCE * _noise(values - smooth, seen))
     if field.max() - floor < least:
         return []
     peaks = measure.label(morphology.h_maxima(field, least), connectivity=2)
-    found = []
+    spots = []
     for label in range(1, peaks.max() + 1):
-        own = peaks == label
-        place = np.unravel_index(int(np.argmax(np.where(own & seen, field, -np.inf))), field.shape)
-        found.append(_hotspot(rise, values, field, seen, place, floor))
-    return sorted(found, key=lambda spot: -spot.prominence_K)[:limit]
+        peak = np.where((peaks == label) & seen, field, -np.inf)
+        place = np.unravel_index(int(np.argmax(peak)), field.shape)
+        spots.append(_hotspot(rise, values, field, seen, place, floor))
+    return sorted(spots, key=lambda spot: -spot.prominence_K)[:limit]
 
 
-def follow_hotspots(rise: xr.DataArray, *, least_prominence_K: float = 0.1, reach_mm: float = 40.0) -> xr.Dataset:
-    """Follow hotspots over the cycles: a peak is the same one as long as it moves less than `reach_mm` between cycles.
-
-    Parameters
-    ----------
-    rise
-        (cycle, y, x) in K.
-    least_prominence_K
-        As in `detect_hotspots`.
-    reach_mm
-        How far a peak may move from one appearance to the next.
-
-    Returns
-    -------
-    xr.Dataset
-        Dims (hotspot, cycle): x, y (mm), peak_rise, prominence (K), area (mm2); NaN in cycles in which a hotspot is not found.
-        Hotspots count from 1 in the order of their largest prominence.
-    """
-    names = {"x": "x_mm", "y": "y_mm", "peak_rise": "peak_rise_K", "prominence": "prominence_K", "area": "area_mm2"}
-    tracks: list[dict[int, Hotspot]] = []
-    for cycle in range(rise.sizes["cycle"]):
-        spots = detect_hotspots(rise.isel(cycle=cycle), least_prominence_K=least_prominence_K)
-        free = [track for track in tracks if cycle not in track]
-        pairs = sorted(
-            (np.hypot(spot.x_mm - track[max(track)].x_mm, spot.y_mm - track[max(track)].y_mm), i, j)
-            for i, spot in enumerate(spots)
-            for j, track in enumerate(free)
-        )
-        taken_spots: set[int] = set()
-        taken_tracks: set[int] = set()
-        for distance, i, j in pairs:
-            if distance <= reach_mm and i not in taken_spots and j not in taken_tracks:
-                free[j][cycle] = spots[i]
-                taken_spots.add(i)
-                taken_tracks.add(j)
-        tracks.extend({cycle: spot} for i, spot in enumerate(spots) if i not in taken_spots)
-    tracks.sort(key=lambda track: -max(spot.prominence_K for spot in track.values()))
-    data = np.full((len(names), len(tracks), rise.sizes["cycle"]), np.nan)
-    for number, track in enumerate(tracks):
-        for cycle, spot in track.items():
-            data[:, number, cycle] = [getattr(spot, attribute) for attribute in names.values()]
-    units = {"x": "mm", "y": "mm", "peak_rise": "K", "prominence": "K", "area": "mm2"}
-    return xr.Dataset(
-        {name: (("hotspot", "cycle"), data[i], {"units": units[name]}) for i, name in enumerate(names)},
-        coords={"hotspot": np.arange(1, len(tracks) + 1), "cycle": rise["cycle"].values},
-    )
-
-
-def isotherms(field: xr.DataArray, levels: Sequence[float]) -> dict[float, list[Array]]:
-    """Lines of equal temperature on the plan: by level, a list of lines, each (n, 2) mm (x, y)."""
-    y, x = field["y"].values, field["x"].values
-    lines: dict[float, list[Array]] = {}
-    for level in levels:
-        contours = measure.find_contours(field.values.astype(float), level, mask=np.isfinite(field.values))
-        lines[level] = [
-            np.column_stack([np.interp(c[:, 1], np.arange(len(x)), x), np.interp(c[:, 0], np.arange(len(y)), y)])
-            for c in contours
-        ]
-    return lines
-
-
-def smooth_seen(values: Array, width_cells: float) -> Array:
-    """Gaussian mean over seen cells, shape (y, x); NaN cells have no weight and stay NaN."""
+def _smooth_seen(values: Array, width_cells: float) -> Array:
+    """Gaussian mean over seen cells, (y, x); NaN cells have no weight and remain NaN (normalised convolution)."""
     seen = np.isfinite(values)
     total = ndimage.gaussian_filter(np.where(seen, values, 0.0), width_cells, mode="constant")
     weight = ndimage.gaussian_filter(seen.astype(float), width_cells, mode="constant")
@@ -166,15 +117,16 @@ def smooth_seen(values: Array, width_cells: float) -> Array:
 
 
 def _noise(residual: Array, seen: NDArray[np.bool_]) -> float:
-    """Noise of the smoothed field from what the smoothing took away."""
-    # White noise keeps 1 / (4 pi s^2) of its variance under a Gaussian of width s.
-    kept = 1 / (4 * np.pi * SMOOTHING_CELLS**2)
+    """Noise of the smoothed field, K, from the difference between the field and the smoothed one."""
+    # A Gaussian of width s leaves 1 / (4 pi s^2) of the variance of white noise.
+    kept = 1 / (4 * np.pi * _SMOOTHING_CELLS**2)
     return 1.4826 * float(np.median(np.abs(residual[seen]))) * np.sqrt(kept / (1 - kept))
 
 
 def _hotspot(
     rise: xr.DataArray, values: Array, field: Array, seen: NDArray[np.bool_], place: tuple[Any, ...], floor: float
 ) -> Hotspot:
+    """The hotspot of a maximum of the smoothed field at a cell (row, column)."""
     x, y = rise["x"].values, rise["y"].values
     cell = float(x[1] - x[0])
     prominence = field[place] - _saddle(field, place, floor)
@@ -197,11 +149,11 @@ def _hotspot(
 
 
 def _saddle(field: Array, place: tuple[Any, ...], floor: float) -> float:
-    """Highest level at which the peak is connected to a higher one; the floor for the highest peak."""
+    """Highest level at which a peak is connected to a higher one, by bisection; the floor for the highest peak."""
     top = float(field[place])
     levels = np.unique(field[field < top])
     low, high = -1, len(levels) - 1
-    # The peak joins something higher at levels[low] and below, nowhere above: bisection.
+    # The peak is connected to a higher one at levels[low] and below, and not above.
     while low < high:
         middle = (low + high + 1) // 2
         zones = measure.label(field >= levels[middle], connectivity=2)
@@ -213,13 +165,13 @@ def _saddle(field: Array, place: tuple[Any, ...], floor: float) -> float:
 
 
 def _vertex(values: Array, field: Array, place: tuple[Any, ...]) -> tuple[float, float, float]:
-    """Column, row and height of the paraboloid through the 5 x 5 cells around a peak; the cell itself where it has no vertex near."""
+    """Column, row and height of the vertex of a paraboloid fitted to the 5 x 5 cells around a peak; the cell itself without one."""
     row, column = int(place[0]), int(place[1])
     rows, columns = np.mgrid[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
     inside = (rows < field.shape[0]) & (columns < field.shape[1])
     rows, columns = rows[inside], columns[inside]
-    known = np.isfinite(values[rows, columns])
-    rows, columns = rows[known], columns[known]
+    seen = np.isfinite(values[rows, columns])
+    rows, columns = rows[seen], columns[seen]
     if len(rows) >= 15:
         u, v = columns - column, rows - row
         basis = np.column_stack([np.ones(len(u)), u, v, u * u, u * v, v * v]).astype(float)

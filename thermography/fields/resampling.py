@@ -1,10 +1,11 @@
-"""Sensor pixels to plan cells: area-weighted, fiducials and table edge masked, as sparse matrices."""
+"""Resampling of sensor pixels to plan cells: averages by area, fiducials and plan edge masked, as sparse matrices."""
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -17,28 +18,29 @@ from thermography.fields.scheduling import THREADS
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration
 
-#: Every pixel is cut in this many parts squared, each of which goes to the cell that it lies in.
-PARTS = 4
-#: Cells of which less than this part is seen unmasked are NaN.
+#: Pixels that lie in several cells are cut into this number of parts squared, each of which belongs to the cell of its centre.
+_PARTS = 4
+#: Entries provided per pixel: one for a pixel within a cell, four for one on a corner of cells.
+_ENTRIES_PER_PIXEL = 4
+#: Cells of which less than this share is seen unmasked are NaN.
 LEAST_COVERAGE = 0.5
 
 
 @dataclass(frozen=True)
 class PlanWeights:
-    """How much of which pixel makes up every cell of the plan.
+    """Weights of the pixels in every cell of the plan.
 
     Attributes
     ----------
-    areas
-        (cells, pixels of the window), float64 CSR: the part of every cell's seen area that lies in a pixel; rows sum to 1, and are
-        empty where a cell is not seen.
-    centring
-        (cells, cells), what to add to partly seen cells to move them to their own centre, see `centring`.
-    window
-        Rows and columns of the sensor that hold every pixel with a weight.
-    coverage
-        (y, x), the unmasked part of every cell's area that is seen, 0..1.
-    grid
+    areas : (cells, pixels of the window) CSR array
+        Share of every cell's seen area that lies in a pixel; rows sum to 1, and are empty where a cell is not seen.
+    centring : (cells, cells) CSR array
+        Correction that moves partly seen cells to their own centre, see `centring_matrix`.
+    window : (slice, slice)
+        Rows and columns of the sensor that contain every pixel with a weight.
+    coverage : (y, x) ndarray
+        Share of every cell's area that is seen unmasked, 0 to 1.
+    grid : PlanGrid
         The plan.
     """
 
@@ -50,15 +52,15 @@ class PlanWeights:
 
     @cached_property
     def used(self) -> NDArray[np.bool_]:
-        """Which pixels of the window have a weight."""
+        """Pixels of the window that have a weight, (row, column)."""
         shape = tuple(side.stop - side.start for side in self.window)
         used = np.zeros(shape[0] * shape[1], bool)
         used[self.areas.indices] = True
         return used.reshape(shape)
 
     @cached_property
-    def whole(self) -> NDArray[np.bool_]:
-        """Which of them have eight neighbours with a weight."""
+    def interior(self) -> NDArray[np.bool_]:
+        """Pixels of the window whose eight neighbours have a weight too, (row, column)."""
         return np.asarray(ndimage.binary_erosion(self.used, np.ones((3, 3))))
 
     @cached_property
@@ -71,12 +73,12 @@ class PlanWeights:
         return self._on_plan(variance)
 
     def resample(self, values: Array) -> Array:
-        """Average window pixels, shape (row, column), over every cell; shape (y, x), NaN where a cell is not seen."""
+        """Average window pixels, (row, column), over every cell and move partly seen cells to their centre; (y, x), NaN where unseen."""
         cells = self.areas @ values.ravel()
         return self._on_plan(cells + self.centring @ cells)
 
     def average(self, values: Array) -> Array:
-        """As `resample`, but by area alone: for quantities that must not be extrapolated (variances)."""
+        """As `resample`, by area alone: for quantities that must not be extrapolated (variances)."""
         return self._on_plan(self.areas @ values.ravel())
 
     def _on_plan(self, cells: Array) -> Array:
@@ -85,6 +87,7 @@ class PlanWeights:
 
 
 def _row_squares(matrix: sparse.csr_array) -> Array:
+    """Sum of the squares of every row."""
     squares: Array = sparse.csr_array((matrix.data**2, matrix.indices, matrix.indptr), shape=matrix.shape) @ np.ones(
         matrix.shape[1]
     )
@@ -92,14 +95,23 @@ def _row_squares(matrix: sparse.csr_array) -> Array:
 
 
 def plan_window(registration: Registration, grid: PlanGrid) -> tuple[slice, slice]:
-    """Rows and columns of the sensor that hold the plan: whole rows, for they lie together in the file.
+    """Window of the sensor that contains the plan: whole rows, because these are contiguous in the file.
+
+    Parameters
+    ----------
+    registration : Registration
+    grid : PlanGrid
+
+    Returns
+    -------
+    rows, columns : slice, px
 
     Raises
     ------
     ThermographyError
         No pixel lies on the plan.
     """
-    outline = registration.to_sensor(_outline(grid))
+    outline = registration.to_sensor(grid.outline_mm(25))
     rows, columns = registration.shape
     top = max(int(np.floor(outline[:, 1].min())), 0)
     bottom = min(int(np.ceil(outline[:, 1].max())), rows - 1)
@@ -109,20 +121,25 @@ def plan_window(registration: Registration, grid: PlanGrid) -> tuple[slice, slic
 
 
 def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float = 2.0) -> PlanWeights:
-    """Work out the weights of a registered camera.
+    """Weights of the pixels of a registered camera in the cells of the plan.
 
-    A pixel whose centre is nearer than `margin_px` to a disc or to the plan's edge has no weight, because the lens blurs what lies
-    beyond into it. A cell that is only partly seen is moved from the centre of its seen area to its own centre along the gradient
-    of the cells around it; otherwise a gradient of 10 K along the table would put 15 mK on cells of which a millimetre is masked.
+    A pixel whose centre is nearer than `margin_px` to a fiducial or to the plan's edge has no weight, because the lens blurs what
+    lies beyond into it. A cell that is only partly seen is moved from the centre of its seen area to its own centre along the
+    gradient of the cells around it; otherwise a gradient of 10 K along the table would cause 15 mK in cells of which a millimetre is
+    masked.
 
     Parameters
     ----------
-    registration
-        Where the pixels lie.
-    grid
+    registration : Registration
+        Position of the pixels on the plan.
+    grid : PlanGrid
         The plan.
-    margin_px
-        Width of the lens's blur; 2 px hold all but 1 % of an edge for common cameras.
+    margin_px : float, px
+        Width of the lens's blur; 2 px contain all but 1 % of an edge for common cameras.
+
+    Returns
+    -------
+    PlanWeights
 
     Raises
     ------
@@ -130,172 +147,221 @@ def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float
         No pixel lies on the plan.
     """
     window = plan_window(registration, grid)
-    top, bottom, columns = window[0].start, window[0].stop - 1, window[1].stop
-    across, down = np.meshgrid(np.arange(columns + 1) - 0.5, np.arange(top, bottom + 2) - 0.5)
-    corners = registration.to_plan(np.stack([across, down], axis=-1))
-    discs = np.array([(disc.x_mm, disc.y_mm, disc.diameter_mm / 2) for disc in registration.masked])
-    size, middle = (grid.width_mm, grid.height_mm), (bottom + 1 - top) // 2
-    with ThreadPoolExecutor(THREADS) as executor:
-        halves = executor.map(
-            lambda rows: _parts(corners, rows, discs, size, grid.cell_size_mm, margin_px),
-            [(0, middle), (middle, bottom + 1 - top)],
-        )
-        cell, pixel, area, x, y = (np.concatenate(both) for both in zip(*halves, strict=True))
+    cell, pixel, area, x, y = _pieces(registration, grid, window, margin_px)
     if len(cell) == 0:
         raise ThermographyError("no pixel of the frame lies on the plan; check the fiducials and the plan's size")
     cells = grid.shape[0] * grid.shape[1]
-    seen = np.bincount(cell, area, cells)
-    coverage = (seen / grid.cell_size_mm**2).reshape(grid.shape).clip(0, 1)
-    centre = np.stack([np.bincount(cell, area * along, cells) for along in (x, y)], axis=-1)
+    seen_area = np.bincount(cell, area, cells)
+    coverage = (seen_area / grid.cell_size_mm**2).reshape(grid.shape).clip(0, 1)
+    moments = np.stack([np.bincount(cell, area * along, cells) for along in (x, y)], axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        offset = centre / seen[:, None] - np.stack(np.meshgrid(grid.x_mm, grid.y_mm), axis=-1).reshape(-1, 2)
-    # The pixels come in their order, so that sorting by cells alone gives sorted rows.
+        offset = moments / seen_area[:, None] - grid.centres_mm.reshape(-1, 2)
+    # The pieces are in the order of the pixels, so that a stable sort by cells leaves the columns of every row sorted.
     order = np.argsort(cell, kind="stable")
     starts = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=cells))])
-    shape = (cells, (bottom + 1 - top) * columns)
-    areas = sparse.csr_array(((area / seen[cell])[order], pixel[order], starts), shape=shape)
-    return PlanWeights(areas, centring(offset, coverage, grid), window, coverage, grid)
+    shape = (cells, (window[0].stop - window[0].start) * window[1].stop)
+    areas = sparse.csr_array(((area / seen_area[cell])[order], pixel[order], starts), shape=shape)
+    return PlanWeights(areas, centring_matrix(offset, coverage, grid), window, coverage, grid)
+
+
+def _pieces(
+    registration: Registration, grid: PlanGrid, window: tuple[slice, slice], margin_px: float
+) -> tuple[Array, ...]:
+    """Cut the unmasked pixels of a window at the cells, in two threads: cell, pixel, area (mm2), and mean x and y (mm) per piece."""
+    rows, columns = window[0].stop - window[0].start, window[1].stop
+    across, down = np.meshgrid(np.arange(columns + 1) - 0.5, np.arange(window[0].start, window[0].stop + 1) - 0.5)
+    corners = registration.to_plan(np.stack([across, down], axis=-1))
+    discs = np.array([(disc.x_mm, disc.y_mm, disc.diameter_mm / 2) for disc in registration.masked])
+    size = (grid.width_mm, grid.height_mm)
+    with ThreadPoolExecutor(THREADS) as executor:
+        halves = executor.map(
+            lambda part: _cut_pixels(corners, part, discs, size, grid.cell_size_mm, margin_px),
+            [(0, rows // 2), (rows // 2, rows)],
+        )
+        return tuple(np.concatenate(both) for both in zip(*halves, strict=True))
+
+
+class _Pixel(NamedTuple):
+    """A pixel on the plan as a parallelogram: its centre and its sides along the row (across) and the column (down), mm."""
+
+    x: float
+    y: float
+    across_x: float
+    across_y: float
+    down_x: float
+    down_y: float
+
+
+class _Pieces(NamedTuple):
+    """Pieces of pixels, one entry per pixel and cell: area (mm2), and area times mean position (mm3)."""
+
+    cell: Array
+    pixel: Array
+    area: Array
+    x: Array
+    y: Array
 
 
 @numba.njit(cache=True, nogil=True)
-def _parts(
-    corners: Array, own_rows: tuple[int, int], discs: Array, size: tuple[float, float], cell_mm: float, margin_px: float
+def _cut_pixels(
+    corners: Array, rows: tuple[int, int], discs: Array, size: tuple[float, float], cell_mm: float, margin_px: float
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Cut every unmasked pixel of some rows in parts and add them up by cell: cell, pixel, area (mm2) and mean place (mm) of every pair."""
+    """Cut every unmasked pixel of some rows at the cells: cell, pixel, area (mm2), mean x and y (mm) of every piece."""
     columns = corners.shape[1] - 1
-    nx, ny = round(size[0] / cell_mm), round(size[1] / cell_mm)
-    most = 4 * (own_rows[1] - own_rows[0]) * columns
-    cell, pixel = np.empty(most, np.int32), np.empty(most, np.int32)
-    area, x_mean, y_mean = np.empty(most), np.empty(most), np.empty(most)
+    cells = (round(size[0] / cell_mm), round(size[1] / cell_mm))
+    most = _ENTRIES_PER_PIXEL * (rows[1] - rows[0]) * columns
+    pieces = _Pieces(np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most), np.empty(most), np.empty(most))
     count = 0
-    for row in range(own_rows[0], own_rows[1]):
+    for row in range(rows[0], rows[1]):
         for column in range(columns):
-            ux, vx, px = _sides(
-                corners[row, column, 0],
-                corners[row, column + 1, 0],
-                corners[row + 1, column, 0],
-                corners[row + 1, column + 1, 0],
-            )
-            uy, vy, py = _sides(
-                corners[row, column, 1],
-                corners[row, column + 1, 1],
-                corners[row + 1, column, 1],
-                corners[row + 1, column + 1, 1],
-            )
-            margin = margin_px * np.sqrt(max(ux * ux + uy * uy, vx * vx + vy * vy))
-            if not (margin <= px <= size[0] - margin and margin <= py <= size[1] - margin):
-                continue
-            if _hidden(px, py, discs, margin):
-                continue
-            part = abs(ux * vy - uy * vx) / PARTS**2
-            first = count
-            reach_x, reach_y = (abs(ux) + abs(vx)) / 2, (abs(uy) + abs(vy)) / 2
-            left, top = int((px - reach_x) / cell_mm), int((py - reach_y) / cell_mm)
-            if (
-                left == int((px + reach_x) / cell_mm)
-                and top == int((py + reach_y) / cell_mm)
-                and left < nx
-                and top < ny
-            ):
-                # Most pixels lie in one cell as a whole.
-                cell[count], pixel[count] = top * nx + left, row * columns + column
-                area[count], x_mean[count], y_mean[count] = part * PARTS**2, part * PARTS**2 * px, part * PARTS**2 * py
-                count += 1
-                continue
-            for i in range(PARTS):
-                for j in range(PARTS):
-                    s, t = (j + 0.5) / PARTS - 0.5, (i + 0.5) / PARTS - 0.5
-                    x, y = px + s * ux + t * vx, py + s * uy + t * vy
-                    cx, cy = int(x / cell_mm), int(y / cell_mm)
-                    if not (0 <= cx < nx and 0 <= cy < ny):
-                        continue
-                    own = cy * nx + cx
-                    place = first
-                    while place < count and cell[place] != own:
-                        place += 1
-                    if place == most:
-                        # Pixels of the size of cells spread over many: such a plan is too coarse to be seen anyway.
-                        continue
-                    if place == count:
-                        cell[place], pixel[place] = own, row * columns + column
-                        area[place], x_mean[place], y_mean[place] = 0.0, 0.0, 0.0
-                        count += 1
-                    area[place] += part
-                    x_mean[place] += part * x
-                    y_mean[place] += part * y
-    return cell[:count], pixel[:count], area[:count], x_mean[:count] / area[:count], y_mean[:count] / area[:count]
+            pixel = _pixel(corners, row, column)
+            across2 = pixel.across_x * pixel.across_x + pixel.across_y * pixel.across_y
+            down2 = pixel.down_x * pixel.down_x + pixel.down_y * pixel.down_y
+            margin = margin_px * np.sqrt(max(across2, down2))
+            inside_x = margin <= pixel.x <= size[0] - margin
+            inside_y = margin <= pixel.y <= size[1] - margin
+            if inside_x and inside_y and not _on_disc(pixel.x, pixel.y, discs, margin):
+                count = _add_pixel(pieces, count, row * columns + column, pixel, cells, cell_mm)
+    area = pieces.area[:count]
+    return pieces.cell[:count], pieces.pixel[:count], area, pieces.x[:count] / area, pieces.y[:count] / area
 
 
 @numba.njit(cache=True, nogil=True)
-def _sides(a: float, b: float, c: float, d: float) -> tuple[float, float, float]:
-    """Steps along and across, and the middle, of a pixel with corners a, b above and c, d below (one coordinate)."""
-    return (b - a + d - c) / 2, (c - a + d - b) / 2, (a + b + c + d) / 4
+def _pixel(corners: Array, row: int, column: int) -> _Pixel:
+    """The parallelogram through the middles of a pixel's sides, from the plan positions of all corners of pixels."""
+    x, across_x, down_x = _sides(corners, row, column, 0)
+    y, across_y, down_y = _sides(corners, row, column, 1)
+    return _Pixel(x, y, across_x, across_y, down_x, down_y)
 
 
 @numba.njit(cache=True, nogil=True)
-def _hidden(x: float, y: float, discs: Array, margin: float) -> bool:
+def _sides(corners: Array, row: int, column: int, k: int) -> tuple[float, float, float]:
+    """Middle of a pixel and its sides along the row and the column, in coordinate `k`."""
+    a, b = corners[row, column, k], corners[row, column + 1, k]
+    c, d = corners[row + 1, column, k], corners[row + 1, column + 1, k]
+    return (a + b + c + d) / 4, (b - a + d - c) / 2, (c - a + d - b) / 2
+
+
+@numba.njit(cache=True, nogil=True)
+def _on_disc(x: float, y: float, discs: Array, margin: float) -> bool:
     """Whether a point lies on a disc (x, y, radius) or nearer to it than a margin."""
-    hidden = False
+    on_disc = False
     for k in range(len(discs)):
-        hidden |= (x - discs[k, 0]) ** 2 + (y - discs[k, 1]) ** 2 < (discs[k, 2] + margin) ** 2
-    return hidden
+        on_disc |= (x - discs[k, 0]) ** 2 + (y - discs[k, 1]) ** 2 < (discs[k, 2] + margin) ** 2
+    return on_disc
 
 
-def _outline(grid: PlanGrid) -> Array:
-    t = np.linspace(0, 1, 25)
-    zero, one = np.zeros_like(t), np.ones_like(t)
-    sides = [(t, zero), (t, one), (zero, t), (one, t)]
-    return np.concatenate([np.stack(side, axis=-1) for side in sides]) * (grid.width_mm, grid.height_mm)
+@numba.njit(cache=True, nogil=True, inline="always")
+def _add_pixel(pieces: _Pieces, count: int, number: int, pixel: _Pixel, cells: tuple[int, int], cell_mm: float) -> int:
+    """Add the pieces of one pixel after the first `count`; the new count."""
+    part_area = abs(pixel.across_x * pixel.down_y - pixel.across_y * pixel.down_x) / _PARTS**2
+    reach_x = (abs(pixel.across_x) + abs(pixel.down_x)) / 2
+    reach_y = (abs(pixel.across_y) + abs(pixel.down_y)) / 2
+    left, top = int((pixel.x - reach_x) / cell_mm), int((pixel.y - reach_y) / cell_mm)
+    right, bottom = int((pixel.x + reach_x) / cell_mm), int((pixel.y + reach_y) / cell_mm)
+    if left == right and top == bottom and left < cells[0] and top < cells[1]:
+        # Most pixels lie within one cell.
+        return _add_piece(pieces, count, count, top * cells[0] + left, number, part_area * _PARTS**2, pixel.x, pixel.y)
+    first = count
+    for i in range(_PARTS):
+        for j in range(_PARTS):
+            s, t = (j + 0.5) / _PARTS - 0.5, (i + 0.5) / _PARTS - 0.5
+            x = pixel.x + s * pixel.across_x + t * pixel.down_x
+            y = pixel.y + s * pixel.across_y + t * pixel.down_y
+            column, row = int(x / cell_mm), int(y / cell_mm)
+            if 0 <= column < cells[0] and 0 <= row < cells[1]:
+                count = _add_piece(pieces, first, count, row * cells[0] + column, number, part_area, x, y)
+    return count
 
 
-def centring(offset: Array, coverage: Array, grid: PlanGrid) -> sparse.csr_array:
-    """What to add to the cells, (cells, cells), so that partly seen ones move from the centre of their seen area to their own.
+@numba.njit(cache=True, nogil=True, inline="always")
+def _add_piece(pieces: _Pieces, first: int, count: int, cell: int, number: int, area: float, x: float, y: float) -> int:
+    """Add an area at (x, y) to the entry of its cell among those from `first` on, which are the pixel's, or to a new one; the count."""
+    entry = first
+    while entry < count and pieces.cell[entry] != cell:
+        entry += 1
+    if entry == len(pieces.cell):
+        # No entry left: pixels larger than cells, a plan too coarsely imaged for its grid.
+        return count
+    if entry == count:
+        pieces.cell[entry], pieces.pixel[entry] = cell, number
+        pieces.area[entry], pieces.x[entry], pieces.y[entry] = 0.0, 0.0, 0.0
+        count += 1
+    pieces.area[entry] += area
+    pieces.x[entry] += area * x
+    pieces.y[entry] += area * y
+    return count
 
-    That is minus their offset, (cells, 2) mm, times the gradient of the cells around them; both are linear in the cells.
+
+def centring_matrix(offset_mm: Array, coverage: Array, grid: PlanGrid) -> sparse.csr_array:
+    """Correction that moves partly seen cells from the centre of their seen area to their own centre.
+
+    Parameters
+    ----------
+    offset_mm : (cells, 2) ndarray, mm
+        Centre of the seen area minus centre of the cell, (x, y); NaN for cells that are not seen.
+    coverage : (y, x) ndarray
+        Share of every cell that is seen unmasked, 0 to 1.
+    grid : PlanGrid
+        The plan.
+
+    Returns
+    -------
+    (cells, cells) CSR array
+        To be multiplied with the cells and added to them: minus the offset times the gradient of a plane fitted to the 3 x 3 cells
+        around each, both of which are linear in the cells. Empty rows for cells within 2 % of their centre.
     """
-    places = offset + np.stack(np.meshgrid(grid.x_mm, grid.y_mm), axis=-1).reshape(-1, 2)
+    centres_mm = offset_mm + grid.centres_mm.reshape(-1, 2)
     seen = coverage.ravel() >= LEAST_COVERAGE
-    off = (np.abs(offset) > 0.02 * grid.cell_size_mm).any(axis=1) & seen
-    rows, columns, weights = _gradients(
-        np.flatnonzero(off), offset, places, coverage.ravel(), grid.shape, grid.cell_size_mm
+    off_centre = (np.abs(offset_mm) > 0.02 * grid.cell_size_mm).any(axis=1) & seen
+    rows, columns, weights = _centring_entries(
+        np.flatnonzero(off_centre), offset_mm, centres_mm, coverage.ravel(), grid.shape, grid.cell_size_mm
     )
     return sparse.csr_array((weights, (rows, columns)), shape=(seen.size, seen.size))
 
 
 @numba.njit(cache=True, nogil=True)
-def _gradients(
-    chosen: Array, offset: Array, places: Array, coverage: Array, shape: tuple[int, int], cell_mm: float
+def _centring_entries(
+    chosen: Array, offset: Array, centres: Array, coverage: Array, shape: tuple[int, int], cell_mm: float
 ) -> tuple[Array, Array, Array]:
-    """Entries of `centring`: a plane fitted to the 3 x 3 cells around each, weighted by how much of them is seen."""
+    """Row, column and weight of the entries of `centring_matrix`: a plane fitted to 3 x 3 cells, weighted by their coverage."""
     rows, columns = np.empty(9 * len(chosen), np.int64), np.empty(9 * len(chosen), np.int64)
     weights = np.empty(9 * len(chosen))
     count = 0
     around = np.empty(9, np.int64)
     for cell in chosen:
-        y, x = cell // shape[1], cell % shape[1]
-        n, total, mx, my = 0, 0.0, 0.0, 0.0
-        for j in range(max(y - 1, 0), min(y + 2, shape[0])):
-            for i in range(max(x - 1, 0), min(x + 2, shape[1])):
-                other = j * shape[1] + i
-                if coverage[other] >= LEAST_COVERAGE:
-                    around[n] = other
-                    n += 1
-                    total += coverage[other]
-                    mx += coverage[other] * places[other, 0]
-                    my += coverage[other] * places[other, 1]
-        mx, my = mx / total, my / total
+        n = _seen_neighbours(cell, coverage, shape, around)
+        total, mean_x, mean_y = 0.0, 0.0, 0.0
+        for other in around[:n]:
+            total += coverage[other]
+            mean_x += coverage[other] * centres[other, 0]
+            mean_y += coverage[other] * centres[other, 1]
+        mean_x, mean_y = mean_x / total, mean_y / total
         sxx, sxy, syy = 0.0, 0.0, 0.0
-        for k in range(n):
-            w, dx, dy = coverage[around[k]], places[around[k], 0] - mx, places[around[k], 1] - my
+        for other in around[:n]:
+            w, dx, dy = coverage[other], centres[other, 0] - mean_x, centres[other, 1] - mean_y
             sxx, sxy, syy = sxx + w * dx * dx, sxy + w * dx * dy, syy + w * dy * dy
-        det = sxx * syy - sxy * sxy
-        # Cells in a line have no gradient across it; such a cell stays where it is seen.
-        if det < 0.05 * cell_mm**4:
+        determinant = sxx * syy - sxy * sxy
+        # Cells in one line have no gradient across it; such a cell is not moved.
+        if determinant < 0.05 * cell_mm**4:
             continue
-        for k in range(n):
-            w, dx, dy = coverage[around[k]], places[around[k], 0] - mx, places[around[k], 1] - my
-            gx, gy = w * (syy * dx - sxy * dy) / det, w * (sxx * dy - sxy * dx) / det
-            rows[count], columns[count] = cell, around[k]
+        for other in around[:n]:
+            w, dx, dy = coverage[other], centres[other, 0] - mean_x, centres[other, 1] - mean_y
+            gx, gy = w * (syy * dx - sxy * dy) / determinant, w * (sxx * dy - sxy * dx) / determinant
+            rows[count], columns[count] = cell, other
             weights[count] = -(offset[cell, 0] * gx + offset[cell, 1] * gy)
             count += 1
     return rows[:count], columns[:count], weights[:count]
+
+
+@numba.njit(cache=True, nogil=True)
+def _seen_neighbours(cell: int, coverage: Array, shape: tuple[int, int], around: Array) -> int:
+    """Write the seen cells among the 3 x 3 around a cell, itself included, to `around`; their number."""
+    y, x = cell // shape[1], cell % shape[1]
+    n = 0
+    for j in range(max(y - 1, 0), min(y + 2, shape[0])):
+        for i in range(max(x - 1, 0), min(x + 2, shape[1])):
+            if coverage[j * shape[1] + i] >= LEAST_COVERAGE:
+                around[n] = j * shape[1] + i
+                n += 1
+    return n

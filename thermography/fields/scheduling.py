@@ -1,4 +1,4 @@
-"""Blocks computed by threads or by a dask cluster, handed back in order, never more in flight than memory allows."""
+"""Computation of blocks by threads or by a dask cluster: results in order, and a limited number of blocks in memory."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from thermography.errors import ThermographyError
 
 Task = TypeVar("Task")
 
-#: Threads without a cluster: reading and the sums release the interpreter, and two keep a disk and a core busy.
+#: Threads without a cluster: reading and the sums release the interpreter lock, and two keep a disk and a core busy.
 THREADS = 2
 
 
 class SchedulerError(ThermographyError):
-    """The cluster cannot be used; the message names its address and what to do."""
+    """The cluster cannot be used; the message names its address and the remedy."""
 
 
 @dataclass(frozen=True)
 class Pool:
-    """Something that computes functions elsewhere.
+    """Workers to which function calls are submitted.
 
     Attributes
     ----------
-    submit
-        ``submit(function, *arguments)`` returns a future with `result` and `cancel`.
-    share
-        Hand over once what many calls need; returns what to pass to `submit` in its place.
-    in_flight
-        How many calls to have waiting or running.
+    submit : callable
+        ``submit(function, *arguments)`` returns a future with the methods `result` and `cancel`.
+    share : callable
+        Sends an object that many calls need to the workers once; returns what to pass to `submit` in its place.
+    in_flight : int
+        Number of calls to keep waiting or running.
     """
 
     submit: Callable[..., Any]
@@ -43,7 +43,17 @@ class Pool:
 
 @contextmanager
 def open_pool(scheduler: str | None = None) -> Iterator[Pool]:
-    """Open threads, or the workers of the dask scheduler at an address (``tcp://host:8786``).
+    """Open a pool of threads, or of the workers of a dask scheduler.
+
+    Parameters
+    ----------
+    scheduler : str or None
+        Address of a dask scheduler (``tcp://host:8786``) whose workers see the same files; None for two threads.
+
+    Yields
+    ------
+    Pool
+        Closed at the end of the ``with`` block.
 
     Raises
     ------
@@ -82,9 +92,19 @@ def open_pool(scheduler: str | None = None) -> Iterator[Pool]:
 
 
 def in_order(pool: Pool, tasks: Iterable[tuple[Task, tuple[Any, ...]]]) -> Generator[tuple[Task, Any], None, None]:
-    """Compute (function, *arguments) of every task; yield tasks and results in the order of the tasks.
+    """Compute one function call per task, in parallel.
 
-    Closing the generator early cancels what is waiting.
+    Parameters
+    ----------
+    pool : Pool
+        From `open_pool`.
+    tasks : iterable of (task, (function, *arguments))
+        The task itself may be any object; it is returned with its result.
+
+    Yields
+    ------
+    task, result
+        In the order of the tasks. Closing the generator early cancels the calls that are waiting.
     """
     waiting: deque[tuple[Task, Any]] = deque()
     try:

@@ -1,6 +1,7 @@
-"""Frames to temperature fields on the table plan: one per cycle, and one per frame or short block of frames.
+"""Fields of a still table: one per cycle, and one per frame or short block of frames, on the table plan.
 
-A reduction under way: registrations, the cycle that is open, the frame stack, and what a broken run had finished.
+Blocks of frames are reduced in parallel and gathered in order. Every frame is compared with its registration; after a lasting
+displacement of camera or table (a knock) the plan is registered again, and the frames from there on are cut into blocks again.
 """
 
 from __future__ import annotations
@@ -8,61 +9,52 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from thermography._typing import Array
-from thermography.errors import ThermographyError
-from thermography.fields.blocks import Block, BlockResult, Camera, Override, cut_blocks, reduce_block
-from thermography.fields.checkpoint import Checkpoint, Finished, Group, describe
-from thermography.fields.cycle_fields import NOT_NUMBERED, CyclePart, assemble, position_covariance
+from thermography.fields.blocks import Block, BlockResult, RegisteredSensor, cut_blocks, reduce_block
+from thermography.fields.checkpoint import Checkpoint, ParameterGroup, StoredCycle, describe_reduction
+from thermography.fields.cycle_fields import CyclePart, assemble_fields, position_covariance
+from thermography.fields.inputs import NO_CYCLE, FrameSeries, Override, ReductionError, make_frame_series
 from thermography.fields.resampling import plan_weights, plan_window
-from thermography.fields.scheduling import in_order, open_pool
+from thermography.fields.scheduling import Pool, in_order, open_pool
 from thermography.io.flir import FrameReference
-from thermography.radiometry.planck import calibrate
 from thermography.registration.displacement import (
     KNOCK_PX,
     SUSPECT_PX,
-    RegisteredFrom,
+    RegistrationSpan,
     fiducial_shift,
     image_shift,
-    register_anew,
-    shifted,
-    watch,
+    monitor_fiducials,
+    register_after_knock,
+    shift_registration,
 )
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration
 
-__all__ = [
-    "FieldError",
-    "RegisteredFrom",
-    "check_bounds",
-    "check_correction",
-    "check_frames",
-    "cycle_of",
-    "reduce_frames",
-]
-
-#: Frames of one cycle that follow each other within this time share one field of the frame stack.
+#: Consecutive frames of one cycle within this time share one field of the frame stack, s.
 BLOCK_S = 10.0
-
-
-class FieldError(ThermographyError):
-    """The frames cannot be reduced to fields; the message names the frame or cycle and what to do."""
+#: The open cycle is stored whenever it has grown by this number of frames: the most that an interrupted run has to repeat.
+STORED_FRAMES = 4096
+#: Number of frames whose mean is registered after a knock.
+_RENEWAL_FRAMES = 8
 
 
 def reduce_frames(
     references: Sequence[FrameReference],
-    registration: Registration | Sequence[RegisteredFrom],
+    registration: Registration | Sequence[RegistrationSpan],
     grid: PlanGrid,
-    cycle_bounds: Array,
+    cycle_bounds: ArrayLike,
     *,
     override: Override = lambda frame: frame.parameters,
-    correction_K: Array | None = None,
+    correction_K: ArrayLike | None = None,
     block_s: float = BLOCK_S,
     scheduler: str | None = None,
     checkpoint: str | Path | None = None,
@@ -70,400 +62,433 @@ def reduce_frames(
 ) -> xr.Dataset:
     """Reduce frames of a still table to one temperature field per cycle on the table plan.
 
-    Counts are averaged, not temperatures, which is exact to the second order of the calibration curve; where the counts of a
-    pixel vary too much for that, its frames are calibrated one by one. The fiducials of every frame are compared with the
-    registration; where they have moved and stay so, the plan is registered anew from that frame on.
+    Counts are averaged, not temperatures, which is exact to the second order of the calibration curve; where the counts of a pixel
+    vary too much for that, its frames are calibrated one by one. The fiducials of every frame are compared with the registration;
+    where they have moved and remain so, the plan is registered again from that frame on.
 
     Parameters
     ----------
-    references
-        Frames sorted by time.
-    registration
-        For all frames, or spans of them in order (`RegisteredFrom`), the first starting at frame 0.
-    grid
+    references : sequence of FrameReference
+        Frames sorted by time, from `thermography.io.flir.index_frames`.
+    registration : Registration, or sequence of RegistrationSpan
+        For all frames, or spans of frames in order, the first starting at frame 0.
+    grid : PlanGrid
         The plan.
-    cycle_bounds
-        Start and end per cycle, (cycle, 2), or edges (cycle + 1,), datetime64, on the frames' clock; the end is not included.
-    override
-        Parameters to calibrate a frame with; the frame's own by default.
-    correction_K
-        Added to the temperature of every frame, shape (time,), for what the camera itself did (shutter steps, drift).
-    block_s
+    cycle_bounds : (cycles, 2) or (cycles + 1,) array of datetime64
+        Start and end of every cycle, or the edges between cycles, on the frames' clock; the end is excluded.
+    override : callable
+        From a frame reference to the camera parameters to calibrate the frame with; by default the frame's own.
+    correction_K : (frames,) array, K, or None
+        Added to the temperature of every frame, to correct artefacts of the camera (NUC/FFC events, drift).
+    block_s : float, s
         Frames of one cycle within this time share one field of `frame_temperature`; 0 gives every frame its own.
-    scheduler
-        Address of a dask scheduler whose workers see the same files; without it two threads do the work.
-    checkpoint
-        Folder for what is finished, with its sums of counts. A run that finds it goes on from there, within a long cycle too;
-        `thermography.fields.checkpoint.recalibrate` calibrates the cycles anew without the frames.
-    progress
+    scheduler : str or None
+        Address of a dask scheduler whose workers see the same files; None for two threads.
+    checkpoint : str, Path or None
+        Folder for finished cycles with their sums of counts. A run that finds it resumes there, also within a long cycle;
+        `thermography.fields.checkpoint.recalibrate` calibrates the cycles again without the frames.
+    progress : callable or None
         Called with the number of frames done since the last call.
 
     Returns
     -------
     xr.Dataset
-        Keeps `thermography.contract.FIELDS`; further `temperature_rate`, `quality_flag`, `position_u`, and as JSON texts the attributes
-        `frames_outside_cycles` (their fields are in the stack), `knocks` (frame and shift in px), `frames_shaken` (moved for one
-        frame only) and `frames_unchecked` (too little contrast to see the fiducials).
+        Variables of `thermography.contract.FIELDS` with dimensions (cycle, y, x) in degC and K, coordinates in mm; further
+        `temperature_rate`, `quality_flag`, `position_u`, and as JSON texts the attributes `frames_outside_cycles` (their fields are
+        in the stack), `knocks` (frame and shift in px), `frames_shaken` (displaced alone) and `frames_unchecked` (too little
+        contrast to locate the fiducials).
 
     Raises
     ------
-    FieldError
-        No frame, frames of different sizes, frames out of order, cycles that overlap, or no frame within any cycle.
+    ReductionError
+        There is no frame, frames differ in size or are out of order, cycles overlap, or no frame lies within any cycle.
+    RegistrationError
+        The plan is not located any more after a knock.
     CheckpointError
         The checkpoint belongs to another reduction.
+
+    Notes
+    -----
+    See ``docs/method/fields.md``; the average of counts is derived in `thermography.radiometry.averaging`.
     """
-    spans = _check_spans([RegisteredFrom(0, registration)] if isinstance(registration, Registration) else registration)
-    bounds = check_bounds(cycle_bounds)
-    times = check_frames(references, spans[0].registration.shape)
-    correction = check_correction(correction_K, len(references))
-    cycles = cycle_of(times, bounds)
-    _check_meeting(times, bounds, cycles)
-    kept = None
+    spans = _check_spans(
+        [RegistrationSpan(0, registration)] if isinstance(registration, Registration) else registration
+    )
+    frames = make_frame_series(
+        references, cycle_bounds, shape=spans[0].registration.shape, override=override, correction_K=correction_K
+    )
+    _check_overlap(frames)
+    store = None
     if checkpoint is not None:
-        parameters = [override(frame) for frame in references]
-        kept = Checkpoint(checkpoint, describe(references, parameters, correction, bounds, grid, spans, block_s))
-    run = Reduction(references, times, correction, grid, spans, override, kept)
-    _reduce(run, cycles, block_s=block_s, scheduler=scheduler, progress=progress)
-    return run.dataset(bounds, cycles)
-
-
-def _reduce(
-    run: Reduction,
-    cycles: Array,
-    *,
-    block_s: float,
-    scheduler: str | None,
-    progress: Callable[[int], None] | None,
-) -> None:
-    """Send the frames that are not done through the pool, block by block; after a knock, cut the rest anew."""
-    done = run.resume()
+        store = Checkpoint(checkpoint, describe_reduction(frames, grid, spans, block_s=block_s))
+    reduction = StillReduction(frames, grid, spans, store)
+    done = reduction.resume()
     if progress is not None and done:
         progress(done)
     with open_pool(scheduler) as pool:
-        while done < len(run.references):
-            blocks = cut_blocks(
-                run.references,
-                run.times,
-                cycles,
-                run.spans,
-                run.correction_K,
-                override=run.override,
-                block_s=block_s,
-                first=done,
-            )
-            cameras = [pool.share(camera) for camera in run.cameras]
-            tasks = (
-                (
-                    b,
-                    (
-                        reduce_block,
-                        run.references[b.first : b.stop],
-                        b.parameters,
-                        cameras[b.span],
-                        run.keep_statistics,
-                    ),
-                )
-                for b in blocks
-            )
-            results = in_order(pool, tasks)
-            for block, result in results:
-                if run.renew(block, result):
-                    results.close()
-                    break
-                run.gather(block, result)
-                done = block.stop
-                if progress is not None:
-                    progress(block.stop - block.first)
+        while done < len(frames):
+            done = _reduce_until_knock(reduction, pool, done, block_s=block_s, progress=progress)
+    return reduction.dataset()
 
 
-def check_bounds(cycle_bounds: Array) -> Array:
-    """Cycle bounds as (cycle, 2) datetime64[ns], in order and apart."""
-    bounds = np.asarray(cycle_bounds, "datetime64[ns]")
-    bounds = np.stack([bounds[:-1], bounds[1:]], axis=-1) if bounds.ndim == 1 else bounds
-    if len(bounds) == 0:
-        raise FieldError("cycle_bounds is empty; give the start and end of at least one cycle")
-    wrong = np.flatnonzero(~(bounds[:, 0] < bounds[:, 1]))
-    if wrong.size:
-        raise FieldError(
-            f"cycle {wrong[0] + 1} ends at {bounds[wrong[0], 1]}, before it starts at {bounds[wrong[0], 0]}"
-        )
-    overlap = np.flatnonzero(bounds[1:, 0] < bounds[:-1, 1])
-    if overlap.size:
-        n = int(overlap[0])
-        raise FieldError(f"cycle {n + 2} starts at {bounds[n + 1, 0]}, before cycle {n + 1} ends at {bounds[n, 1]}")
-    return bounds
-
-
-def check_frames(references: Sequence[FrameReference], shape: tuple[int, int]) -> Array:
-    """Times of the frames, datetime64[ns], after a check that they rise and that all frames have the registered size."""
-    if not references:
-        raise FieldError("there is no frame to reduce")
-    times = np.array([frame.time for frame in references], "datetime64[ns]")
-    for i, frame in enumerate(references):
-        where = f"{frame.path}: frame {frame.index}"
-        if tuple(frame.shape) != tuple(shape):
-            raise FieldError(
-                f"{where} has {frame.shape} pixels, the registered frames {shape}; reduce one size at a time"
-            )
-        if np.isnat(times[i]):
-            raise FieldError(f"{where} has no time; leave it out")
-        if i and times[i] <= times[i - 1]:
-            raise FieldError(f"{where} has the time {frame.time}, not after {references[i - 1].time}; sort the frames")
-    return times
-
-
-def cycle_of(times: Array, bounds: Array) -> NDArray[np.int64]:
-    """Index of the cycle that every time lies in, `NOT_NUMBERED` where it lies in none."""
-    index = np.searchsorted(bounds[:, 0], times, side="right") - 1
-    inside = (index >= 0) & (times < bounds[np.maximum(index, 0), 1])
-    return np.where(inside, index, NOT_NUMBERED)
-
-
-def _check_meeting(times: Array, bounds: Array, cycles: Array) -> None:
-    if (cycles == NOT_NUMBERED).all():
-        raise FieldError(
-            f"no frame lies within a cycle: frames {times[0]} to {times[-1]}, cycles {bounds[0, 0]} to {bounds[-1, 1]}; "
-            "check the time zones and the clock offset"
-        )
-
-
-def _check_spans(spans: Sequence[RegisteredFrom]) -> list[RegisteredFrom]:
-    starts = [span.first for span in spans]
+def _check_spans(spans: Sequence[RegistrationSpan]) -> list[RegistrationSpan]:
+    starts = [span.first_frame for span in spans]
     if not starts or starts[0] != 0 or (np.diff(starts) <= 0).any():
-        raise FieldError(f"registrations start at frames {starts}; they must start at 0 and rise")
+        raise ReductionError(f"registrations start at frames {starts}; they must start at 0 and rise")
     return list(spans)
 
 
-def check_correction(correction_K: Array | None, frames: int) -> Array:
-    """Correction of every frame, K; zeros where none is given."""
-    if correction_K is None:
-        return np.zeros(frames)
-    correction = np.asarray(correction_K, float)
-    if correction.shape != (frames,) or not np.isfinite(correction).all():
-        raise FieldError(
-            f"correction_K has shape {correction.shape}; it needs one finite value for each of {frames} frames"
+def _check_overlap(frames: FrameSeries) -> None:
+    if (frames.cycles == NO_CYCLE).all():
+        raise ReductionError(
+            f"no frame lies within a cycle: frames {frames.times[0]} to {frames.times[-1]}, "
+            f"cycles {frames.bounds[0, 0]} to {frames.bounds[-1, 1]}; check the time zones and the clock offset"
         )
-    return correction
 
 
-#: A cycle that is open is kept on disk whenever it has grown by so many frames: what a broken run has to do again at most.
-KEPT_FRAMES = 4096
-#: Frames whose mean the plan is registered on anew after a knock.
-RENEWAL_FRAMES = 8
+def _reduce_until_knock(
+    reduction: StillReduction, pool: Pool, first: int, *, block_s: float, progress: Callable[[int], None] | None
+) -> int:
+    """Reduce the frames from `first` on, block by block, up to the block in which a knock is found; the first frame not reduced."""
+    frames, registrations = reduction.frames, reduction.registrations
+    blocks = cut_blocks(frames, registrations.spans, block_s=block_s, first=first)
+    sensors = [pool.share(sensor) for sensor in registrations.sensors]
+    keep_statistics = reduction.checkpoint is not None
+    tasks = (
+        (b, (reduce_block, frames.references[b.first : b.stop], b.parameters, sensors[b.span], keep_statistics))
+        for b in blocks
+    )
+    with closing(in_order(pool, tasks)) as results:
+        for block, result in results:
+            knock = reduction.displacement.find_knock(block, result.shift_px)
+            if knock is not None:
+                reduction.register_again(knock)
+                return block.first
+            reduction.gather(block, result)
+            if progress is not None:
+                progress(block.stop - block.first)
+    return len(frames)
 
 
-@dataclass
-class Reduction:
-    """What has been gathered so far, in the order of time: the registrations, the open cycle, and the frame stack."""
+@dataclass(frozen=True)
+class _Knock:
+    """A lasting displacement from a frame on: the registration span in which it occurs, and the shift (column, row) px."""
 
-    references: Sequence[FrameReference]
-    times: Array
-    correction_K: Array
-    grid: PlanGrid
-    spans: list[RegisteredFrom]
-    override: Override
-    checkpoint: Checkpoint | None = None
-    cameras: list[Camera] = field(default_factory=list)
-    covariances: list[Array] = field(default_factory=list)
-    parts: list[CyclePart] = field(default_factory=list)
-    blocks: list[Block] = field(default_factory=list)
-    stack: list[NDArray[np.float32]] = field(default_factory=list)
-    shift_px: Array = field(default_factory=lambda: np.empty(0))
-    shaken: set[int] = field(default_factory=set)
-    baseline_px: Array = field(default_factory=lambda: np.zeros(2))
-    groups: list[Group] = field(default_factory=list)
-    saved_blocks: int = 0
-    kept_frames: int = 0
+    frame: int
+    span: int
+    shift_px: Array
 
-    def __post_init__(self) -> None:
-        self.shift_px = np.full(len(self.references), np.nan)
-        prepared = [self._prepare(span.registration) for span in self.spans]
-        self.cameras, self.covariances = [one for one, _ in prepared], [other for _, other in prepared]
+
+class _Registrations:
+    """Registration spans in the order of time, and what is derived from each of them.
+
+    Attributes
+    ----------
+    spans : list of RegistrationSpan
+    sensors : list of RegisteredSensor
+        Weights and fiducial monitor for the reduction of blocks.
+    covariances : list of (y, x, 2, 2) ndarray, mm2
+        Of the position of every cell.
+    """
+
+    def __init__(self, spans: Sequence[RegistrationSpan], grid: PlanGrid) -> None:
+        self.grid = grid
+        self.spans: list[RegistrationSpan] = []
+        self.sensors: list[RegisteredSensor] = []
+        self.covariances: list[Array] = []
+        for index, span in enumerate(spans):
+            self.insert(index, span)
+
+    def insert(self, index: int, span: RegistrationSpan) -> None:
+        """Insert a span before the one at `index`."""
+        registration, grid = span.registration, self.grid
+        # In parallel: the weights are compiled loops over pixels, the others many small steps of the interpreter.
+        with ThreadPoolExecutor(1) as executor:
+            monitor = executor.submit(monitor_fiducials, registration, grid, plan_window(registration, grid))
+            covariance = executor.submit(position_covariance, registration, grid)
+            sensor = RegisteredSensor(plan_weights(registration, grid), monitor.result())
+        self.spans.insert(index, span)
+        self.sensors.insert(index, sensor)
+        self.covariances.insert(index, covariance.result())
+
+    def stop_frame(self, index: int) -> int | None:
+        """First frame of the span after the one at `index`; None for the last."""
+        return self.spans[index + 1].first_frame if index + 1 < len(self.spans) else None
+
+
+class _Displacement:
+    """Displacement of every frame against its registration.
+
+    Attributes
+    ----------
+    shift_px : (frames,) ndarray, px
+        Length of the shift of every frame; NaN where it is not measured.
+    shaken : set of int
+        Frames that are displaced alone.
+    baseline_px : (2,) ndarray, px
+        Bias (column, row) of the fiducial monitor against the exact shift, from temperature gradients on the table.
+    """
+
+    def __init__(self, frames: FrameSeries, registrations: _Registrations) -> None:
+        self.frames, self.registrations = frames, registrations
+        self.shift_px = np.full(len(frames), np.nan)
+        self.shaken: set[int] = set()
+        self.baseline_px = np.zeros(2)
+
+    def find_knock(self, block: Block, monitored_px: Array) -> _Knock | None:
+        """Measure the frames of a block up to the first one of a lasting displacement.
+
+        Frames for which the monitor shows a shift, (frames, 2) px, or nothing are measured exactly. A displacement that the next
+        frame shares is a knock; otherwise the frame is shaken.
+        """
+        for i, monitored in zip(range(block.first, block.stop), monitored_px, strict=True):
+            shift = monitored - self.baseline_px
+            if np.isnan(monitored).any() or np.hypot(*shift) > SUSPECT_PX:
+                exact = self._exact_shift(i, block.span)
+                if np.hypot(*exact) > KNOCK_PX:
+                    if i + 1 == len(self.frames) or _alike(self._exact_shift(i + 1, block.span), exact):
+                        return _Knock(i, block.span, exact)
+                    self.shaken.add(i)
+                elif np.isfinite(exact + monitored).all():
+                    self.baseline_px = monitored - exact
+                shift = exact
+            self.shift_px[i] = np.hypot(*shift)
+        return None
+
+    def span_after(self, knock: _Knock) -> RegistrationSpan:
+        """Register the plan again on the mean of the frames after a knock; the baseline starts anew."""
+        temperature = np.mean([self.frames.temperature(i) for i in self._frames_after(knock)], axis=0, dtype=float)
+        old, grid = self.registrations.spans[knock.span].registration, self.registrations.grid
+        if np.isfinite(fiducial_shift(temperature, old, grid)).all():
+            name = self.frames.name(knock.frame)
+            registration = register_after_knock(temperature, old, knock.shift_px, grid, frame_name=name)
+        else:
+            registration = shift_registration(old, knock.shift_px)
+        self.baseline_px = np.zeros(2)
+        return RegistrationSpan(knock.frame, registration, (float(knock.shift_px[0]), float(knock.shift_px[1])))
+
+    def _frames_after(self, knock: _Knock) -> list[int]:
+        """The first displaced frame and those of the next few, up to the next span, that share its displacement."""
+        stop = self.registrations.stop_frame(knock.span)
+        stop = min(knock.frame + _RENEWAL_FRAMES, len(self.frames), *([] if stop is None else [stop]))
+        following = range(knock.frame + 1, stop)
+        return [knock.frame, *(i for i in following if _alike(self._exact_shift(i, knock.span), knock.shift_px))]
+
+    def _exact_shift(self, i: int, span: int) -> Array:
+        """Shift of a frame, (column, row) px, by the fiducials, or where they have no contrast by the image of the table."""
+        first, registration = self.registrations.spans[span].first_frame, self.registrations.spans[span].registration
+        temperature = self.frames.temperature(i)
+        shift = fiducial_shift(temperature, registration, self.registrations.grid)
+        if np.isnan(shift).any() and i != first:
+            shift = image_shift(self.frames.temperature(first), temperature, registration, self.registrations.grid)
+        return shift
+
+
+def _alike(shift_px: Array, other_px: Array) -> bool:
+    """Whether a shift is a displacement, and the same as another one."""
+    difference = np.hypot(*(shift_px - other_px))
+    return bool(np.hypot(*shift_px) > KNOCK_PX and difference < max(KNOCK_PX, 0.3 * np.hypot(*other_px)))
+
+
+class _FrameStack:
+    """Blocks in the order of time, and the field of each, (y, x) degC."""
+
+    def __init__(self) -> None:
+        self.blocks: list[Block] = []
+        self.fields: list[NDArray[np.float32]] = []
+
+    def variables(self, shift_px: Array) -> dict[str, Any]:
+        """Variables along ``time``, from the shift of every frame, (frames,) px."""
+        shifts = np.array([_largest(shift_px[b.first : b.stop]) for b in self.blocks], np.float32)
+        return {
+            "frame_temperature": (("time", "y", "x"), np.stack(self.fields)),
+            "frame_cycle": ("time", np.array([b.cycle + 1 for b in self.blocks], np.int32)),
+            "frame_count": ("time", np.array([b.stop - b.first for b in self.blocks], np.int32)),
+            "frame_shift": ("time", shifts),
+        }
+
+
+def _largest(values: Array) -> float:
+    measured = values[np.isfinite(values)]
+    return float(measured.max()) if measured.size else float("nan")
+
+
+class _Cycles:
+    """Finished cycles, and the open one: the last part, as long as it has pixels, with its sums of counts.
+
+    Attributes
+    ----------
+    parts : list of CyclePart
+        In the order of time.
+    sums : list of ParameterGroup
+        Of the open cycle.
+    """
+
+    def __init__(self) -> None:
+        self.parts: list[CyclePart] = []
+        self.sums: list[ParameterGroup] = []
 
     @property
-    def keep_statistics(self) -> bool:
-        """Sums of counts are kept where there is a place for them."""
-        return self.checkpoint is not None
+    def open(self) -> CyclePart | None:
+        """The open cycle, if there is one."""
+        return self.parts[-1] if self.parts and self.parts[-1].pixels is not None else None
+
+    def holds(self, block: Block) -> bool:
+        """Whether the last cycle is that of a block."""
+        return bool(self.parts) and (self.parts[-1].cycle, self.parts[-1].span) == (block.cycle, block.span)
+
+    def add(self, block: Block, result: BlockResult, times: Array, correction_K: float) -> None:
+        """Add a block to the open cycle, or open its cycle: times (frames,) of its frames, and their mean correction."""
+        if not self.holds(block):
+            self.parts.append(CyclePart(block.cycle, block.span))
+        self.parts[-1].add(replace(result.temperature, mean=result.temperature.mean + correction_K), times)
+        if result.statistics is not None:
+            self._add_sums(ParameterGroup(block.parameters, result.statistics, correction_K))
+
+    def _add_sums(self, new: ParameterGroup) -> None:
+        for number, group in enumerate(self.sums):
+            if group.parameters == new.parameters and group.correction_K == new.correction_K:
+                self.sums[number] = replace(group, statistics=group.statistics.merge(new.statistics))
+                return
+        self.sums.append(new)
+
+
+class StillReduction:
+    """State of a reduction under way: what has been gathered, in the order of time.
+
+    Parameters
+    ----------
+    frames : FrameSeries
+        All frames.
+    grid : PlanGrid
+        The plan.
+    spans : sequence of RegistrationSpan
+        As given, before knocks.
+    checkpoint : Checkpoint or None
+        Where finished cycles are stored.
+
+    Attributes
+    ----------
+    registrations, displacement, stack, cycles
+        Registrations including those after knocks; shift of every frame; blocks with their fields; cycles with their sums.
+    stored_blocks, stored_frames : int
+        Blocks of finished cycles, and frames, that the checkpoint holds.
+    """
+
+    def __init__(
+        self, frames: FrameSeries, grid: PlanGrid, spans: Sequence[RegistrationSpan], checkpoint: Checkpoint | None
+    ) -> None:
+        self.frames, self.grid, self.checkpoint = frames, grid, checkpoint
+        self.registrations = _Registrations(spans, grid)
+        self.displacement = _Displacement(frames, self.registrations)
+        self.stack = _FrameStack()
+        self.cycles = _Cycles()
+        self.stored_blocks = 0
+        self.stored_frames = 0
 
     def resume(self) -> int:
-        """Take over what an earlier run has finished; return the first frame that is not done."""
+        """Load what an earlier run has stored; the first frame that is not done."""
         done = 0
         if self.checkpoint is None:
             return done
         for index, span, shift in self.checkpoint.knocks():
-            self._renew_from(index, span, np.array(shift))
-        for finished in self.checkpoint.load():
-            if finished.first_frame != done:
+            self.register_again(_Knock(index, span, np.array(shift)))
+        for cycle in self.checkpoint.load():
+            if cycle.first_frame != done:
                 break
-            done = self._take_over(finished)
-        self.saved_blocks = len(self.blocks)
+            done = self._restore(cycle)
+        self.stored_blocks = len(self.stack.blocks)
         unfinished = self.checkpoint.load_open()
         if unfinished is not None and unfinished.first_frame == done:
-            done = self._take_over(unfinished)
-            self.groups = list(unfinished.groups)
-        self.kept_frames = done
+            done = self._restore(unfinished)
+            self.cycles.sums = list(unfinished.groups)
+        self.stored_frames = done
         return done
 
-    def _take_over(self, found: Finished) -> int:
-        for first, stop, cycle, span in found.blocks.tolist():
-            self.blocks.append(Block(first, stop, cycle, span, self.override(self.references[first])))
-        self.stack.extend(found.stack)
-        self.parts.append(found.part)
-        self.shift_px[found.first_frame : found.stop_frame] = found.shift_px
-        self.baseline_px = np.array(found.baseline_px)
-        self.shaken.update(found.shaken)
-        return found.stop_frame
+    def _restore(self, cycle: StoredCycle) -> int:
+        """Take over a stored cycle; the first frame after it."""
+        for first, stop, number, span in cycle.blocks.tolist():
+            parameters = self.frames.override(self.frames.references[first])
+            self.stack.blocks.append(Block(first, stop, number, span, parameters))
+        self.stack.fields.extend(cycle.stack)
+        self.cycles.parts.append(cycle.part)
+        self.displacement.shift_px[cycle.first_frame : cycle.stop_frame] = cycle.shift_px
+        self.displacement.shaken.update(cycle.shaken)
+        self.displacement.baseline_px = np.array(cycle.baseline_px)
+        return cycle.stop_frame
 
-    def _prepare(self, registration: Registration) -> tuple[Camera, Array]:
-        """What the workers need of a registration, and the covariance of the place of every cell."""
-        # Side by side: the weights are loops over pixels, the others many small steps.
-        with ThreadPoolExecutor(1) as executor:
-            looks = executor.submit(watch, registration, self.grid, plan_window(registration, self.grid))
-            covariance = executor.submit(position_covariance, registration, self.grid)
-            camera = Camera(plan_weights(registration, self.grid), looks.result())
-        return camera, covariance.result()
-
-    def renew(self, block: Block, result: BlockResult) -> bool:
-        """Look for a knock in a block; register anew from its first moved frame and return True, so that the block is cut again."""
-        for i, seen in zip(range(block.first, block.stop), result.shift_px, strict=True):
-            shift = seen - self.baseline_px
-            if np.isnan(seen).any() or np.hypot(*shift) > SUSPECT_PX:
-                exact = self._exact_shift(i, block.span)
-                if np.hypot(*exact) > KNOCK_PX:
-                    if i + 1 == len(self.references) or _alike(self._exact_shift(i + 1, block.span), exact):
-                        self._renew_from(i, block.span, exact)
-                        return True
-                    self.shaken.add(i)
-                elif np.isfinite(exact + seen).all():
-                    self.baseline_px = seen - exact
-                shift = exact
-            self.shift_px[i] = np.hypot(*shift)
-        return False
-
-    def _exact_shift(self, i: int, span: int) -> Array:
-        """Shift by the fiducials, or where they have no contrast by the picture of the table."""
-        own = self.spans[span]
-        frame = self._temperature(i)
-        shift = fiducial_shift(frame, own.registration, self.grid)
-        if np.isnan(shift).any() and i != own.first:
-            shift = image_shift(self._temperature(own.first), frame, own.registration, self.grid)
-        return shift
-
-    def _temperature(self, i: int) -> Array:
-        return calibrate(self.references[i].read().counts, self.override(self.references[i]))
-
-    def _renew_from(self, i: int, span: int, shift: Array) -> None:
-        later = [
-            j
-            for j in range(i + 1, min(i + RENEWAL_FRAMES, len(self.references)))
-            if self._same_place(j, i, span, shift)
-        ]
-        frame = np.mean([self._temperature(j) for j in [i, *later]], axis=0, dtype=float)
-        old = self.spans[span].registration
-        if np.isfinite(fiducial_shift(frame, old, self.grid)).all():
-            registration = register_anew(frame, old, shift, self.grid, where=self._name(i))
-        else:
-            registration = shifted(old, shift)
+    def register_again(self, knock: _Knock) -> None:
+        """Register the plan again from the frame of a knock on."""
+        span = self.displacement.span_after(knock)
         if self.checkpoint is not None:
-            self.checkpoint.note_knock(i, span, shift.tolist())
-        self.spans.insert(span + 1, RegisteredFrom(i, registration, (float(shift[0]), float(shift[1]))))
-        camera, covariance = self._prepare(registration)
-        self.cameras.insert(span + 1, camera)
-        self.covariances.insert(span + 1, covariance)
-        self.baseline_px = np.zeros(2)
-
-    def _same_place(self, j: int, i: int, span: int, shift: Array) -> bool:
-        following = self.spans[span + 1].first if span + 1 < len(self.spans) else len(self.references)
-        return j < following and _alike(self._exact_shift(j, span), shift)
+            self.checkpoint.save_knock(knock.frame, knock.span, knock.shift_px.tolist())
+        self.registrations.insert(knock.span + 1, span)
 
     def gather(self, block: Block, result: BlockResult) -> None:
-        """Add a block to the stack and to the cycle that is open; a block of the next cycle or registration closes it."""
-        last = self.parts[-1] if self.parts else None
-        if last is not None and (last.cycle, last.span) != (block.cycle, block.span):
+        """Add a block to the stack and to its cycle; the first block of another cycle or registration closes the open cycle."""
+        if not self.cycles.holds(block):
             self.close()
-        offset = float(self.correction_K[block.first : block.stop].mean())
-        self.blocks.append(block)
-        self.stack.append((result.cells + offset).astype(np.float32))
-        if block.cycle == NOT_NUMBERED:
+        correction = float(self.frames.correction_K[block.first : block.stop].mean())
+        self.stack.blocks.append(block)
+        self.stack.fields.append((result.cells + correction).astype(np.float32))
+        if block.cycle == NO_CYCLE:
             return
-        if last is None or (last.cycle, last.span) != (block.cycle, block.span):
-            self.parts.append(CyclePart(block.cycle, block.span))
-        temperature = replace(result.temperature, mean=result.temperature.mean + offset)
-        self.parts[-1].add(temperature, self.times[block.first : block.stop])
-        if result.statistics is not None:
-            self._add_sums(Group(block.parameters, result.statistics, offset))
-        if self.checkpoint is not None and block.stop - self.kept_frames >= KEPT_FRAMES:
-            self._save(self.checkpoint)
-
-    def _add_sums(self, new: Group) -> None:
-        for number, group in enumerate(self.groups):
-            if group.parameters == new.parameters and group.correction_K == new.correction_K:
-                self.groups[number] = replace(group, statistics=group.statistics.merge(new.statistics))
-                return
-        self.groups.append(new)
+        self.cycles.add(block, result, self.frames.times[block.first : block.stop], correction)
+        if self.checkpoint is not None and block.stop - self.stored_frames >= STORED_FRAMES:
+            self._store(self.checkpoint)
 
     def close(self) -> None:
-        """Finish the cycle that is open, if there is one, and write it to the checkpoint."""
-        part = self.parts[-1] if self.parts else None
-        if part is None or part.pixels is None:
+        """Finish the open cycle, if there is one, and store it."""
+        part = self.cycles.open
+        if part is None:
             return
-        part.finish(self.cameras[part.span].weights)
+        part.finish(self.registrations.sensors[part.span].weights)
         if self.checkpoint is not None:
-            self._save(self.checkpoint)
-            self.saved_blocks = len(self.blocks)
-        self.groups = []
+            self._store(self.checkpoint)
+            self.stored_blocks = len(self.stack.blocks)
+        self.cycles.sums = []
 
-    def _save(self, checkpoint: Checkpoint) -> None:
-        blocks = self.blocks[self.saved_blocks :]
+    def _store(self, checkpoint: Checkpoint) -> None:
+        """Store the last cycle with all blocks since the previous one."""
+        blocks = self.stack.blocks[self.stored_blocks :]
         first, stop = blocks[0].first, blocks[-1].stop
-        places = np.array([(b.first, b.stop, b.cycle, b.span) for b in blocks])
-        stack = np.stack(self.stack[self.saved_blocks :])
-        shaken = tuple(sorted(i for i in self.shaken if first <= i < stop))
-        shift, baseline = self.shift_px[first:stop], (float(self.baseline_px[0]), float(self.baseline_px[1]))
-        groups = tuple(self.groups)
-        checkpoint.save(Finished(self.parts[-1], first, stop, places, stack, shift, groups, shaken, baseline))
-        self.kept_frames = stop
-
-    def dataset(self, bounds: Array, cycles: Array) -> xr.Dataset:
-        """Put everything together."""
-        self.close()
-        coverages = [camera.weights.coverage for camera in self.cameras]
-        blocks = self.blocks
-        middles = [self.times[b.first] + (self.times[b.first : b.stop] - self.times[b.first]).mean() for b in blocks]
-        knocks = [
-            {"frame": self._name(s.first), "index": s.first, "shift_px": list(s.shift_px)} for s in self.spans[1:]
-        ]
-        texts = {
-            "frames_outside_cycles": [self._name(i) for i in np.flatnonzero(cycles == NOT_NUMBERED)],
-            "knocks": knocks,
-            "frames_shaken": [self._name(i) for i in sorted(self.shaken)],
-            "frames_unchecked": [self._name(i) for i in np.flatnonzero(np.isnan(self.shift_px))],
-        }
-        frames = {
-            "frame_temperature": (("time", "y", "x"), np.stack(self.stack)),
-            "frame_cycle": ("time", np.array([b.cycle + 1 for b in blocks], np.int32)),
-            "frame_count": ("time", np.array([b.stop - b.first for b in blocks], np.int32)),
-            "frame_shift": ("time", np.array([_largest(self.shift_px[b.first : b.stop]) for b in blocks], np.float32)),
-        }
-        fields = assemble(
-            self.parts,
-            len(bounds),
-            self.grid,
-            self.covariances,
-            coverages,
-            frames=frames,
-            frame_coordinates={"time": np.array(middles)},
+        baseline = self.displacement.baseline_px
+        checkpoint.save(
+            StoredCycle(
+                part=self.cycles.parts[-1],
+                first_frame=first,
+                stop_frame=stop,
+                blocks=np.array([(b.first, b.stop, b.cycle, b.span) for b in blocks]),
+                stack=np.stack(self.stack.fields[self.stored_blocks :]),
+                shift_px=self.displacement.shift_px[first:stop],
+                groups=tuple(self.cycles.sums),
+                shaken=tuple(sorted(i for i in self.displacement.shaken if first <= i < stop)),
+                baseline_px=(float(baseline[0]), float(baseline[1])),
+            )
         )
-        return fields.assign_attrs({name: json.dumps(value) for name, value in texts.items()})
+        self.stored_frames = stop
 
-    def _name(self, i: int) -> str:
-        return f"{self.references[i].path.name}#{self.references[i].index}"
-
-
-def _alike(one: Array, other: Array) -> bool:
-    return bool(np.hypot(*one) > KNOCK_PX and np.hypot(*(one - other)) < max(KNOCK_PX, 0.3 * np.hypot(*other)))
-
-
-def _largest(values: Array) -> float:
-    known = values[np.isfinite(values)]
-    return float(known.max()) if known.size else float("nan")
+    def dataset(self) -> xr.Dataset:
+        """Finish the open cycle and assemble the fields, the frame stack and the lists of frames with remarks."""
+        self.close()
+        frames, spans, shift_px = self.frames, self.registrations.spans, self.displacement.shift_px
+        times = np.array([frames.mean_time(block.first, block.stop) for block in self.stack.blocks])
+        fields = assemble_fields(
+            self.cycles.parts,
+            len(frames.bounds),
+            self.grid,
+            self.registrations.covariances,
+            [sensor.weights.coverage for sensor in self.registrations.sensors],
+            frames=self.stack.variables(shift_px),
+            frame_coordinates={"time": times},
+        )
+        remarks = {
+            "frames_outside_cycles": frames.names(frames.cycles == NO_CYCLE),
+            "knocks": [
+                {"frame": frames.name(s.first_frame), "index": s.first_frame, "shift_px": list(s.shift_px)}
+                for s in spans[1:]
+            ],
+            "frames_shaken": [frames.name(i) for i in sorted(self.displacement.shaken)],
+            "frames_unchecked": frames.names(np.isnan(shift_px)),
+        }
+        return fields.assign_attrs({name: json.dumps(value) for name, value in remarks.items()})

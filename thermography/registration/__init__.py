@@ -1,1 +1,1 @@
-"""Pixels become places on the table plan (level 2): fiducials found, projection fitted, motion and clock of the table."""
+"""Registration of thermograms to the table plan: fiducials, lens model, displacement and motion of the table, and the camera's clock."""

@@ -1,6 +1,8 @@
-"""One clock for camera and machine: the table's seen motion laid over its commanded motion.
+"""Offset of the camera's clock against the machine's: the observed motion of the table fitted to its commanded motion.
 
-Where a machine was sent at any time, and how well frames that saw the table fix its offset, zero, feed and rate.
+The commanded motion follows from the readings of a positioning test (time and target position) and the feed between them. A coarse
+search finds the offset whose misfit is smallest and refuses ambiguous ones; least squares then fit offset, zero of the observed
+position, feed and clock rate; the uncertainty is the largest of several estimates, because each of them fails in some campaigns.
 """
 
 from __future__ import annotations
@@ -14,40 +16,56 @@ from scipy.optimize import least_squares
 from thermography._typing import Array
 from thermography.errors import ThermographyError
 
-#: The seen table must travel at least this many times the uncertainty of its place.
-LEAST_TRAVEL = 20.0
-#: Another offset makes the clock ambiguous if its misfit is less than this much larger, ...
-AMBIGUITY = 1.5
-#: ... and no more than this many frames speak for the better one.
-DECIDING_FRAMES = 8
-#: Offsets nearer together than this belong to one minimum, s.
-ONE_MINIMUM_S = 5.0
-#: Consecutive groups of frames that are left out in turn for the uncertainty (delete-a-group jackknife).
-GROUPS = 20
+#: The observed travel of the table must be at least this many times the uncertainty of its position.
+_LEAST_TRAVEL = 20.0
+#: Two offsets are ambiguous if the misfit of the second is less than this many times that of the first, ...
+_AMBIGUITY = 1.5
+#: ... and the difference amounts to fewer than this many frames at `_FAR_MM`.
+_DECIDING_FRAMES = 8
+#: Offsets nearer than this to each other belong to one minimum, s.
+_ONE_MINIMUM_S = 5.0
+#: Step of the search, s.
+_SEARCH_STEP_S = 0.5
+#: Largest number of groups of the delete-a-group jackknife: consecutive frames.
+_GROUPS = 20
+#: Residuals are limited to this value in searches, mm: beyond it a frame contradicts the offset, however far it is.
+_FAR_MM = 20.0
+#: In shorter records the clock rate is taken as zero, s.
+_RATE_AFTER_S = 3600.0
+#: Residuals above this count linearly instead of squared (soft L1 loss), mm.
+_LOSS_SCALE_MM = 0.5
+#: Misfit that the steps of the starting grid alone cause, mm.
+_GRID_MM = 1.0
+#: Range, s, and number of steps either way of the profile of the misfit over the offset.
+_PROFILE_S, _PROFILE_STEPS = 4.0, 30
+#: Feeds tried, as multiples of the median feed that the readings require at least.
+_FEEDS = np.geomspace(1.0, 20.0, 40)
+#: Slowest feed, mm/s: the table arrives at the very time of the next reading.
+_SLOWEST_MM_S = 1e-9
 
 
 class ClockError(ThermographyError):
-    """Nothing determines the clock offset; the message says why and what to give instead."""
+    """Nothing determines the clock offset; the message gives the reason and what to give instead."""
 
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """Camera clock minus machine clock.
+    """Time of the camera's clock minus time of the machine's clock.
 
     Attributes
     ----------
-    offset_s, offset_u_s
+    offset_s, offset_u_s : float, s
         At the middle of the frames, with its standard uncertainty.
-    rate, rate_u
-        Seconds gained per second by the camera's clock; zero where the record is too short to tell.
-    start_mm
+    rate, rate_u : float, s/s
+        Seconds that the camera's clock gains per second; zero where the record is shorter than an hour.
+    start_mm : float, mm
         Axis position at which the table was registered.
-    feed_mm_per_min
-        Used for the commanded motion; fitted where it was not given.
-    rms_mm
-        Seen minus commanded position.
-    frames
-        Frames that took part.
+    feed_mm_per_min : float, mm/min
+        Feed between target positions; fitted where it was not given.
+    rms_mm : float, mm
+        Root mean square of observed minus commanded position.
+    frames : int
+        Number of frames used.
     """
 
     offset_s: float
@@ -62,59 +80,63 @@ class ClockOffset:
 
 def estimate_clock_offset(
     frame_time: ArrayLike,
-    seen_mm: ArrayLike,
-    seen_u_mm: ArrayLike,
+    table_mm: ArrayLike,
+    table_u_mm: ArrayLike,
     reading_time: ArrayLike,
-    reading_mm: ArrayLike,
+    target_mm: ArrayLike,
     *,
     feed_mm_per_min: float | None = None,
-    reading_at: float = 1.0,
+    reading_phase: float = 1.0,
     search_s: float = 900.0,
     expected_s: float = 0.0,
 ) -> ClockOffset:
-    """Estimate how far the camera's clock is ahead of the machine's, from where the table is seen and where it was sent.
+    """Estimate the offset of the camera's clock against the machine's from the observed and the commanded motion of the table.
 
     Parameters
     ----------
-    frame_time, seen_mm, seen_u_mm
-        Per frame: UTC time on the camera's clock, the table's displacement along the axis (any zero), its standard uncertainty;
-        NaN where the table was not found.
-    reading_time, reading_mm
-        Per reading of the laser: UTC time on the machine's clock, and the target; in any order, NaT left out.
-    feed_mm_per_min
-        Feed between targets; fitted if not given.
-    reading_at
-        When during the stand the readings are taken, see `commanded_position`. The motion alone cannot tell this from a clock
-        offset: half a stand of error here is half a stand of error of the offset.
-    search_s, expected_s
+    frame_time : (frames,) array of datetime64
+        UTC by the camera's clock.
+    table_mm, table_u_mm : (frames,) array, mm
+        Displacement of the table along the axis from any zero, and its standard uncertainty; NaN where the table was not located.
+    reading_time : (readings,) array of datetime64
+        UTC of the laser readings by the machine's clock, in any order; NaT is left out.
+    target_mm : (readings,) array, mm
+        Target position of every reading.
+    feed_mm_per_min : float or None, mm/min
+        Feed between target positions; None fits it.
+    reading_phase : float
+        Phase of the dwell at which readings are taken, see `commanded_position`. The motion alone cannot distinguish it from a
+        clock offset: an error of half a dwell here is an error of half a dwell of the offset.
+    search_s, expected_s : float, s
         Offsets from ``expected_s - search_s`` to ``expected_s + search_s`` are considered.
 
     Returns
     -------
     ClockOffset
-        Its uncertainty comes from leaving out groups of frames in turn, so that it covers what the motion model gets wrong from
-        one part of the test to another.
+        Its uncertainty is estimated by leaving out groups of frames, so that it includes errors of the motion model that differ
+        between parts of the test.
 
     Raises
     ------
     ClockError
-        The table is not seen to travel, too few frames meet the readings in time, or two offsets fit about equally well.
+        The table is not observed to travel, too few frames overlap with the readings, or two offsets fit about equally well.
+
+    Notes
+    -----
+    See ``docs/method/registration.md``. Delete-a-group jackknife: B. Efron, R. J. Tibshirani, An Introduction to the Bootstrap (1993),
+    ch. 11.
     """
     frame_s, origin = _seconds(frame_time)
     reading_s, _ = _seconds(reading_time, origin)
-    seen, seen_u, target = (np.asarray(values, float) for values in (seen_mm, seen_u_mm, reading_mm))
-    known = np.isfinite(frame_s) & np.isfinite(seen)
+    table, table_u, target = (np.asarray(values, float) for values in (table_mm, table_u_mm, target_mm))
+    located = np.isfinite(frame_s) & np.isfinite(table)
     order = np.argsort(reading_s)
     order = order[np.isfinite(reading_s[order]) & np.isfinite(target[order])]
-    frame_s, seen, seen_u = frame_s[known], seen[known], np.nan_to_num(seen_u[known], nan=1.0)
-    reading_s, target = reading_s[order], target[order]
-    _check_travel(seen, seen_u, target)
-    # Until the feed is known, the table is taken to travel all the time between readings: wrong by less than FAR_MM.
-    feed = feed_mm_per_min / 60 if feed_mm_per_min is not None else 1e-9
-    start = _search(frame_s, seen, reading_s, target, feed, reading_at, expected_s, search_s)
-    model = Motion(frame_s, seen, reading_s, target, None if feed_mm_per_min is None else feed, reading_at)
-    best, u = _fit(model, start)
-    residual = model.residual(best)
+    _check_travel(table[located], np.nan_to_num(table_u[located], nan=1.0), target[order])
+    feed = None if feed_mm_per_min is None else feed_mm_per_min / 60
+    motion = _Motion(frame_s[located], table[located], reading_s[order], target[order], feed, reading_phase)
+    best, u = _fit(motion, _search(motion, expected_s, search_s))
+    residual = motion.residual(best)
     inside = np.isfinite(residual)
     return ClockOffset(
         offset_s=float(best[0]),
@@ -128,77 +150,38 @@ def estimate_clock_offset(
     )
 
 
-def _fit(model: Motion, start: float) -> tuple[Array, Array]:
-    """Offset, zero, feed and rate near an offset, and their standard uncertainties, (4,) each."""
-    fits = model.fits(start)
-    best = fits[0]
-    groups = np.array_split(np.arange(len(model.seen)), min(GROUPS, len(model.seen) // 5))
-    left_out = np.array([model.without(group).fit(best) for group in groups])
-    u = np.sqrt((len(groups) - 1) / len(groups) * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0))
-    # A jackknife of few groups scatters by itself: never less than the scatter of the residuals gives.
-    u = np.maximum(u, model.formal_u(best))
-    # Solutions that the frames cannot tell apart: any offset up to the farthest is as good, a rectangular distribution (GUM 4.3.7).
-    u = np.hypot(u, np.abs(fits - best).max(axis=0) / np.sqrt(3))
-    u[0] = max(u[0], model.profile_u(best, u[0] / 4))
-    return best, u
+def commanded_position(
+    time_s: Array, reading_s: Array, target_mm: Array, feed_mm_s: float, *, reading_phase: float = 1.0
+) -> Array:
+    """Axis position during a positioning test: dwell at a target position, take the reading, move on at the feed, dwell.
 
+    Parameters
+    ----------
+    time_s : ndarray, s
+        Times at which the position is wanted, any shape.
+    reading_s : (readings,) ndarray, s
+        Times of the readings, rising.
+    target_mm : (readings,) ndarray, mm
+        Target positions.
+    feed_mm_s : float, mm/s
+        Feed between targets; where it is too slow, the table arrives at the time of the next reading.
+    reading_phase : float
+        Phase of the dwell at which the reading is taken: 0 on arrival, 1 just before the move, as a controller with a dwell time does.
 
-def _search(
-    frame_s: Array,
-    seen: Array,
-    reading_s: Array,
-    target: Array,
-    feed: float,
-    reading_at: float,
-    expected_s: float,
-    search_s: float,
-) -> float:
-    """The offset that fits best on a grid; refused where another one fits about as well."""
-    offsets = expected_s + np.arange(-search_s, search_s + 0.25, 0.5)
-    costs = np.array([_cost(frame_s - offset, seen, reading_s, target, feed, reading_at) for offset in offsets])
-    best = int(np.argmin(costs))
-    if costs[best] > 0.9 * FAR_MM:
-        raise ClockError(
-            f"frames and readings do not meet within {search_s:g} s of an offset of {expected_s:g} s; check the time zones (all times "
-            "are UTC), or give clock_offset"
-        )
-    apart = np.abs(offsets - offsets[best]) > ONE_MINIMUM_S
-    # Only other minima count: the flanks of the best one are not other answers.
-    lower = np.r_[False, (costs[1:-1] <= costs[:-2]) & (costs[1:-1] <= costs[2:]), False]
-    near = costs < AMBIGUITY * costs[best] + 0.02 * FAR_MM
-    rivals = np.flatnonzero(apart & lower & near & ((costs - costs[best]) * len(seen) < DECIDING_FRAMES * FAR_MM))
-    if rivals.size:
-        named = ", ".join(f"{offsets[i]:.1f}" for i in rivals[:4])
-        raise ClockError(
-            f"the motion fits clock offsets of {offsets[best]:.1f} s and {named} s about equally well (a periodic test); give "
-            "clock_offset, or frames from before the first reading to after the last"
-        )
-    return float(offsets[best])
-
-
-def _cost(machine_s: Array, seen: Array, reading_s: Array, target: Array, feed: float, reading_at: float) -> float:
-    """Mean absolute misfit, mm, cut at `FAR_MM`; frames outside the readings count as far."""
-    residual = seen - commanded_position(machine_s, reading_s, target, feed, reading_at=reading_at)
-    inside = np.isfinite(residual)
-    if inside.sum() < 5:
-        return FAR_MM
-    near = np.minimum(np.abs(residual[inside] - np.median(residual[inside])), FAR_MM)
-    return float((near.sum() + FAR_MM * (~inside).sum()) / len(seen))
-
-
-def _check_travel(seen: Array, seen_u: Array, target: Array) -> None:
-    if len(seen) < 20:
-        raise ClockError(
-            f"the table is found in {len(seen)} frames; 20 are needed for a clock offset, or give clock_offset"
-        )
-    if len(target) < 3:
-        raise ClockError(f"{len(target)} readings have a time; a clock offset needs at least 3, or give clock_offset")
-    travel, sent = float(np.ptp(seen)), float(np.ptp(target))
-    if travel < LEAST_TRAVEL * float(np.median(seen_u)) or travel < 0.1 * sent:
-        raise ClockError(
-            f"the table is seen to travel {travel:.2f} mm where it was sent over {sent:g} mm: frames of a still table do not determine "
-            'a clock offset; give clock_offset, or leave both clocks on UTC and write clock_offset = "0 s"'
-        )
+    Returns
+    -------
+    ndarray, mm
+        Of the shape of `time_s`; NaN before the first and after the last reading, where the motion of the machine is unknown.
+    """
+    interval = np.diff(reading_s)
+    dwell = np.maximum(interval - np.abs(np.diff(target_mm)) / feed_mm_s, 0.0)
+    leave = reading_s[:-1] + (1 - reading_phase) * dwell
+    arrive = reading_s[1:] - reading_phase * dwell
+    path_s = np.concatenate([[reading_s[0]], np.column_stack([leave, arrive]).ravel(), [reading_s[-1]]])
+    path_mm = np.concatenate(
+        [[target_mm[0]], np.column_stack([target_mm[:-1], target_mm[1:]]).ravel(), [target_mm[-1]]]
+    )
+    return np.interp(time_s, path_s, path_mm, left=np.nan, right=np.nan)
 
 
 def _seconds(times: ArrayLike, origin: np.datetime64 | None = None) -> tuple[Array, np.datetime64]:
@@ -210,110 +193,93 @@ def _seconds(times: ArrayLike, origin: np.datetime64 | None = None) -> tuple[Arr
     return np.where(np.isnat(stamps), np.nan, seconds), origin
 
 
-#: Residuals beyond this count no further in the search: whoever is that far off is simply elsewhere, mm.
-FAR_MM = 20.0
-#: Below this length of record the rate of one clock against the other is taken as zero, s.
-RATE_AFTER_S = 3600.0
-#: From here on a deviation counts as itself, not as its square, mm.
-HUBER_MM = 0.5
-#: What the grid of starts misfits by its steps alone, mm.
-GRID_MM = 1.0
-#: How far from the best offset, and at how many offsets either way, others are compared with it, s.
-PROFILE_S, PROFILE_STEPS = 4.0, 30
-#: Feeds that are tried, as parts of what the readings need at least.
-FEEDS = np.geomspace(1.0, 20.0, 40)
-
-
-def commanded_position(
-    time_s: Array, reading_s: Array, reading_mm: Array, feed_mm_s: float, *, reading_at: float = 1.0
-) -> Array:
-    """Axis position (mm) of a positioning test at any time: stand, read, go on at the feed to the next target, stand.
-
-    Parameters
-    ----------
-    time_s
-        Times wanted, any shape, s.
-    reading_s, reading_mm
-        Times of the readings in order, and the targets, (readings,).
-    feed_mm_s
-        Between targets; where it is too slow to arrive, the table arrives at the next reading.
-    reading_at
-        When during the stand the reading is taken: 0 on arrival, 1 just before going on, as a controller with a dwell time does.
-
-    Returns
-    -------
-    ndarray
-        NaN before the first and after the last reading: nothing is known of what the machine did there.
-    """
-    gap = np.diff(reading_s)
-    stand = np.maximum(gap - np.abs(np.diff(reading_mm)) / feed_mm_s, 0.0)
-    leave = reading_s[:-1] + (1 - reading_at) * stand
-    arrive = reading_s[1:] - reading_at * stand
-    way_s = np.concatenate([[reading_s[0]], np.column_stack([leave, arrive]).ravel(), [reading_s[-1]]])
-    way_mm = np.concatenate(
-        [[reading_mm[0]], np.column_stack([reading_mm[:-1], reading_mm[1:]]).ravel(), [reading_mm[-1]]]
-    )
-    return np.interp(time_s, way_s, way_mm, left=np.nan, right=np.nan)
+def _check_travel(table: Array, table_u: Array, target: Array) -> None:
+    if len(table) < 20:
+        raise ClockError(
+            f"the table is found in {len(table)} frames; 20 are needed for a clock offset, or give clock_offset"
+        )
+    if len(target) < 3:
+        raise ClockError(f"{len(target)} readings have a time; a clock offset needs at least 3, or give clock_offset")
+    observed, commanded = float(np.ptp(table)), float(np.ptp(target))
+    if observed < _LEAST_TRAVEL * float(np.median(table_u)) or observed < 0.1 * commanded:
+        raise ClockError(
+            f"the observed travel of the table is {observed:.2f} mm, the commanded travel {commanded:g} mm: "
+            "frames of a still table do not determine a clock offset; give clock_offset, or leave both clocks on UTC "
+            'and write clock_offset = "0 s"'
+        )
 
 
 @dataclass(frozen=True)
-class Motion:
-    """Seen against commanded motion; parameters are offset (s), zero of the seen position (mm), feed (mm/s) and clock rate."""
+class _Motion:
+    """Observed against commanded motion.
+
+    The parameters of the model, (4,), are the offset (s), the zero of the observed position (mm), the feed (mm/s) and the clock
+    rate (s/s).
+
+    Attributes
+    ----------
+    frame_s, table_mm : (frames,) ndarray, s and mm
+    reading_s, target_mm : (readings,) ndarray, s and mm
+    feed_mm_s : float or None, mm/s
+        None: fitted.
+    reading_phase : float
+    """
 
     frame_s: Array
-    seen: Array
+    table_mm: Array
     reading_s: Array
-    target: Array
-    feed: float | None
-    reading_at: float
+    target_mm: Array
+    feed_mm_s: float | None
+    reading_phase: float
 
     @property
-    def middle(self) -> float:
-        """Time at which the offset holds, s."""
+    def middle_s(self) -> float:
+        """Time at which the offset holds."""
         return float(self.frame_s.mean())
-
-    def without(self, group: Array) -> Motion:
-        """The same without some frames."""
-        return replace(self, frame_s=np.delete(self.frame_s, group), seen=np.delete(self.seen, group))
 
     @property
     def free(self) -> NDArray[np.bool_]:
         """Which of the parameters are fitted."""
-        return np.array([True, True, self.feed is None, np.ptp(self.frame_s) > RATE_AFTER_S])
+        return np.array([True, True, self.feed_mm_s is None, np.ptp(self.frame_s) > _RATE_AFTER_S])
 
-    def formal_u(self, best: Array) -> Array:
-        """Standard uncertainties of the parameters as if the residuals were independent and the model linear, (4,)."""
-        steps = np.diag([0.02, 0.01, 1e-3 * best[2], 1e-6])[self.free]
-        columns = [(self.residual(best + step) - self.residual(best - step)) / (2 * step.sum()) for step in steps]
-        jacobian = np.nan_to_num(np.stack(columns, axis=-1))
-        residual = np.nan_to_num(self.residual(best))
-        variance = float(residual @ residual) / max(int(np.count_nonzero(residual)) - len(steps), 1)
-        u = np.zeros(4)
-        u[self.free] = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * variance)
-        return u
+    @property
+    def feeds(self) -> list[float]:
+        """Feeds to start a fit from, mm/s."""
+        if self.feed_mm_s is not None:
+            return [self.feed_mm_s]
+        required = np.abs(np.diff(self.target_mm)) / np.diff(self.reading_s)
+        return list(float(np.median(required[required > 0])) * _FEEDS)
+
+    def without(self, group: Array) -> _Motion:
+        """The motion without some frames."""
+        return replace(self, frame_s=np.delete(self.frame_s, group), table_mm=np.delete(self.table_mm, group))
 
     def residual(self, parameters: Array) -> Array:
-        """Seen minus commanded position, mm; NaN where the machine's is not known."""
+        """Observed minus commanded position, mm; NaN where the commanded one is unknown."""
         offset, zero, feed, rate = parameters
-        machine_s = self.frame_s - offset - rate * (self.frame_s - self.middle)
-        commanded = commanded_position(machine_s, self.reading_s, self.target, feed, reading_at=self.reading_at)
-        residual: Array = self.seen - zero - commanded
+        machine_s = self.frame_s - offset - rate * (self.frame_s - self.middle_s)
+        commanded = commanded_position(
+            machine_s, self.reading_s, self.target_mm, feed, reading_phase=self.reading_phase
+        )
+        residual: Array = self.table_mm - zero - commanded
         return residual
 
-    def fits(self, offset: float) -> Array:
-        """Solutions near an offset that the frames cannot tell apart at three standard deviations, (solutions, 4), best first."""
-        found = np.array([self.fit(start) for start in self._starts(offset)])
-        misfits = np.array([self.misfit(one) for one in found])
-        order = np.argsort(misfits)
-        alike = misfits[order] <= misfits[order[0]] * (1 + 9 / len(self.seen))
-        return found[order[alike]]
-
     def misfit(self, parameters: Array) -> float:
-        """Mean squared residual, mm2, none counted as farther than `FAR_MM`."""
-        return float(np.nanmean(np.minimum(np.abs(self.residual(parameters)), FAR_MM) ** 2))
+        """Mean squared residual, mm2, residuals limited to `_FAR_MM`."""
+        return float(np.nanmean(np.minimum(np.abs(self.residual(parameters)), _FAR_MM) ** 2))
+
+    def centre(self, grid: Array) -> Array:
+        """Set the zero of every set of parameters, (sets, 4), to the median residual; their mean absolute misfits, (sets,) mm."""
+        misfits = np.empty(len(grid))
+        for i, parameters in enumerate(grid):
+            parameters[1] = 0.0
+            residual = self.residual(parameters)
+            parameters[1] = np.nanmedian(residual)
+            misfits[i] = np.nanmean(np.minimum(np.abs(residual - parameters[1]), _FAR_MM))
+        return misfits
 
     def fit(self, start: Array, *, offset_free: bool = True) -> Array:
-        """Least squares of the near, least absolute deviations of the far frames."""
+        """Robust least squares: small residuals count squared, large ones linearly."""
         free = self.free & np.array([offset_free, True, True, True])
         scale = np.array([1.0, 1.0, 1.0, 1e-5])
 
@@ -323,67 +289,126 @@ class Motion:
             parameters[2] = max(parameters[2], 1e-3)
             return np.nan_to_num(self.residual(parameters), nan=0.0)
 
-        found = least_squares(
+        solution = least_squares(
             residuals,
             start[free] / scale[free],
             loss="soft_l1",
-            f_scale=HUBER_MM,
+            f_scale=_LOSS_SCALE_MM,
             diff_step=1e-4,
             x_scale="jac",
             xtol=1e-10,
         )
         best = start.copy()
-        best[free] = found.x * scale[free]
+        best[free] = solution.x * scale[free]
         return best
 
-    def _starts(self, offset: float) -> list[Array]:
-        """Offset, zero and feed to start from: the best of a grid, and the outermost ones that fit about as well.
 
-        Frames at a few phases of the motion only (every 10 s of a motion of 6 s) leave feed and offset to each other.
-        """
-        grid = np.array(
-            [(offset + step, 0.0, feed, 0.0) for feed in self._feeds for step in np.arange(-4.0, 4.25, 0.5)]
+def _search(motion: _Motion, expected_s: float, search_s: float) -> float:
+    """Offset of the smallest misfit on a grid, s; refused where another one fits about equally well."""
+    # Until the feed is known, the table is taken to move all the time between readings: wrong by less than _FAR_MM.
+    feed = motion.feed_mm_s if motion.feed_mm_s is not None else _SLOWEST_MM_S
+    offsets = expected_s + np.arange(-search_s, search_s + _SEARCH_STEP_S / 2, _SEARCH_STEP_S)
+    misfits = np.array([_search_misfit(motion, offset, feed) for offset in offsets])
+    best = int(np.argmin(misfits))
+    if misfits[best] > 0.9 * _FAR_MM:
+        raise ClockError(
+            f"frames and readings do not meet within {search_s:g} s of an offset of {expected_s:g} s; check the time zones (all times "
+            "are UTC), or give clock_offset"
         )
-        costs = self._centre(grid)
-        alike = grid[costs <= 1.5 * costs.min() + GRID_MM]
-        outer = [alike[np.argmin(alike[:, k])] for k in (0, 2)] + [alike[np.argmax(alike[:, k])] for k in (0, 2)]
-        return [grid[np.argmin(costs)], *outer]
+    apart = np.abs(offsets - offsets[best]) > _ONE_MINIMUM_S
+    # Only other minima are rivals, not the flanks of the best one.
+    minimum = np.r_[False, (misfits[1:-1] <= misfits[:-2]) & (misfits[1:-1] <= misfits[2:]), False]
+    similar = misfits < _AMBIGUITY * misfits[best] + 0.02 * _FAR_MM
+    undecided = (misfits - misfits[best]) * len(motion.table_mm) < _DECIDING_FRAMES * _FAR_MM
+    rivals = np.flatnonzero(apart & minimum & similar & undecided)
+    if rivals.size:
+        named = ", ".join(f"{offsets[i]:.1f}" for i in rivals[:4])
+        raise ClockError(
+            f"the motion fits clock offsets of {offsets[best]:.1f} s and {named} s about equally well (a periodic test); give "
+            "clock_offset, or frames from before the first reading to after the last"
+        )
+    return float(offsets[best])
 
-    @property
-    def _feeds(self) -> list[float]:
-        if self.feed is not None:
-            return [self.feed]
-        moves = np.abs(np.diff(self.target)) / np.diff(self.reading_s)
-        return list(float(np.median(moves[moves > 0])) * FEEDS)
 
-    def _centre(self, grid: Array) -> Array:
-        """Give each set of parameters the zero that suits it; return their mean absolute misfits, mm."""
-        costs = np.empty(len(grid))
-        for i, parameters in enumerate(grid):
-            parameters[1] = 0.0
-            residual = self.residual(parameters)
-            parameters[1] = np.nanmedian(residual)
-            costs[i] = np.nanmean(np.minimum(np.abs(residual - parameters[1]), FAR_MM))
-        return costs
+def _search_misfit(motion: _Motion, offset: float, feed_mm_s: float) -> float:
+    """Mean absolute misfit about its median, limited to `_FAR_MM`, which is also that of frames outside the readings, mm."""
+    residual = motion.residual(np.array([offset, 0.0, feed_mm_s, 0.0]))
+    inside = np.isfinite(residual)
+    if inside.sum() < 5:
+        return _FAR_MM
+    limited = np.minimum(np.abs(residual[inside] - np.median(residual[inside])), _FAR_MM)
+    return float((limited.sum() + _FAR_MM * (~inside).sum()) / len(residual))
 
-    def profile_u(self, best: Array, step_s: float) -> float:
-        """Standard uncertainty of the offset about the best one, from how well every other offset fits with all else free, s.
 
-        Frames that always meet the motion at the same phases leave feed and offset to each other, or see the table standing only: then
-        a whole range of offsets fits alike, and neither the curvature at the best one nor leaving out frames shows it. Offsets count by
-        their likelihood, ``exp(-chi2 / 2)``, those about `step_s` apart near the best one and farther apart away from it.
-        """
-        growth = np.linspace(0.0, 1.0, PROFILE_STEPS)
-        away = step_s * (PROFILE_S / step_s) ** growth
-        offsets = best[0] + np.concatenate([-away[::-1], [0.0], away])
-        misfits = np.array([self._best_misfit(offset, best) for offset in offsets])
-        least = misfits.min()
-        likelihood = np.exp(-0.5 * len(self.seen) * (misfits - least) / least)
-        square = np.trapezoid(likelihood * (offsets - best[0]) ** 2, offsets) / np.trapezoid(likelihood, offsets)
-        return float(np.sqrt(square))
+def _fit(motion: _Motion, offset: float) -> tuple[Array, Array]:
+    """Parameters fitted near an offset, and their standard uncertainties, (4,) each."""
+    solutions = _indistinguishable_fits(motion, offset)
+    best = solutions[0]
+    frames = len(motion.table_mm)
+    groups = np.array_split(np.arange(frames), min(_GROUPS, frames // 5))
+    left_out = np.array([motion.without(group).fit(best) for group in groups])
+    u = np.sqrt((len(groups) - 1) / len(groups) * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0))
+    # A jackknife of few groups scatters: it is never less than the scatter of the residuals implies.
+    u = np.maximum(u, _formal_u(motion, best))
+    # Solutions that the frames cannot distinguish: a rectangular distribution up to the farthest one (JCGM 100:2008, 4.3.7).
+    u = np.hypot(u, np.abs(solutions - best).max(axis=0) / np.sqrt(3))
+    u[0] = max(u[0], _profile_u(motion, best, u[0] / 4))
+    return best, u
 
-    def _best_misfit(self, offset: float, best: Array) -> float:
-        """Misfit at one offset, the other parameters fitted from the best of several feeds and from those of the best offset."""
-        grid = np.array([(offset, 0.0, feed, best[3]) for feed in self._feeds] + [(offset, *best[1:])])
-        costs = self._centre(grid)
-        return min(self.misfit(self.fit(start, offset_free=False)) for start in (grid[np.argmin(costs)], grid[-1]))
+
+def _indistinguishable_fits(motion: _Motion, offset: float) -> Array:
+    """Fits near an offset whose misfits differ by less than three standard deviations, (fits, 4), best first."""
+    fits = np.array([motion.fit(start) for start in _starts(motion, offset)])
+    misfits = np.array([motion.misfit(parameters) for parameters in fits])
+    order = np.argsort(misfits)
+    alike = misfits[order] <= misfits[order[0]] * (1 + 9 / len(motion.table_mm))
+    return fits[order[alike]]
+
+
+def _starts(motion: _Motion, offset: float) -> list[Array]:
+    """Parameters to start from: the best of a grid of offsets and feeds, and the outermost ones that fit about equally well.
+
+    Frames at a few phases of the motion only (every 10 s of a motion of 6 s) determine a combination of feed and offset.
+    """
+    steps = np.arange(-4.0, 4.25, 0.5)
+    grid = np.array([(offset + step, 0.0, feed, 0.0) for feed in motion.feeds for step in steps])
+    misfits = motion.centre(grid)
+    alike = grid[misfits <= 1.5 * misfits.min() + _GRID_MM]
+    outer = [alike[np.argmin(alike[:, k])] for k in (0, 2)] + [alike[np.argmax(alike[:, k])] for k in (0, 2)]
+    return [grid[np.argmin(misfits)], *outer]
+
+
+def _formal_u(motion: _Motion, best: Array) -> Array:
+    """Standard uncertainties of the parameters for independent residuals and a linear model, (4,)."""
+    steps = np.diag([0.02, 0.01, 1e-3 * best[2], 1e-6])[motion.free]
+    columns = [(motion.residual(best + step) - motion.residual(best - step)) / (2 * step.sum()) for step in steps]
+    jacobian = np.nan_to_num(np.stack(columns, axis=-1))
+    residual = np.nan_to_num(motion.residual(best))
+    variance = float(residual @ residual) / max(int(np.count_nonzero(residual)) - len(steps), 1)
+    u = np.zeros(4)
+    u[motion.free] = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)) * variance)
+    return u
+
+
+def _profile_u(motion: _Motion, best: Array, step_s: float) -> float:
+    """Standard uncertainty of the offset from its profile likelihood, all other parameters fitted at every offset, s.
+
+    Frames that always meet the motion at the same phases determine a combination of feed and offset only, or observe the table at
+    rest only: then a whole range of offsets fits equally well, which neither the curvature at the best one nor the jackknife shows.
+    Offsets are weighted by ``exp(-chi2 / 2)``; they lie about `step_s` apart near the best one and farther apart away from it.
+    """
+    growth = np.linspace(0.0, 1.0, _PROFILE_STEPS)
+    away = step_s * (_PROFILE_S / step_s) ** growth
+    offsets = best[0] + np.concatenate([-away[::-1], [0.0], away])
+    misfits = np.array([_profile_misfit(motion, offset, best) for offset in offsets])
+    least = misfits.min()
+    likelihood = np.exp(-0.5 * len(motion.table_mm) * (misfits - least) / least)
+    variance = np.trapezoid(likelihood * (offsets - best[0]) ** 2, offsets) / np.trapezoid(likelihood, offsets)
+    return float(np.sqrt(variance))
+
+
+def _profile_misfit(motion: _Motion, offset: float, best: Array) -> float:
+    """Misfit at one offset, the other parameters fitted from the best of several feeds and from those of the best offset."""
+    grid = np.array([(offset, 0.0, feed, best[3]) for feed in motion.feeds] + [(offset, *best[1:])])
+    misfits = motion.centre(grid)
+    return min(motion.misfit(motion.fit(start, offset_free=False)) for start in (grid[np.argmin(misfits)], grid[-1]))

@@ -1,4 +1,4 @@
-"""Disc fiducials in a temperature image: found anywhere, then located to hundredths of a pixel."""
+"""Disc fiducials in a thermogram: detected anywhere in the frame, then located to hundredths of a pixel."""
 
 from __future__ import annotations
 
@@ -7,23 +7,38 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import median_abs_deviation
 
 from thermography._typing import Array
 from thermography.registration.plan import Fiducial, PlanGrid
 
-#: Kernel widths in px at which spots are lifted from their background; each finds discs of 0.2 to 0.8 of its width.
-KERNEL_WIDTHS_PX = (15, 29, 57, 113)
-#: A spot is a disc if its area differs from that of the ellipse with its moments by less than this part.
-ELLIPSE_TOLERANCE = 0.12
-#: A disc whose contrast is less than this many times the noise of one pixel is not located: its centroid would err by tenths of a pixel.
-LEAST_CONTRAST = 2.0
-#: More oblique discs than this ratio of axes are not accepted as discs.
-LARGEST_ASPECT = 4.0
+#: Widths of the structuring element, px; each width detects discs with diameters of 0.2 to 0.8 of it.
+_KERNEL_WIDTHS_PX = (15, 29, 57, 113)
+#: A spot is accepted as a disc if its area differs by less than this share from that of the ellipse with its second moments.
+_ELLIPSE_TOLERANCE = 0.12
+#: A disc whose contrast is less than this many times the noise of a pixel is not located: its centroid would err by tenths of a pixel.
+_LEAST_CONTRAST = 2.0
+#: Spots with a larger ratio of axes are not accepted as discs.
+_LARGEST_ASPECT = 4.0
+#: Smallest area of a spot, px.
+_LEAST_AREA_PX = 12
+#: Normal standard deviation over median absolute deviation.
+_SIGMA_PER_MAD = 1.4826
 
 
 @dataclass(frozen=True)
 class Spot:
-    """An elliptic spot in the image: centre, area, and contrast to its surroundings (negative: looks colder)."""
+    """An elliptic spot in a frame.
+
+    Attributes
+    ----------
+    column_px, row_px : float, px
+        Centroid.
+    area_px : float
+        Number of pixels.
+    contrast_K : float, K
+        Apparent temperature against the surroundings; negative where the spot looks colder.
+    """
 
     column_px: float
     row_px: float
@@ -33,7 +48,19 @@ class Spot:
 
 @dataclass(frozen=True)
 class LocatedDisc:
-    """A disc's centroid in px with its standard uncertainty, its image area and its contrast to the table around it."""
+    """A disc fiducial located in a frame.
+
+    Attributes
+    ----------
+    column_px, row_px : float, px
+        Centroid of the disc's image.
+    u_px : float, px
+        Standard uncertainty of either coordinate from pixel noise.
+    area_px : float
+        Area of the image in pixels; NaN where it was not measured.
+    contrast_K : float, K
+        Apparent temperature against the table around the disc; NaN where it was not measured.
+    """
 
     column_px: float
     row_px: float
@@ -43,28 +70,33 @@ class LocatedDisc:
 
 
 def detect_discs(temperature: NDArray[np.floating], *, limit: int = 40) -> list[Spot]:
-    """Find elliptic spots that are colder or warmer than what surrounds them, without knowing where or how large.
+    """Detect elliptic spots of unknown position and size that are colder or warmer than their surroundings.
 
     Parameters
     ----------
-    temperature
-        One frame (row, column) in degC; the mean of several where contrast is low.
-    limit
-        How many spots to return at most, strongest first.
+    temperature : (row, column) ndarray, degC
+        One frame, or the mean of several where the contrast is low.
+    limit : int
+        Largest number of spots to return.
 
     Returns
     -------
-    list[Spot]
+    list of Spot
         Strongest contrast first.
+
+    Notes
+    -----
+    Black and white top-hat transforms (J. Serra, Image Analysis and Mathematical Morphology, 1982) at four widths lift spots from
+    their background; connected components above half their peak are compared with the ellipse of their second moments.
     """
     smooth = cv2.GaussianBlur(np.nan_to_num(temperature).astype(np.float32), (0, 0), 0.8)
     spots: list[Spot] = []
-    for width in KERNEL_WIDTHS_PX:
+    for width in _KERNEL_WIDTHS_PX:
         kernel = np.ones((width, width), np.uint8)
-        closed = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, kernel) - smooth
-        opened = smooth - cv2.morphologyEx(smooth, cv2.MORPH_OPEN, kernel)
-        for lifted, sign in ((closed, -1.0), (opened, 1.0)):
-            spots.extend(_spots_of(lifted, sign, width))
+        black_hat = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, kernel) - smooth
+        white_hat = smooth - cv2.morphologyEx(smooth, cv2.MORPH_OPEN, kernel)
+        for top_hat, sign in ((black_hat, -1.0), (white_hat, 1.0)):
+            spots.extend(_spots_in(top_hat, sign, width))
     spots.sort(key=lambda spot: -abs(spot.contrast_K))
     distinct: list[Spot] = []
     for spot in spots:
@@ -74,25 +106,20 @@ def detect_discs(temperature: NDArray[np.floating], *, limit: int = 40) -> list[
     return distinct[:limit]
 
 
-def _spots_of(lifted: NDArray[np.float32], sign: float, width: int) -> list[Spot]:
-    median = float(np.median(lifted))
-    noise = 1.4826 * float(np.median(np.abs(lifted - median)))
-    marked = (lifted > median + 6 * max(noise, 1e-3)).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(marked, connectivity=4)
+def _spots_in(top_hat: NDArray[np.float32], sign: float, width: int) -> list[Spot]:
+    """Elliptic spots of a top-hat transform with a structuring element of `width` px."""
+    noise = float(median_abs_deviation(top_hat, axis=None, scale="normal"))
+    marked = (top_hat > float(np.median(top_hat)) + 6 * max(noise, 1e-3)).astype(np.uint8)
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(marked, connectivity=4)
+    rows, columns = top_hat.shape
     spots = []
     for label in range(1, count):
-        left, top, w, h, area = stats[label]
-        if (
-            area < 12
-            or max(w, h) > width
-            or left == 0
-            or top == 0
-            or left + w == lifted.shape[1]
-            or top + h == lifted.shape[0]
-        ):
+        left, top, w, h, area = boxes[label]
+        at_frame_edge = left == 0 or top == 0 or left + w == columns or top + h == rows
+        if area < _LEAST_AREA_PX or max(w, h) > width or at_frame_edge:
             continue
         window = (slice(top, top + h), slice(left, left + w))
-        values = np.where(labels[window] == label, lifted[window], 0.0)
+        values = np.where(labels[window] == label, top_hat[window], 0.0)
         peak = float(np.percentile(values[values > 0], 80))
         spot = _ellipse(values > peak / 2, sign * peak)
         if spot is not None:
@@ -104,12 +131,12 @@ def _ellipse(mask: NDArray[np.bool_], contrast_K: float) -> Spot | None:
     """The mask as a spot, if its area is that of the ellipse with the same second moments."""
     rows, columns = np.nonzero(mask)
     area = len(rows)
-    if area < 12:
+    if area < _LEAST_AREA_PX:
         return None
-    # A pixel has a variance of 1/12 of its own, which a small disc must not be denied.
+    # A square pixel has a variance of 1/12 px2 of its own, which matters for small discs.
     axes = np.linalg.eigvalsh(np.cov(np.stack([columns, rows]), bias=True) + np.eye(2) / 12)
     expected = 4 * np.pi * np.sqrt(axes[0] * axes[1])
-    if abs(expected / area - 1) > ELLIPSE_TOLERANCE or np.sqrt(axes[1] / axes[0]) > LARGEST_ASPECT:
+    if abs(expected / area - 1) > _ELLIPSE_TOLERANCE or np.sqrt(axes[1] / axes[0]) > _LARGEST_ASPECT:
         return None
     return Spot(float(columns.mean()), float(rows.mean()), float(area), contrast_K)
 
@@ -123,28 +150,30 @@ def locate_disc(
     *,
     reach_px: float = 3.0,
 ) -> LocatedDisc | str:
-    """Locate a disc near a predicted place by the centroid of its coverage, from 0 (table) to 1 (disc) in every pixel.
+    """Locate a disc near its predicted position by the centroid of its coverage, from 0 (table) to 1 (disc) in every pixel.
 
-    Coverage is taken between two planes, one fitted to the table around the disc and one to its inside, so that neither a
-    gradient on the table nor the sign of the contrast moves the centroid.
+    Coverage is the temperature between two planes, one fitted to the table around the disc and one to the disc's inside, so that
+    neither a temperature gradient on the table nor the sign of the contrast moves the centroid.
 
     Parameters
     ----------
-    temperature
-        Frame (row, column) in degC.
-    fiducial, grid
-        The disc, and the plan whose edge bounds the table around it.
-    predicted_px
-        Where to start, (column, row) px.
-    jacobian
-        Sensor position by plan position there, (2, 2) px/mm.
-    reach_px
-        How far from the start the centroid may end.
+    temperature : (row, column) ndarray, degC
+        One frame.
+    fiducial : Fiducial
+        The disc: its plan position and diameter.
+    grid : PlanGrid
+        The plan, whose edge bounds the table around the disc.
+    predicted_px : (2,) ndarray, px
+        Position (column, row) to start from.
+    jacobian : (2, 2) ndarray, px/mm
+        Derivative of the sensor position (column, row) by the plan position (x, y) there.
+    reach_px : float, px
+        Largest distance of the centroid from the start.
 
     Returns
     -------
     LocatedDisc or str
-        The disc, or the reason why it was not located.
+        The disc, or the reason why it was not located, as the predicate of a sentence.
     """
     radius_mm = fiducial.diameter_mm / 2
     to_mm = np.linalg.inv(jacobian)
@@ -178,7 +207,7 @@ def locate_disc(
             break
     area = np.pi * radius_mm**2 * abs(np.linalg.det(jacobian))
     if abs(located.area_px / area - 1) > 0.35:
-        return f"what is seen has {located.area_px / area:.2f} times the area of a disc of {fiducial.diameter_mm:g} mm"
+        return f"its image has {located.area_px / area:.2f} times the area of a disc of {fiducial.diameter_mm:g} mm"
     return LocatedDisc(float(centre[0]), float(centre[1]), located.u_px, located.area_px, located.contrast_K)
 
 
@@ -190,11 +219,12 @@ def _coverage_centroid(
     blur_mm: float,
     on_table: NDArray[np.bool_],
 ) -> tuple[Array, LocatedDisc] | str:
+    """Shift (column, row) px of the coverage's centroid against the patch's centre, and its uncertainty, area and contrast."""
     around = (distance > radius_mm + blur_mm) & (distance < 2.2 * radius_mm + blur_mm) & on_table
     inside = distance < max(radius_mm - blur_mm, 0.45 * radius_mm)
     counted = distance < radius_mm + blur_mm
     if around.sum() < 12 or inside.sum() < 3:
-        return "is too small in the image or too near the plan's edge"
+        return "is too small in the frame or too near the plan's edge"
     basis = np.concatenate([offsets, np.ones((*distance.shape, 1))], axis=-1)
     table, noise = _robust_plane(basis, values, around)
     if inside.sum() >= 20:
@@ -202,12 +232,12 @@ def _coverage_centroid(
     else:
         disc = np.full(values.shape, np.median(values[inside]))
     contrast = float((disc - table)[inside].mean())
-    if abs(contrast) < max(LEAST_CONTRAST * noise, 1e-3):
+    if abs(contrast) < max(_LEAST_CONTRAST * noise, 1e-3):
         return f"has no contrast ({contrast:.3f} K with {noise:.3f} K of noise)"
     step = disc - table
-    safe = np.where(
-        np.sign(step) == np.sign(contrast), np.maximum(np.abs(step), 0.3 * abs(contrast)), 0.3 * abs(contrast)
-    ) * np.sign(contrast)
+    # Extrapolated to the rim, the two planes may meet: the denominator keeps its sign and 30 % of the contrast.
+    least = 0.3 * abs(contrast)
+    safe = np.where(np.sign(step) == np.sign(contrast), np.maximum(np.abs(step), least), least) * np.sign(contrast)
     coverage = np.where(counted, (values - table) / safe, 0.0)
     area = float(coverage.sum())
     if area <= 0:
@@ -219,13 +249,14 @@ def _coverage_centroid(
 
 
 def _robust_plane(basis: Array, values: NDArray[np.floating], mask: NDArray[np.bool_]) -> tuple[Array, float]:
-    """Fit a plane to the masked pixels, leaving out what is more than four deviations off; plane everywhere, and noise."""
+    """Fit a plane to the masked pixels without residuals above four standard deviations; the plane everywhere, and the noise."""
     kept = mask.copy()
     for _ in range(3):
         coefficients = np.linalg.lstsq(basis[kept], values[kept], rcond=None)[0]
         plane = basis @ coefficients
         residual = values - plane
-        noise = 1.4826 * float(np.median(np.abs(residual[kept])))
+        # Residuals of a fit with a constant term: their deviation is taken about zero.
+        noise = _SIGMA_PER_MAD * float(np.median(np.abs(residual[kept])))
         keep = mask & (np.abs(residual) <= max(4 * noise, 1e-9))
         if keep.sum() < 6 or (keep == kept).all():
             break

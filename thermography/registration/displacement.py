@@ -1,9 +1,13 @@
-"""Every frame checked against the registration: a knocked camera or table is found and registered anew from that frame.
+"""Displacement of a still table in the frames against its registration (a knock to camera or table), and registration after it.
 
-The shift of a frame from the whole picture of the table, for frames whose fiducials have no contrast.
+The displacement is measured in three ways, from fast to robust:
 
-By the enhanced correlation coefficient (Evangelidis and Psarakis 2008) on the masked, mean-subtracted temperature. Phase
-correlation is not used: on smooth thermal fields it finds no shift whatever the shift.
+* `FiducialMonitor`: centroids of the fiducials from linear sums of raw counts, for every frame;
+* `fiducial_shift`: fiducials located in the calibrated frame as in a registration, for frames that the monitor suspects;
+* `image_shift`: the image of the whole table, where the fiducials have no contrast.
+
+After a knock, `register_after_knock` registers the table again; without contrast of the fiducials, `shift_registration` moves the
+old registration.
 """
 
 from __future__ import annotations
@@ -20,38 +24,56 @@ from thermography.registration.plan import Fiducial, PlanGrid
 from thermography.registration.projection import Projection
 from thermography.registration.register import Registration, RegistrationError, locate_fiducials, register
 
-#: A shift of the fiducials together by more than this is a knock.
+#: A common shift of the fiducials by more than this is a knock, px.
 KNOCK_PX = 0.5
-#: The quick check hands over to the exact one at this shift: gradients on the table move its centroids by some tenths.
+#: Shift on the monitor above which a frame is measured exactly, px: temperature gradients move the monitor's centroids by some tenths.
 SUSPECT_PX = 0.3
-#: How far from their place the fiducials of a frame are looked for.
-REACH_PX = 12.0
+#: Largest distance of a fiducial from its registered position in `fiducial_shift`, px.
+_REACH_PX = 12.0
+#: A disc shows on the monitor if its sum exceeds this many standard deviations of its noise.
+_LEAST_SIGNIFICANCE = 10
+#: Least correlation of two images for a shift between them to be accepted.
+_LEAST_CORRELATION = 0.8
+#: Images are compared between these two widths of a Gaussian, px.
+_FINE_PX, _COARSE_PX = 1.0, 10.0
+#: Pixels around the table that take part in the comparison: the table's edge is its strongest feature.
+_BORDER_PX = 12
 
 
 @dataclass(frozen=True)
-class RegisteredFrom:
-    """A registration, the first frame (index into the references) that it holds for, and the shift that made it necessary."""
+class RegistrationSpan:
+    """A registration and the frames for which it holds: from one frame to the first frame of the next span.
 
-    first: int
+    Attributes
+    ----------
+    first_frame : int
+        Index of the first frame.
+    registration : Registration
+        Of the still table in these frames.
+    shift_px : (column, row), px
+        Shift of the fiducials that made the registration necessary; zeros for the first one.
+    """
+
+    first_frame: int
     registration: Registration
     shift_px: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class Watch:
-    """Quick look at the fiducials of many frames: three sums over the pixels around every disc.
+class FiducialMonitor:
+    """Shift of the fiducials in many frames at the cost of three weighted sums over the pixels around every disc.
 
-    Between the table around a disc (a plane through its ring) and the disc itself, the coverage's sum and its first moments are
-    linear in the pixels; their ratio is the centroid. No frame needs to be calibrated for it.
+    Between the table around a disc (a plane through its ring) and the disc itself, the sum of the coverage and its first moments
+    are linear in the pixels; their ratio is the centroid. Raw counts serve as well as temperatures.
 
     Attributes
     ----------
-    places
-        Top, left, height and width of every disc's patch in the window, and where its weights start, (discs, 5).
-    weights
-        For the sum and the first moments along columns and rows, (3, entries), patch after patch, row by row.
-    noise_gain
-        Standard deviation of a disc's sum for pixels of unit noise, (discs,).
+    places : (discs, 5) ndarray of int
+        Top, left, height and width of every disc's patch in the window, and the index of its first weight.
+    weights : (3, entries) ndarray of float32
+        For the sum and the first moments along columns and rows, patch after patch, row by row.
+    noise_gain : (discs,) ndarray
+        Standard deviation of a disc's sum for pixels of unit noise.
     """
 
     places: NDArray[np.int64]
@@ -59,33 +81,61 @@ class Watch:
     noise_gain: Array
 
     def shifts(self, counts: NDArray[np.uint16], noise_counts: float) -> Array:
-        """Median shift (column, row) px per frame of window counts (time, row, column); NaN where fewer than three discs show."""
-        return _shifts(_disc_sums(counts, self.places, self.weights), 10 * noise_counts * self.noise_gain)
+        """Median shift of the fiducials in every frame.
+
+        Parameters
+        ----------
+        counts : (time, row, column) ndarray of uint16
+            Raw counts of the window for which the monitor was prepared.
+        noise_counts : float
+            Standard deviation of the noise of a pixel, counts.
+
+        Returns
+        -------
+        (time, 2) ndarray, px
+            (column, row); NaN where fewer than three discs show.
+        """
+        return _shifts(
+            _disc_sums(counts, self.places, self.weights), _LEAST_SIGNIFICANCE * noise_counts * self.noise_gain
+        )
 
 
-def watch(registration: Registration, grid: PlanGrid, window: tuple[slice, slice]) -> Watch:
-    """Prepare the quick look for the fiducials of a registration that lie within a window of the sensor."""
+def monitor_fiducials(registration: Registration, grid: PlanGrid, window: tuple[slice, slice]) -> FiducialMonitor:
+    """Prepare the monitor for the fiducials of a registration that lie within a window of the sensor.
+
+    Parameters
+    ----------
+    registration : Registration
+    grid : PlanGrid
+        The plan, whose edge bounds the table around the discs.
+    window : (slice, slice)
+        Rows and columns of the sensor, px.
+
+    Returns
+    -------
+    FiducialMonitor
+    """
     places, weights, gains, start = [], [np.empty((3, 0), np.float32)], [], 0
     origin = np.array([window[1].start, window[0].start])
     shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
     for name, disc in registration.fiducials.items():
         located = registration.located[name]
         centre = np.array([located.column_px, located.row_px]) - origin
-        found = _disc_weights(disc, centre, registration, grid, shape)
-        if found is None:
+        placed = _disc_weights(disc, centre, registration, grid, shape)
+        if placed is None:
             continue
-        top, left, patch = found
+        top, left, patch = placed
         places.append((top, left, *patch.shape[1:], start))
         weights.append(patch.reshape(3, -1).astype(np.float32))
         gains.append(float(np.linalg.norm(patch[0])))
         start += patch[0].size
-    return Watch(np.array(places, np.int64).reshape(-1, 5), np.concatenate(weights, axis=1), np.array(gains))
+    return FiducialMonitor(np.array(places, np.int64).reshape(-1, 5), np.concatenate(weights, axis=1), np.array(gains))
 
 
 def _disc_weights(
     disc: Fiducial, centre: Array, registration: Registration, grid: PlanGrid, shape: tuple[int, int]
 ) -> tuple[int, int, Array] | None:
-    """Top, left and weights (3, height, width) of the patch around one disc; None where the window does not hold it."""
+    """Top, left and weights (3, height, width) of the patch around one disc; None where the window does not contain it."""
     place = np.array([disc.x_mm, disc.y_mm])
     jacobian = registration.projection.jacobian(place)
     to_mm = np.linalg.inv(jacobian)
@@ -100,7 +150,7 @@ def _disc_weights(
     distance = np.linalg.norm(plan - place, axis=1)
     counted = distance < radius + 3.5 * pixel_mm
     ring = ~counted & (distance < 1.5 * radius + 5.5 * pixel_mm) & grid.contains(plan, margin_mm=1.5 * pixel_mm)
-    # Every other pixel of the ring is enough for its plane, and halves the cost of the look.
+    # Every other pixel of the ring determines its plane well enough, at half the cost.
     ring &= ((columns + rows).ravel() & 1) == 0
     if ring.sum() < 12 or counted.sum() < 12:
         return None
@@ -114,6 +164,7 @@ def _disc_weights(
 
 @numba.njit(cache=True, nogil=True)
 def _disc_sums(counts: Array, places: Array, weights: Array) -> Array:
+    """Sum and first moments of the coverage of every disc, (frames, discs, 3)."""
     sums = np.zeros((len(counts), len(places), 3))
     longest = 0
     for disc in range(len(places)):
@@ -123,7 +174,7 @@ def _disc_sums(counts: Array, places: Array, weights: Array) -> Array:
         top, left, height, width, start = places[disc]
         size = height * width
         for frame in range(len(counts)):
-            # About the patch's own level, so that single precision is enough; the weights of all sums are blind to it.
+            # Relative to one pixel of the patch, so that single precision suffices; a constant has no effect on the sums.
             level = np.float32(counts[frame, top, left])
             for i in range(height):
                 row = counts[frame, top + i, left : left + width]
@@ -135,16 +186,16 @@ def _disc_sums(counts: Array, places: Array, weights: Array) -> Array:
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
-def _dot(one: Array, other: Array) -> np.float32:
+def _dot(a: Array, b: Array) -> np.float32:
     total = np.float32(0)
-    for i in range(len(one)):
-        total += one[i] * other[i]
+    for i in range(len(a)):
+        total += a[i] * b[i]
     return total
 
 
 @numba.njit(cache=True, nogil=True)
 def _shifts(sums: Array, least: Array) -> Array:
-    """Median over the discs of which the sum exceeds `least`, (frames, 2); NaN where those are fewer than three."""
+    """Median over the discs whose sum exceeds `least`, (frames, 2) px; NaN where those are fewer than three."""
     shifts = np.full((len(sums), 2), np.nan)
     for frame in range(len(sums)):
         shows = np.abs(sums[frame, :, 0]) > least
@@ -154,10 +205,25 @@ def _shifts(sums: Array, least: Array) -> Array:
     return shifts
 
 
-def fiducial_shift(frame: Array, registration: Registration, grid: PlanGrid) -> Array:
-    """Median shift (column, row) px of the fiducials of a calibrated frame, exactly; NaN where fewer than three show."""
+def fiducial_shift(temperature: Array, registration: Registration, grid: PlanGrid) -> Array:
+    """Median shift of the fiducials of one frame, each located as in a registration.
+
+    Parameters
+    ----------
+    temperature : (row, column) ndarray, degC
+        One frame.
+    registration : Registration
+        Against which the shift is measured.
+    grid : PlanGrid
+        The plan.
+
+    Returns
+    -------
+    (2,) ndarray, px
+        (column, row); NaN where fewer than three fiducials are located within 12 px.
+    """
     listed = list(registration.fiducials.values())
-    located, _ = locate_fiducials(frame, listed, registration.projection, grid=grid, reach_px=REACH_PX)
+    located, _ = locate_fiducials(temperature, listed, registration.projection, grid=grid, reach_px=_REACH_PX)
     if len(located) < 3:
         return np.full(2, np.nan)
     before = registration.located
@@ -165,72 +231,121 @@ def fiducial_shift(frame: Array, registration: Registration, grid: PlanGrid) -> 
     return np.asarray(np.median(shifts, axis=0))
 
 
-def register_anew(frame: Array, old: Registration, shift_px: Array, grid: PlanGrid, *, where: str) -> Registration:
-    """Register a frame after a knock: the old places, moved by the shift, are the hints.
+def image_shift(reference: Array, temperature: Array, registration: Registration, grid: PlanGrid) -> Array:
+    """Shift of the image of the table between two frames.
+
+    Parameters
+    ----------
+    reference, temperature : (row, column) ndarray, degC
+        The registered frame, and the frame whose shift is wanted.
+    registration : Registration
+        Of the reference. Its discs are masked, because the reflections on them may change.
+    grid : PlanGrid
+        The plan.
+
+    Returns
+    -------
+    (2,) ndarray, px
+        (column, row); NaN where the images correlate by less than 0.8.
+
+    Notes
+    -----
+    Maximum of the enhanced correlation coefficient (G. D. Evangelidis, E. Z. Psarakis, IEEE Trans. PAMI 30 (2008) 1858-1865) of the
+    masked images. Phase correlation fails on smooth thermal fields: it returns no shift whatever the shift is.
+    """
+    mask = _table_mask(registration, grid)
+    images = []
+    for frame in (reference, temperature):
+        values = np.nan_to_num(np.asarray(frame, np.float32), nan=float(np.nanmean(frame)))
+        values -= values[mask > 0].mean()
+        # Without changes over tens of pixels: a table that has warmed at one end would be taken for one that has moved.
+        images.append(cv2.GaussianBlur(values, (0, 0), _FINE_PX) - cv2.GaussianBlur(values, (0, 0), _COARSE_PX))
+    start = np.eye(2, 3, dtype=np.float32)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-6)
+    try:
+        correlation, warp = cv2.findTransformECC(images[0], images[1], start, cv2.MOTION_TRANSLATION, criteria, mask, 5)
+    except cv2.error:
+        # The iteration diverged: the images have nothing in common.
+        return np.full(2, np.nan)
+    return np.asarray(warp[:, 2], float) if correlation >= _LEAST_CORRELATION else np.full(2, np.nan)
+
+
+def _table_mask(registration: Registration, grid: PlanGrid) -> NDArray[np.uint8]:
+    """255 on the pixels of the table and its border, 0 elsewhere and on the discs, (row, column)."""
+    mask = np.zeros(registration.shape, np.uint8)
+    outline = registration.to_sensor(grid.outline_mm(40))
+    cv2.fillPoly(mask, [np.round(outline).astype(np.int32)], 255)
+    width = 2 * _BORDER_PX + 1
+    mask = np.asarray(cv2.dilate(mask, np.ones((width, width), np.uint8)), np.uint8)
+    for disc in registration.masked:
+        place = np.array([disc.x_mm, disc.y_mm])
+        radius = disc.diameter_mm / 2 * float(np.linalg.norm(registration.projection.jacobian(place), 2)) + 3
+        column, row = np.round(registration.to_sensor(place)).astype(int).tolist()
+        cv2.circle(mask, (column, row), int(radius), 0, -1)
+    return mask
+
+
+def register_after_knock(
+    temperature: Array, old: Registration, shift_px: Array, grid: PlanGrid, *, frame_name: str
+) -> Registration:
+    """Register the table again after a knock; the old positions, moved by the shift, are the hints.
+
+    Parameters
+    ----------
+    temperature : (row, column) ndarray, degC
+        First frame after the knock, or the mean of several.
+    old : Registration
+        Before the knock.
+    shift_px : (2,) ndarray, px
+        Shift (column, row) of the fiducials against `old`.
+    grid : PlanGrid
+        The plan.
+    frame_name : str
+        Names the frame in messages.
+
+    Returns
+    -------
+    Registration
 
     Raises
     ------
     RegistrationError
-        The plan is not found any more; the message names the frame by `where`.
+        The plan is not located any more.
     """
     places = old.to_sensor(np.array([(disc.x_mm, disc.y_mm) for disc in old.masked])) + shift_px
     hinted = [
         replace(disc, column_px=float(c), row_px=float(r)) for disc, (c, r) in zip(old.masked, places, strict=True)
     ]
     try:
-        return register(frame, hinted, grid=grid)
+        return register(temperature, hinted, grid=grid)
     except RegistrationError as error:
         raise RegistrationError(
-            f"{where}: the fiducials moved by ({shift_px[0]:.1f}, {shift_px[1]:.1f}) px and the plan is not found again: {error}; "
-            "leave out the frames from here on, or give them a fiducial file of their own"
+            f"{frame_name}: the fiducials moved by ({shift_px[0]:.1f}, {shift_px[1]:.1f}) px and the plan is not located again: "
+            f"{error}; leave out the frames from here on, or give them a fiducial file of their own"
         ) from error
 
 
-#: Least correlation between the two pictures for a shift to be believed.
-LEAST_CORRELATION = 0.8
-#: What is looked at lies between these two widths.
-FINE_PX, COARSE_PX = 1.0, 10.0
-#: The table's edge is its strongest feature: so many pixels around it are looked at too.
-BORDER_PX = 12
-
-
-def image_shift(reference: Array, frame: Array, registration: Registration, grid: PlanGrid) -> Array:
-    """How far the table in `frame` lies from where it lies in `reference`, (column, row) px; NaN where the pictures do not agree.
+def shift_registration(registration: Registration, shift_px: Array) -> Registration:
+    """Shift a registration on the sensor.
 
     Parameters
     ----------
-    reference, frame
-        Temperatures (row, column), degC.
-    registration, grid
-        Of the reference: where table and discs are. Discs do not count: what they mirror may change.
+    registration : Registration
+    shift_px : (2,) ndarray, px
+        Shift (column, row) of the image of the table.
+
+    Returns
+    -------
+    Registration
+        Its uncertainty remains that of the old one.
     """
-    mask = _table_mask(registration, grid)
-    pictures = []
-    for image in (reference, frame):
-        values = np.nan_to_num(np.asarray(image, np.float32), nan=float(np.nanmean(image)))
-        values -= values[mask > 0].mean()
-        # Without what changes over tens of pixels: a table that has warmed at one end would pass for one that has moved.
-        pictures.append(cv2.GaussianBlur(values, (0, 0), FINE_PX) - cv2.GaussianBlur(values, (0, 0), COARSE_PX))
-    start = np.eye(2, 3, dtype=np.float32)
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-6)
-    try:
-        correlation, warp = cv2.findTransformECC(
-            pictures[0], pictures[1], start, cv2.MOTION_TRANSLATION, criteria, mask, 5
-        )
-    except cv2.error:
-        # The iteration diverged: the pictures have nothing in common.
-        return np.full(2, np.nan)
-    return np.asarray(warp[:, 2], float) if correlation >= LEAST_CORRELATION else np.full(2, np.nan)
-
-
-def shifted(registration: Registration, shift_px: Array) -> Registration:
-    """The registration of a camera whose picture has moved by (column, row) px; its uncertainty stays that of the old one."""
-    move = np.array([[1.0, 0.0, shift_px[0]], [0.0, 1.0, shift_px[1]], [0.0, 0.0, 1.0]])
+    shift = (float(shift_px[0]), float(shift_px[1]))
+    move = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]], [0.0, 0.0, 1.0]])
     old = registration.projection
-    centre = (old.principal_point_px[0] + float(shift_px[0]), old.principal_point_px[1] + float(shift_px[1]))
+    centre = (old.principal_point_px[0] + shift[0], old.principal_point_px[1] + shift[1])
     projection = Projection(move @ old.plan_to_sensor, old.distortion, old.focal_length_px, centre)
     located = {
-        name: replace(disc, column_px=disc.column_px + float(shift_px[0]), row_px=disc.row_px + float(shift_px[1]))
+        name: replace(disc, column_px=disc.column_px + shift[0], row_px=disc.row_px + shift[1])
         for name, disc in registration.located.items()
     }
     return replace(
@@ -238,21 +353,5 @@ def shifted(registration: Registration, shift_px: Array) -> Registration:
         projection=projection,
         homography=np.linalg.inv(projection.plan_to_sensor),
         located=located,
-        model=f"{registration.model}, shifted by the picture",
+        model=f"{registration.model}, shifted by the image of the table",
     )
-
-
-def _table_mask(registration: Registration, grid: PlanGrid) -> NDArray[np.uint8]:
-    t = np.linspace(0, 1, 40)
-    zero, one = np.zeros_like(t), np.ones_like(t)
-    outline = np.concatenate([np.stack(side, axis=-1) for side in ((t, zero), (one, t), (1 - t, one), (zero, 1 - t))])
-    mask = np.zeros(registration.shape, np.uint8)
-    corners = registration.to_sensor(outline * (grid.width_mm, grid.height_mm))
-    cv2.fillPoly(mask, [np.round(corners).astype(np.int32)], 255)
-    mask = np.asarray(cv2.dilate(mask, np.ones((2 * BORDER_PX + 1, 2 * BORDER_PX + 1), np.uint8)), np.uint8)
-    for disc in registration.masked:
-        place = np.array([disc.x_mm, disc.y_mm])
-        radius = disc.diameter_mm / 2 * float(np.linalg.norm(registration.projection.jacobian(place), 2)) + 3
-        column, row = np.round(registration.to_sensor(place)).astype(int).tolist()
-        cv2.circle(mask, (column, row), int(radius), 0, -1)
-    return mask

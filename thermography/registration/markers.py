@@ -1,4 +1,4 @@
-"""ArUco markers tell which plan is in view and where to look for its discs; the discs alone say where it lies."""
+"""ArUco markers: they identify the table plan and hint where its discs are; the discs alone determine the registration."""
 
 from __future__ import annotations
 
@@ -12,70 +12,89 @@ from thermography._typing import Array
 from thermography.errors import ThermographyError
 from thermography.registration.plan import Fiducial
 
-#: The markers' dictionary: 50 patterns of 4 x 4 squares, the coarsest there is, for thermal pictures are small.
+#: 50 patterns of 4 x 4 squares, the coarsest dictionary of OpenCV: thermograms have few pixels.
 DICTIONARY = cv2.aruco.DICT_4X4_50
-#: Their centres are good to a pixel and an affine map bends with perspective, so they are hints and nothing more; it takes three.
-LEAST_MARKERS = 3
+#: Hints come from an affine map of the plan, which three markers determine. It neglects perspective and serves as a hint only.
+_LEAST_MARKERS = 3
 
 
 class MarkerError(ThermographyError):
-    """The markers in the picture belong to another plan; the message names both and what to do."""
+    """The markers in the frame belong to another plan; the message names both and the remedy."""
 
 
-def find_markers(frame: Array) -> dict[int, Array]:
-    """Centres (column, row) px of the markers in a frame (row, column) degC, by their number; dark or bright on their ground."""
-    low, high = np.nanpercentile(frame, (1, 99))
-    picture = np.round(255 * np.clip((frame - low) / max(high - low, 1e-6), 0, 1)).astype(np.uint8)
-    parameters = cv2.aruco.DetectorParameters()
-    # Paint of low emissivity swaps dark and bright; a pattern with a wrong square is taken for none rather than for its neighbour.
-    parameters.detectInvertedMarker = True
-    parameters.errorCorrectionRate = 0.0
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARY), parameters)
-    corners, numbers, _ = detector.detectMarkers(picture)
-    if numbers is None:
-        return {}
-    return {int(number): four.reshape(4, 2).mean(axis=0) for number, four in zip(numbers.ravel(), corners, strict=True)}
-
-
-def identify(frame: Array, fiducials: Sequence[Fiducial]) -> list[Fiducial]:
-    """Compare the markers that a frame shows with those of the plan, and hint the discs by them.
+def detect_markers(temperature: Array) -> dict[int, Array]:
+    """Detect ArUco markers in a thermogram, dark on bright or bright on dark.
 
     Parameters
     ----------
-    frame
-        (row, column), degC.
-    fiducials
-        Discs and markers.
+    temperature : (row, column) ndarray, degC
+        One frame.
+
+    Returns
+    -------
+    dict of int to (2,) ndarray, px
+        Centre (column, row) by marker number, to about a pixel.
+
+    Notes
+    -----
+    S. Garrido-Jurado et al., Automatic generation and detection of highly reliable fiducial markers under occlusion, Pattern
+    Recognition 47 (2014) 2280-2292, as implemented in OpenCV.
+    """
+    low, high = np.nanpercentile(temperature, (1, 99))
+    picture = np.round(255 * np.clip((temperature - low) / max(high - low, 1e-6), 0, 1)).astype(np.uint8)
+    parameters = cv2.aruco.DetectorParameters()
+    # Paint of low emissivity swaps dark and bright. A pattern with a wrong square is rejected rather than corrected to a similar marker.
+    parameters.detectInvertedMarker = True
+    parameters.errorCorrectionRate = 0.0
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARY), parameters)
+    quadrilaterals, numbers, _ = detector.detectMarkers(picture)
+    if numbers is None:
+        return {}
+    return {
+        int(number): corners.reshape(4, 2).mean(axis=0)
+        for number, corners in zip(numbers.ravel(), quadrilaterals, strict=True)
+    }
+
+
+def identify_plan(temperature: Array, fiducials: Sequence[Fiducial]) -> list[Fiducial]:
+    """Compare the markers in a frame with those of the plan, and derive hints for the discs from them.
+
+    Parameters
+    ----------
+    temperature : (row, column) ndarray, degC
+        One frame.
+    fiducials : sequence of Fiducial
+        Discs and markers of the plan.
 
     Returns
     -------
     list of Fiducial
-        The discs; those without a hint of their own have one where at least three markers of the plan are seen.
+        The discs. Where at least three markers of the plan are detected, discs without a hint of their own have one.
 
     Raises
     ------
     MarkerError
-        Markers are seen, and none of them is one of the plan's.
+        Markers are detected, and none of them is listed in the plan.
     """
-    discs = [one for one in fiducials if one.marker is None]
-    markers = {one.marker: one for one in fiducials if one.marker is not None}
-    if not markers:
+    discs = [fiducial for fiducial in fiducials if fiducial.marker is None]
+    listed = {fiducial.marker: fiducial for fiducial in fiducials if fiducial.marker is not None}
+    if not listed:
         return discs
-    found = find_markers(frame)
-    known = sorted(markers.keys() & found.keys())
-    if found and not known:
+    detected = detect_markers(temperature)
+    common = sorted(listed.keys() & detected.keys())
+    if detected and not common:
         raise MarkerError(
-            f"the frames show the markers {', '.join(map(str, sorted(found)))}, the plan lists {', '.join(map(str, sorted(markers)))}: "
-            "this is another table; name its fiducial file"
+            f"the frames show the markers {', '.join(map(str, sorted(detected)))}, "
+            f"the plan lists {', '.join(map(str, sorted(listed)))}: this is another table; name its fiducial file"
         )
-    if len(known) < LEAST_MARKERS:
+    if len(common) < _LEAST_MARKERS:
         return discs
-    plan = np.array([(markers[number].x_mm, markers[number].y_mm, 1.0) for number in known])
-    affine, _, rank, _ = np.linalg.lstsq(plan, np.array([found[number] for number in known]))
+    plan = np.array([(listed[number].x_mm, listed[number].y_mm, 1.0) for number in common])
+    affine, _, rank, _ = np.linalg.lstsq(plan, np.array([detected[number] for number in common]))
     if rank < 3:
         return discs
-    places = np.array([(disc.x_mm, disc.y_mm, 1.0) for disc in discs]) @ affine
+    hints = np.array([(disc.x_mm, disc.y_mm, 1.0) for disc in discs]) @ affine
     return [
         replace(disc, column_px=float(column), row_px=float(row)) if disc.hint_px is None else disc
-        for disc, (column, row) in zip(discs, places, strict=True)
+        for disc, (column, row) in zip(discs, hints, strict=True)
     ]

@@ -1,4 +1,4 @@
-"""The table plan: its grid of cells in millimetres and the disc fiducials that lie on it."""
+"""The table plan: its grid of square cells and the fiducials that lie on it, in millimetres."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from thermography._typing import Array
 from thermography.errors import ThermographyError
 
-REQUIRED_COLUMNS = ("name", "x_mm", "y_mm", "diameter_mm")
-HINT_COLUMNS = ("column_px", "row_px")
-MARKER_COLUMN = "marker"
-#: Markers in the dictionary.
-MARKERS = 50
+_REQUIRED_COLUMNS = ("name", "x_mm", "y_mm", "diameter_mm")
+_HINT_COLUMNS = ("column_px", "row_px")
+_MARKER_COLUMN = "marker"
+#: Markers in the dictionary `thermography.registration.markers.DICTIONARY`.
+_MARKER_COUNT = 50
 
 
 class FiducialError(ThermographyError):
@@ -26,12 +26,30 @@ class FiducialError(ThermographyError):
 
 @dataclass(frozen=True)
 class PlanGrid:
-    """The table plan as a grid of square cells; (0, 0) mm is the plan's corner, not the first cell's centre.
+    """The table plan as a grid of square cells.
+
+    The origin (0, 0) mm is a corner of the plan, not the centre of the first cell; x runs along the columns of a field (y, x),
+    y along its rows.
+
+    Attributes
+    ----------
+    width_mm, height_mm : float, mm
+        Extent of the plan along x and y, whole multiples of the cell size.
+    cell_size_mm : float, mm
+        Side of a cell.
 
     Raises
     ------
     ThermographyError
-        A size is not positive or is not a whole number of cells.
+        A length is not positive, or a side of the plan is not a whole number of cells.
+
+    Examples
+    --------
+    >>> grid = PlanGrid(width_mm=700, height_mm=180, cell_size_mm=5)
+    >>> grid.shape
+    (36, 140)
+    >>> float(grid.x_mm[0])
+    2.5
     """
 
     width_mm: float
@@ -57,16 +75,50 @@ class PlanGrid:
 
     @property
     def x_mm(self) -> Array:
-        """Cell centres along x, shape (x,), mm."""
+        """Cell centres along x, (x,) mm."""
         return (np.arange(self.shape[1]) + 0.5) * self.cell_size_mm
 
     @property
     def y_mm(self) -> Array:
-        """Cell centres along y, shape (y,), mm."""
+        """Cell centres along y, (y,) mm."""
         return (np.arange(self.shape[0]) + 0.5) * self.cell_size_mm
 
+    @property
+    def centres_mm(self) -> Array:
+        """Cell centres (x, y), shape (y, x, 2), mm."""
+        return np.stack(np.meshgrid(self.x_mm, self.y_mm), axis=-1)
+
+    def outline_mm(self, points_per_side: int) -> Array:
+        """Points on the edge of the plan, in order around it.
+
+        Parameters
+        ----------
+        points_per_side : int
+            Including both corners of the side; every corner is listed twice.
+
+        Returns
+        -------
+        (4 * points_per_side, 2) ndarray, mm
+        """
+        t = np.linspace(0, 1, points_per_side)
+        zero, one = np.zeros_like(t), np.ones_like(t)
+        sides = ((t, zero), (one, t), (1 - t, one), (zero, 1 - t))
+        return np.concatenate([np.stack(side, axis=-1) for side in sides]) * (self.width_mm, self.height_mm)
+
     def contains(self, points_mm: Array, *, margin_mm: float = 0.0) -> NDArray[np.bool_]:
-        """Tell which points, shape (..., 2), lie on the plan at least `margin_mm` from its edge."""
+        """Tell which points lie on the plan.
+
+        Parameters
+        ----------
+        points_mm : (..., 2) ndarray, mm
+            Plan points (x, y).
+        margin_mm : float, mm
+            Least distance from the edge of the plan.
+
+        Returns
+        -------
+        (...) ndarray of bool
+        """
         x, y = points_mm[..., 0], points_mm[..., 1]
         inside_x = (x >= margin_mm) & (x <= self.width_mm - margin_mm)
         return inside_x & (y >= margin_mm) & (y <= self.height_mm - margin_mm)
@@ -74,9 +126,19 @@ class PlanGrid:
 
 @dataclass(frozen=True)
 class Fiducial:
-    """A disc on the table plan; the pixel position, where given, is only a hint of where to look for it.
+    """A disc on the table whose plan position is known, or an ArUco marker that identifies the plan.
 
-    With a `marker` number it is an ArUco marker (4 x 4, one of 50) within a circle of that diameter, which tells only which plan this is.
+    Attributes
+    ----------
+    name : str
+    x_mm, y_mm : float, mm
+        Centre on the plan.
+    diameter_mm : float, mm
+        Of the disc, or of the circle that contains the marker with its quiet zone.
+    column_px, row_px : float or None, px
+        Hint where the disc appears in the frame; it may be wrong by tens of pixels. None: no hint.
+    marker : int or None
+        Number in the dictionary of 4 x 4 ArUco markers, 0 to 49; None for a disc.
     """
 
     name: str
@@ -96,43 +158,70 @@ class Fiducial:
 
 
 def read_fiducials(path: str | Path) -> list[Fiducial]:
-    """Read a fiducial table with the columns name, x_mm, y_mm, diameter_mm and, optionally, column_px, row_px, marker.
+    r"""Read the fiducials of a table plan from a CSV file.
 
     Parameters
     ----------
-    path
-        CSV file; an empty pixel position means that there is no hint for that disc. A number in `marker` makes the row an ArUco marker.
+    path : str or Path
+        CSV file with the columns ``name``, ``x_mm``, ``y_mm``, ``diameter_mm`` and, optionally, ``column_px``, ``row_px`` (an
+        empty position means that there is no hint for that disc) and ``marker`` (a number makes the row an ArUco marker).
 
     Returns
     -------
-    list[Fiducial]
-        In the order of the file, a name or place listed twice included: `register` reports it.
+    list of Fiducial
+        In the order of the file. Duplicates of a name or a position are kept: `register` reports them.
 
     Raises
     ------
     FiducialError
         A column is missing, a value is not a finite number, a diameter is not positive, or fewer than four discs are listed.
+    OSError
+        The file cannot be read.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "fiducials.csv"
+    >>> lines = ["name,x_mm,y_mm,diameter_mm", "F1,40,20,16", "F2,660,20,16", "F3,40,160,16", "F4,660,160,16"]
+    >>> _ = path.write_text("\n".join(lines))
+    >>> read_fiducials(path)[1]
+    Fiducial(name='F2', x_mm=660.0, y_mm=20.0, diameter_mm=16.0, column_px=None, row_px=None, marker=None)
     """
     path = Path(path)
     with path.open(newline="", encoding="utf-8-sig") as file:
         reader = csv.DictReader(file)
         header = [column.strip() for column in reader.fieldnames or []]
-        missing = [column for column in REQUIRED_COLUMNS if column not in header]
+        missing = [column for column in _REQUIRED_COLUMNS if column not in header]
         if missing:
             raise FiducialError(
                 f"{path}:1: no column {', '.join(missing)}; "
-                f"the first line must read {','.join(REQUIRED_COLUMNS + HINT_COLUMNS)} (the last two may be left out)"
+                f"the first line must read {','.join(_REQUIRED_COLUMNS + _HINT_COLUMNS)} (the last two may be left out)"
             )
         reader.fieldnames = header
         fiducials = [_parse(path, reader.line_num, row) for row in reader if any(row.values())]
-    discs = sum(one.marker is None for one in fiducials)
+    discs = sum(fiducial.marker is None for fiducial in fiducials)
     if discs < 4:
         raise FiducialError(f"{path}: lists {discs} fiducials; a plan is located by at least 4")
     return fiducials
 
 
 def mask_discs(points_mm: Array, fiducials: Sequence[Fiducial], *, margin_mm: Array | float) -> NDArray[np.bool_]:
-    """Tell which plan points, shape (..., 2), lie on a disc or nearer than `margin_mm` to its rim."""
+    """Tell which plan points lie on a fiducial or near its rim, where a pixel does not show the table's temperature.
+
+    Parameters
+    ----------
+    points_mm : (..., 2) ndarray, mm
+        Plan points (x, y).
+    fiducials : sequence of Fiducial
+        Discs and markers.
+    margin_mm : float or (...) ndarray, mm
+        Distance from the rim up to which a point is masked.
+
+    Returns
+    -------
+    (...) ndarray of bool
+        True where masked.
+    """
     masked = np.zeros(points_mm.shape[:-1], bool)
     for disc in fiducials:
         distance = np.hypot(points_mm[..., 0] - disc.x_mm, points_mm[..., 1] - disc.y_mm)
@@ -144,20 +233,20 @@ def _parse(path: Path, line: int, row: dict[str, str]) -> Fiducial:
     name = (row["name"] or "").strip()
     if not name:
         raise FiducialError(f"{path}:{line}: name is empty; give every fiducial a name")
-    x_mm, y_mm, diameter_mm = (_number(path, line, column, row[column]) for column in REQUIRED_COLUMNS[1:])
+    x_mm, y_mm, diameter_mm = (_number(path, line, column, row[column]) for column in _REQUIRED_COLUMNS[1:])
     if diameter_mm <= 0:
         raise FiducialError(f"{path}:{line}: diameter_mm = {row['diameter_mm']}; a disc has a positive diameter")
-    marker = (row.get(MARKER_COLUMN) or "").strip()
+    marker = (row.get(_MARKER_COLUMN) or "").strip()
     if marker:
-        if not marker.isdecimal() or int(marker) >= MARKERS:
+        if not marker.isdecimal() or int(marker) >= _MARKER_COUNT:
             raise FiducialError(
-                f"{path}:{line}: marker = {marker!r}; give the number of an ArUco marker, 0 to {MARKERS - 1}"
+                f"{path}:{line}: marker = {marker!r}; give the number of an ArUco marker, 0 to {_MARKER_COUNT - 1}"
             )
         return Fiducial(name, x_mm, y_mm, diameter_mm, marker=int(marker))
-    hints = [(row.get(column) or "").strip() for column in HINT_COLUMNS]
+    hints = [(row.get(column) or "").strip() for column in _HINT_COLUMNS]
     if all(hints):
         column_px, row_px = (
-            _number(path, line, column, text) for column, text in zip(HINT_COLUMNS, hints, strict=True)
+            _number(path, line, column, text) for column, text in zip(_HINT_COLUMNS, hints, strict=True)
         )
         return Fiducial(name, x_mm, y_mm, diameter_mm, column_px, row_px)
     if any(hints):

@@ -1,6 +1,11 @@
-"""How a plane is seen through a lens: homography and radial-tangential distortion, fitted to disc centroids.
+"""Projection of the table plan through a lens onto the sensor: homography and radial-tangential distortion, and their fit to discs.
 
-Points through a lens, compiled: the projection of `thermography.registration.projection` for kernels and for many points.
+A plan point (x, y) is mapped by a homography to undistorted pixels; divided by the focal length about the principal point these
+are the normalised coordinates (u, v), which the lens distorts with r2 = u^2 + v^2 (D. C. Brown, Close-range camera calibration,
+Photogrammetric Engineering 37 (1971) 855-866, in OpenCV's convention)::
+
+    u' = u (1 + k1 r2 + k2 r2^2) + 2 p1 u v + p2 (r2 + 2 u^2)
+    v' = v (1 + k1 r2 + k2 r2^2) + p1 (r2 + 2 v^2) + 2 p2 u v
 """
 
 from __future__ import annotations
@@ -17,28 +22,107 @@ from scipy.optimize import least_squares
 from thermography._typing import Array
 from thermography.errors import ThermographyError
 
-#: The ladder of lens models: name and number of distortion coefficients (k1, k2, p1, p2) that it leaves free.
-LADDER: tuple[tuple[str, int], ...] = (("homography", 0), ("homography+k1", 1), ("homography+k1,k2,p1,p2", 4))
+#: Lens models in ascending order: name, and number of the distortion coefficients (k1, k2, p1, p2) that are fitted.
+LENS_MODELS: tuple[tuple[str, int], ...] = (("homography", 0), ("homography+k1", 1), ("homography+k1,k2,p1,p2", 4))
+#: A model with more coefficients is chosen only if it lowers the leave-one-out error below this share.
+_REQUIRED_GAIN = 0.75
+#: Points on the rim of a disc, as unit circle. The centroid of their image polygon shows 98.9 % of the perspective shift of the disc's
+#: centroid: the second moment of an inscribed 24-gon over that of its circle, (2 + cos(2 pi / 24)) / 3.
+_RIM = np.exp(2j * np.pi * np.arange(24) / 24)
+#: Largest number of iterations of the undistortion, and its tolerance in units of the focal length.
+_UNDISTORTION_STEPS, _UNDISTORTION_TOLERANCE = 40, 1e-11
 
-#: A richer lens model is taken only if it lowers the leave-one-out error to less than this part.
-LADDER_GAIN = 0.75
 
-#: Points on the rim of a disc whose image polygon's centroid predicts the disc's centroid; 24 err by less than 0.1 % of the bias.
-RIM = np.exp(2j * np.pi * np.arange(24) / 24)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def project_point(x: float, y: float, lens: Array) -> tuple[float, float]:
+    """Project one plan point to the sensor; for compiled loops.
+
+    Parameters
+    ----------
+    x, y : float, mm
+        Plan point.
+    lens : (16,) ndarray
+        `Projection.as_array`.
+
+    Returns
+    -------
+    column, row : float, px
+    """
+    w = lens[6] * x + lens[7] * y + lens[8]
+    u = ((lens[0] * x + lens[1] * y + lens[2]) / w - lens[10]) / lens[9]
+    v = ((lens[3] * x + lens[4] * y + lens[5]) / w - lens[11]) / lens[9]
+    du, dv = _distort(u, v, lens)
+    return lens[10] + lens[9] * du, lens[11] + lens[9] * dv
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _distort(u: float, v: float, lens: Array) -> tuple[float, float]:
+    """Distorted normalised coordinates."""
+    r2 = u * u + v * v
+    radial = 1 + r2 * (lens[12] + lens[13] * r2)
+    return (
+        u * radial + 2 * lens[14] * u * v + lens[15] * (r2 + 2 * u * u),
+        v * radial + lens[14] * (r2 + 2 * v * v) + 2 * lens[15] * u * v,
+    )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _project(points: Array, lens: Array) -> Array:
+    """Sensor column and row of plan points, (n, 2)."""
+    projected = np.empty(points.shape)
+    for i in range(len(points)):
+        projected[i, 0], projected[i, 1] = project_point(points[i, 0], points[i, 1], lens)
+    return projected
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _undistort(points: Array, lens: Array) -> Array:
+    """Sensor points, (n, 2) px, as a lens without distortion would show them, by fixed-point iteration."""
+    undistorted = np.empty(points.shape)
+    for i in range(len(points)):
+        u0, v0 = (points[i, 0] - lens[10]) / lens[9], (points[i, 1] - lens[11]) / lens[9]
+        u, v = u0, v0
+        for _ in range(_UNDISTORTION_STEPS):
+            du, dv = _distort(u, v, lens)
+            u, v = u + u0 - du, v + v0 - dv
+            if not max(abs(u0 - du), abs(v0 - dv)) >= _UNDISTORTION_TOLERANCE:
+                break
+        undistorted[i, 0], undistorted[i, 1] = lens[10] + lens[9] * u, lens[11] + lens[9] * v
+    return undistorted
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _transform(points: Array, matrix: Array) -> Array:
+    """Points, (n, 2), mapped by a homography (3, 3)."""
+    mapped = np.empty(points.shape)
+    for i in range(len(points)):
+        x, y = points[i, 0], points[i, 1]
+        w = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2]
+        mapped[i, 0] = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2]) / w
+        mapped[i, 1] = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2]) / w
+    return mapped
+
+
+def _each(kernel: Callable[[Array, Array], Array], points: Array, parameters: Array) -> Array:
+    """Send points of shape (..., 2) through a kernel for (n, 2)."""
+    points = np.ascontiguousarray(points, float)
+    return kernel(points.reshape(-1, 2), parameters).reshape(points.shape)
 
 
 @dataclass(frozen=True)
 class Projection:
-    """Plan to sensor: ``pixel = distort(plan_to_sensor @ plan)``.
+    """Map from the table plan to the sensor: ``pixel = distort(plan_to_sensor @ plan)``.
 
     Attributes
     ----------
-    plan_to_sensor
-        Homography (3, 3) from plan mm to undistorted px.
-    distortion
-        (k1, k2, p1, p2) in OpenCV's convention, for image coordinates divided by `focal_length_px`.
-    focal_length_px, principal_point_px
-        Unit and centre of the distortion; a plane seen once fixes only k1 / focal_length_px**2.
+    plan_to_sensor : (3, 3) ndarray
+        Homography from plan mm to undistorted px.
+    distortion : (4,) ndarray
+        k1, k2, p1, p2 of the normalised coordinates.
+    focal_length_px : float, px
+        Unit of the normalised coordinates; a plane in one position determines k1 / focal_length_px**2 only.
+    principal_point_px : (column, row), px
+        Centre of the distortion.
     """
 
     plan_to_sensor: Array
@@ -48,27 +132,27 @@ class Projection:
 
     @cached_property
     def as_array(self) -> Array:
-        """One array for the kernels: 9 of the homography, focal length, principal point, k1, k2, p1, p2."""
+        """Parameters for the kernels, (16,): homography by rows, focal length, principal point, k1, k2, p1, p2."""
         return np.concatenate(
             [self.plan_to_sensor.ravel(), [self.focal_length_px], self.principal_point_px, self.distortion], dtype=float
         )
 
     def to_sensor(self, points_mm: Array) -> Array:
-        """Project plan points, shape (..., 2) mm, to the sensor, shape (..., 2) px (column, row)."""
-        return _each(project, points_mm, self.as_array)
+        """Project plan points (x, y), shape (..., 2) mm, to sensor points (column, row), shape (..., 2) px."""
+        return _each(_project, points_mm, self.as_array)
 
     def to_plan(self, points_px: Array) -> Array:
-        """Locate sensor points, shape (..., 2) px (column, row), on the plan, shape (..., 2) mm."""
-        return _each(transform, self.undistort(points_px), np.linalg.inv(self.plan_to_sensor))
+        """Locate sensor points (column, row), shape (..., 2) px, on the plan, shape (..., 2) mm."""
+        return _each(_transform, self.undistort(points_px), np.linalg.inv(self.plan_to_sensor))
 
     def undistort(self, points_px: Array) -> Array:
         """Move sensor points, shape (..., 2) px, to where a lens without distortion would show them."""
         if not self.distortion.any():
             return np.asarray(points_px, float)
-        return _each(undistort, points_px, self.as_array)
+        return _each(_undistort, points_px, self.as_array)
 
     def jacobian(self, points_mm: Array) -> Array:
-        """Derivative of the sensor position by the plan position, shape (..., 2, 2), px/mm."""
+        """Derivative of the sensor position by the plan position, shape (..., 2, 2), px/mm, by central differences of 1 um."""
         step = 1e-3
         columns = [
             (self.to_sensor(points_mm + d) - self.to_sensor(points_mm - d)) / (2 * step) for d in step * np.eye(2)
@@ -76,8 +160,19 @@ class Projection:
         return np.stack(columns, axis=-1)
 
     def disc_centroids(self, centres_mm: Array, radii_mm: Array) -> Array:
-        """Centroids, shape (n, 2) px, of the images of discs; perspective shifts them from the image of the centre."""
-        rim_mm = centres_mm[:, None, :] + radii_mm[:, None, None] * np.stack([RIM.real, RIM.imag], axis=-1)
+        """Centroids of the images of discs, which perspective shifts from the images of their centres.
+
+        Parameters
+        ----------
+        centres_mm : (n, 2) ndarray, mm
+        radii_mm : (n,) ndarray, mm
+
+        Returns
+        -------
+        (n, 2) ndarray, px
+            Centroid (column, row) of the polygon through the images of 24 points on the rim.
+        """
+        rim_mm = centres_mm[:, None, :] + radii_mm[:, None, None] * np.stack([_RIM.real, _RIM.imag], axis=-1)
         rim = self.to_sensor(rim_mm)
         origin = rim[:, :1]
         a, b = rim - origin, np.roll(rim, -1, axis=1) - origin
@@ -87,17 +182,17 @@ class Projection:
 
 
 @dataclass(frozen=True)
-class Sightings:
-    """Disc centroids seen on the sensor and what they are on the plan.
+class DiscObservations:
+    """Disc centroids observed on the sensor, and the discs on the plan.
 
     Attributes
     ----------
-    points_px
-        Centroids (n, 2), px (column, row).
-    centres_mm, radii_mm
-        The discs on the plan, (n, 2) and (n,), mm.
-    u_px
-        Standard uncertainty of the centroids, (n,): discs of low contrast count less.
+    points_px : (n, 2) ndarray, px
+        Observed centroids (column, row).
+    centres_mm, radii_mm : (n, 2) and (n,) ndarray, mm
+        The discs on the plan.
+    u_px : (n,) ndarray, px
+        Standard uncertainty of either coordinate of a centroid: weights of the fit.
     """
 
     points_px: Array
@@ -105,31 +200,54 @@ class Sightings:
     radii_mm: Array
     u_px: Array
 
-    def without(self, index: int) -> Sightings:
-        """The sightings but one."""
-        return Sightings(
+    def without(self, index: int) -> DiscObservations:
+        """All observations but the one at `index`."""
+        return DiscObservations(
             *(
                 np.delete(values, index, axis=0)
                 for values in (self.points_px, self.centres_mm, self.radii_mm, self.u_px)
             )
         )
 
-    def plan_error(self, projection: Projection) -> Array:
-        """Seen minus listed place on the plan, shape (n, 2) mm; the perspective shift of a disc's centroid is not an error."""
-        misses = self.points_px - projection.disc_centroids(self.centres_mm, self.radii_mm)
-        error: Array = np.linalg.solve(projection.jacobian(self.centres_mm), misses[..., None])[..., 0]
-        return error
+    def residuals_px(self, projection: Projection) -> Array:
+        """Observed minus projected centroids, (n, 2) px."""
+        residuals: Array = self.points_px - projection.disc_centroids(self.centres_mm, self.radii_mm)
+        return residuals
+
+    def residuals_mm(self, projection: Projection) -> Array:
+        """Observed minus listed positions on the plan, (n, 2) mm; the perspective shift of a centroid is no residual."""
+        residuals: Array = np.linalg.solve(
+            projection.jacobian(self.centres_mm), self.residuals_px(projection)[..., None]
+        )[..., 0]
+        return residuals
 
 
-def fit_homography(seen: Sightings, ideal: Projection) -> Projection:
-    """Fit a plain homography to four or more discs behind the distortion of `ideal`, as the start of `fit_projection`.
+def fit_homography(observations: DiscObservations, ideal: Projection) -> Projection:
+    """Fit a homography to four or more discs behind a given distortion: the start of `fit_projection`.
+
+    Parameters
+    ----------
+    observations : DiscObservations
+        Four or more discs, not on one line.
+    ideal : Projection
+        Gives distortion, focal length and principal point; its homography is ignored.
+
+    Returns
+    -------
+    Projection
+        `ideal` with the homography of least squares on the sensor, unweighted.
 
     Raises
     ------
     ThermographyError
-        The points lie on a line, so that no homography is determined.
+        The discs lie on one line, so that no homography is determined.
+
+    Notes
+    -----
+    R. Hartley, A. Zisserman, Multiple View Geometry in Computer Vision, 2nd ed. (2004), ch. 4, as implemented in OpenCV.
     """
-    matrix, _ = cv2.findHomography(seen.centres_mm.astype(float), ideal.undistort(seen.points_px).astype(float), 0)
+    undistorted_px = ideal.undistort(observations.points_px).astype(float)
+    matrix, _ = cv2.findHomography(observations.centres_mm.astype(float), undistorted_px, 0)
     if matrix is None or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-9:
         raise ThermographyError(
             "the fiducials lie on a line or on one spot; spread at least four over both sides of the plan"
@@ -137,64 +255,114 @@ def fit_homography(seen: Sightings, ideal: Projection) -> Projection:
     return replace(ideal, plan_to_sensor=matrix)
 
 
-def fit_projection(seen: Sightings, start: Projection, coefficients: int) -> Projection:
-    """Fit homography and the first `coefficients` (0, 1 or 4) distortion coefficients by weighted least squares on the sensor.
+def fit_projection(observations: DiscObservations, start: Projection, coefficients: int) -> Projection:
+    """Fit homography and distortion to discs by weighted least squares on the sensor (Levenberg-Marquardt).
 
-    The distortion of `start` beyond `coefficients` is kept.
+    Parameters
+    ----------
+    observations : DiscObservations
+    start : Projection
+        Start of the iteration; its focal length, its principal point and its distortion beyond `coefficients` are kept.
+    coefficients : int
+        Number of distortion coefficients to fit: 0, 1 (k1) or 4 (k1, k2, p1, p2).
+
+    Returns
+    -------
+    Projection
     """
-    pack, unpack = _parameters(start, seen.centres_mm, coefficients)
-
-    # The shift of a disc's centroid by perspective hardly moves with the fit, so it is held fixed within one.
-    shift = start.disc_centroids(seen.centres_mm, seen.radii_mm) - start.to_sensor(seen.centres_mm)
+    pack, unpack = _parameters(start, observations.centres_mm, coefficients)
+    # The perspective shift of the centroids hardly changes during the fit and is held fixed.
+    shift = start.disc_centroids(observations.centres_mm, observations.radii_mm) - start.to_sensor(
+        observations.centres_mm
+    )
 
     def residuals(parameters: Array) -> Array:
-        misses = unpack(parameters).to_sensor(seen.centres_mm) + shift - seen.points_px
-        return (misses / seen.u_px[:, None]).ravel()
+        residuals_px = unpack(parameters).to_sensor(observations.centres_mm) + shift - observations.points_px
+        return (residuals_px / observations.u_px[:, None]).ravel()
 
     return unpack(least_squares(residuals, pack(start), method="lm", xtol=1e-9, ftol=1e-9).x)
 
 
-def climb_ladder(seen: Sightings, start: Projection) -> tuple[Projection, int]:
-    """Fit every rung of the ladder that the discs determine; keep the lowest that no richer one clearly beats.
+def select_lens_model(observations: DiscObservations, start: Projection) -> tuple[Projection, int]:
+    """Fit every lens model that the discs determine, and choose the simplest that no richer one clearly improves on.
 
-    Judged by the leave-one-out error, each disc weighted by its own uncertainty.
+    A richer model is chosen if it lowers the leave-one-out error, weighted by the uncertainties of the discs, below 75 %.
+
+    Parameters
+    ----------
+    observations : DiscObservations
+    start : Projection
+        From `fit_homography`.
 
     Returns
     -------
-    Projection, int
-        The fit and its number of distortion coefficients.
+    projection : Projection
+        The fit of the chosen model.
+    coefficients : int
+        Its number of distortion coefficients, see `LENS_MODELS`.
     """
-    best, best_count, best_error = fit_projection(seen, fit_projection(seen, start, 0), 0), 0, np.inf
-    for _, count in LADDER:
-        if count > 0 and 2 * (len(seen.u_px) - 2) < 8 + count:
+    best, best_count, best_error = fit_projection(observations, fit_projection(observations, start, 0), 0), 0, np.inf
+    for _, count in LENS_MODELS:
+        if count > 0 and 2 * (len(observations.u_px) - 2) < 8 + count:
             break
-        projection = fit_projection(seen, best, count)
-        error = float(np.sqrt(np.mean((leave_one_out(seen, projection, count) / seen.u_px) ** 2)))
-        if error < LADDER_GAIN * best_error:
+        projection = fit_projection(observations, best, count)
+        weighted = leave_one_out_mm(observations, projection, count) / observations.u_px
+        error = float(np.sqrt(np.mean(weighted**2)))
+        if error < _REQUIRED_GAIN * best_error:
             best, best_count, best_error = projection, count, error
     return best, best_count
 
 
-def leave_one_out(seen: Sightings, projection: Projection, coefficients: int) -> Array:
-    """Distance in mm, shape (n,), by which each disc is missed when the others alone are fitted; NaN where they cannot be.
+def leave_one_out_mm(observations: DiscObservations, projection: Projection, coefficients: int) -> Array:
+    """Distance by which each disc is missed by the fit to all other discs.
 
-    From the leverage of each disc in the one fit of all (Allen 1974), which equals fitting n times as long as the projection is
-    linear over the residuals; they are hundredths of a pixel.
+    Parameters
+    ----------
+    observations : DiscObservations
+    projection : Projection
+        The fit to all discs.
+    coefficients : int
+        Number of its fitted distortion coefficients.
+
+    Returns
+    -------
+    (n,) ndarray, mm
+        On the plan; NaN where the other discs would not determine the fit.
+
+    Notes
+    -----
+    The PRESS residual ``(I - H_ii)^-1 r_i`` from the leverage H_ii of each disc (D. M. Allen, Technometrics 16 (1974) 125-127). It
+    equals n repeated fits as long as the projection is linear over the residuals, which are hundredths of a pixel.
     """
-    count = len(seen.u_px)
+    count = len(observations.u_px)
     if 2 * (count - 1) < 8 + coefficients:
         return np.full(count, np.nan)
-    jacobian = parameter_jacobian(projection, seen.centres_mm, coefficients)(seen.centres_mm) / seen.u_px[:, None, None]
+    jacobian = _weighted_jacobian(observations, projection, coefficients)
     flat = jacobian.reshape(2 * count, -1)
     leverage = jacobian @ np.linalg.pinv(flat.T @ flat) @ np.swapaxes(jacobian, 1, 2)
-    misses = (seen.points_px - projection.disc_centroids(seen.centres_mm, seen.radii_mm)) / seen.u_px[:, None]
-    missed_px = np.linalg.solve(np.eye(2) - leverage, misses[..., None]) * seen.u_px[:, None, None]
-    missed_mm = np.linalg.solve(projection.jacobian(seen.centres_mm), missed_px)[..., 0]
+    weighted = observations.residuals_px(projection) / observations.u_px[:, None]
+    missed_px = np.linalg.solve(np.eye(2) - leverage, weighted[..., None]) * observations.u_px[:, None, None]
+    missed_mm = np.linalg.solve(projection.jacobian(observations.centres_mm), missed_px)[..., 0]
     return np.asarray(np.linalg.norm(missed_mm, axis=1))
 
 
 def parameter_jacobian(projection: Projection, centres_mm: Array, coefficients: int) -> Callable[[Array], Array]:
-    """Return a function from plan points (n, 2) to the sensor's derivative by the fitted parameters (n, 2, parameters), px."""
+    """Derivative of the sensor position by the fitted parameters, as a function of the plan point.
+
+    Parameters
+    ----------
+    projection : Projection
+        Where to take the derivative.
+    centres_mm : (n, 2) ndarray, mm
+        The discs of the fit; their mean and extent normalise the homography.
+    coefficients : int
+        Number of fitted distortion coefficients.
+
+    Returns
+    -------
+    callable
+        From plan points (m, 2) mm to (m, 2, 8 + coefficients) px per unit of the parameters, by central differences.
+    """
     pack, unpack = _parameters(projection, centres_mm, coefficients)
     parameters = pack(projection)
     steps = 1e-6 * np.maximum(np.abs(parameters), 1e-2)
@@ -209,16 +377,37 @@ def parameter_jacobian(projection: Projection, centres_mm: Array, coefficients: 
     return derivative
 
 
-def parameter_covariance(seen: Sightings, projection: Projection, coefficients: int) -> Array:
-    """Covariance of the fitted parameters, scaled up by the discs' misfit where that exceeds their stated uncertainty."""
-    jacobian = parameter_jacobian(projection, seen.centres_mm, coefficients)(seen.centres_mm) / seen.u_px[:, None, None]
-    jacobian = jacobian.reshape(2 * len(seen.u_px), -1)
-    misses = (seen.points_px - projection.disc_centroids(seen.centres_mm, seen.radii_mm)) / seen.u_px[:, None]
-    freedom = 2 * len(seen.u_px) - jacobian.shape[1]
-    # Four discs leave no residual: then the centroids' own uncertainty is all that is known, and never less than that.
-    scale = max(float((misses**2).sum()) / freedom, 1.0) if freedom > 0 else 1.0
+def parameter_covariance(observations: DiscObservations, projection: Projection, coefficients: int) -> Array:
+    """Covariance of the fitted parameters.
+
+    Parameters
+    ----------
+    observations : DiscObservations
+    projection : Projection
+        The fit.
+    coefficients : int
+        Number of its fitted distortion coefficients.
+
+    Returns
+    -------
+    (8 + coefficients, 8 + coefficients) ndarray
+        In the units of `parameter_jacobian`: ``(J^T J)^-1`` with rows of J divided by the uncertainty of the discs, times the
+        reduced chi-square of the residuals where that is above 1 (Birge ratio; R. T. Birge, Phys. Rev. 40 (1932) 207-227).
+    """
+    jacobian = _weighted_jacobian(observations, projection, coefficients).reshape(2 * len(observations.u_px), -1)
+    weighted = observations.residuals_px(projection) / observations.u_px[:, None]
+    freedom = 2 * len(observations.u_px) - jacobian.shape[1]
+    # Four discs leave no degree of freedom: then the uncertainty of the centroids is all there is.
+    scale = max(float((weighted**2).sum()) / freedom, 1.0) if freedom > 0 else 1.0
     covariance: Array = scale * np.linalg.pinv(jacobian.T @ jacobian)
     return covariance
+
+
+def _weighted_jacobian(observations: DiscObservations, projection: Projection, coefficients: int) -> Array:
+    """Derivative of the discs' sensor positions by the parameters over their uncertainty, (n, 2, parameters)."""
+    derivative = parameter_jacobian(projection, observations.centres_mm, coefficients)(observations.centres_mm)
+    weighted: Array = derivative / observations.u_px[:, None, None]
+    return weighted
 
 
 def _parameters(
@@ -241,70 +430,3 @@ def _parameters(
         return replace(start, plan_to_sensor=matrix / matrix[2, 2], distortion=distortion)
 
     return pack, unpack
-
-
-def _each(kernel: Callable[[Array, Array], Array], points: Array, parameters: Array) -> Array:
-    """Send points of shape (..., 2) through a kernel for (n, 2)."""
-    points = np.ascontiguousarray(points, float)
-    return kernel(points.reshape(-1, 2), parameters).reshape(points.shape)
-
-
-#: Steps of the undistortion at most, and what it has to reach, in units of the focal length.
-STEPS, REACHED = 40, 1e-11
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def projected(x: float, y: float, lens: Array) -> tuple[float, float]:
-    """Sensor column and row of a plan point; `lens` as `thermography.registration.projection.Projection.as_array` gives it."""
-    w = lens[6] * x + lens[7] * y + lens[8]
-    u = ((lens[0] * x + lens[1] * y + lens[2]) / w - lens[10]) / lens[9]
-    v = ((lens[3] * x + lens[4] * y + lens[5]) / w - lens[11]) / lens[9]
-    du, dv = _distorted(u, v, lens)
-    return lens[10] + lens[9] * du, lens[11] + lens[9] * dv
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _distorted(u: float, v: float, lens: Array) -> tuple[float, float]:
-    r2 = u * u + v * v
-    radial = 1 + r2 * (lens[12] + lens[13] * r2)
-    return (
-        u * radial + 2 * lens[14] * u * v + lens[15] * (r2 + 2 * u * u),
-        v * radial + lens[14] * (r2 + 2 * v * v) + 2 * lens[15] * u * v,
-    )
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def project(points: Array, lens: Array) -> Array:
-    """Sensor column and row of plan points, (n, 2)."""
-    found = np.empty(points.shape)
-    for i in range(len(points)):
-        found[i, 0], found[i, 1] = projected(points[i, 0], points[i, 1], lens)
-    return found
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def undistort(points: Array, lens: Array) -> Array:
-    """Where a lens without distortion would show sensor points, (n, 2) px."""
-    found = np.empty(points.shape)
-    for i in range(len(points)):
-        u0, v0 = (points[i, 0] - lens[10]) / lens[9], (points[i, 1] - lens[11]) / lens[9]
-        u, v = u0, v0
-        for _ in range(STEPS):
-            du, dv = _distorted(u, v, lens)
-            u, v = u + u0 - du, v + v0 - dv
-            if not max(abs(u0 - du), abs(v0 - dv)) >= REACHED:
-                break
-        found[i, 0], found[i, 1] = lens[10] + lens[9] * u, lens[11] + lens[9] * v
-    return found
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def transform(points: Array, matrix: Array) -> Array:
-    """Points, (n, 2), moved by a homography."""
-    found = np.empty(points.shape)
-    for i in range(len(points)):
-        x, y = points[i, 0], points[i, 1]
-        w = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2]
-        found[i, 0] = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2]) / w
-        found[i, 1] = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2]) / w
-    return found

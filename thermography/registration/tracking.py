@@ -1,8 +1,9 @@
-"""Where a moving table is in every frame: its discs found by the one registration, displaced."""
+"""Position of a moving table in every frame: the discs of one registration, located displaced along the axis."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -10,54 +11,58 @@ from numpy.typing import NDArray
 
 from thermography._typing import Array
 from thermography.registration.plan import PlanGrid
-from thermography.registration.projection import projected
+from thermography.registration.projection import project_point
 from thermography.registration.register import Registration
 
-#: Step of the coarse search along the axis, as part of the smallest disc's diameter.
-COARSE_STEP = 0.25
-#: Discs that disagree with the median by more than this (and by five times the median deviation) are left out, mm.
-ODD_MM = 0.5
-#: A place near that of the frame before is taken without a search if its discs agree to this, and so many of those in view are found.
-SURE_MM, SURE_SHARE = 0.3, 0.7
-#: Places of the coarse search that are looked at closely.
-CANDIDATES = 5
+#: Step of the coarse search along the axis, as share of the smallest disc's diameter.
+_COARSE_STEP = 0.25
+#: Discs that differ from the median by more than this (and by five times the median deviation) are left out, mm.
+_OUTLIER_MM = 0.5
+#: A position near that of the previous frame is accepted without a search if its uncertainty is below this, mm, ...
+_RELIABLE_U_MM = 0.3
+#: ... and this share of the discs in view is located.
+_RELIABLE_SHARE = 0.7
+#: Number of peaks of the coarse search that are refined.
+_PEAKS = 5
 #: A disc needs this many times the noise of one pixel as contrast.
-LEAST_CONTRAST = 3.0
+_LEAST_CONTRAST = 3.0
+#: Radii within which a disc's inside and the ring around it are sampled by the coarse search, as share of the disc's radius.
+_COARSE_RADII = (0.5, 1.5)
+_COARSE_POINTS = 8
 
 
 @dataclass(frozen=True)
-class Tracker:
-    """What the kernels need to know of plan, discs and lens, as plain arrays.
+class TableTracker:
+    """A registration prepared for locating the table displaced along one direction.
 
     Attributes
     ----------
-    discs
-        (n, 3): x, y, radius, mm.
-    lens
-        The projection as `thermography.registration.projection.Projection.as_array` gives it.
-    direction
+    registration : Registration
+        Of the table in one position.
+    discs : (n, 3) ndarray, mm
+        x, y and radius of the fiducials on the plan.
+    lens : (16,) ndarray
+        The projection, as `thermography.registration.projection.Projection.as_array`.
+    direction : (2,) ndarray
         Unit vector on the plan along which the table is displaced.
-    size_mm
-        Width and height of the plan.
-    reach_mm
-        How far the table may be displaced either way.
-    registration
-        Of the table where it stood when it was registered.
-    bias_px
-        By how much perspective shifts the centroid of every disc's image from the image of its centre, (n, 2): nearly the same
-        wherever the table is.
-    margin_px
-        How far from the frame's edge a disc must lie to be found, (n, 2).
-    common_mm, common_u_mm
-        Displacements along the direction, and what the registration's own uncertainty adds there for all discs together.
+    size_mm : (width, height), mm
+        Of the plan.
+    reach_mm : float, mm
+        Largest displacement either way.
+    bias_px : (n, 2) ndarray, px
+        Perspective shift of every disc's centroid from the image of its centre: nearly the same for every displacement.
+    margin_px : (n, 2) ndarray, px
+        Distance of a disc from the frame's edge below which it is not located.
+    common_mm, common_u_mm : (m,) ndarray, mm
+        Displacements along the direction, and the standard uncertainty that the registration adds there to all discs together.
     """
 
+    registration: Registration
     discs: Array
     lens: Array
     direction: Array
     size_mm: tuple[float, float]
     reach_mm: float
-    registration: Registration
     bias_px: Array
     margin_px: Array
     common_mm: Array
@@ -65,189 +70,288 @@ class Tracker:
 
 
 @dataclass(frozen=True)
-class TablePlace:
-    """Displacement of the table in one frame, (x, y) mm on the plan, its standard uncertainty along both, and the discs used."""
+class TablePosition:
+    """Position of the table in one frame.
+
+    Attributes
+    ----------
+    shift_mm : (2,) ndarray, mm
+        Displacement (x, y) on the plan from the registered position.
+    u_mm : float, mm
+        Standard uncertainty of the displacement along either coordinate.
+    discs : int
+        Number of discs used.
+    """
 
     shift_mm: Array
     u_mm: float
     discs: int
 
 
-def make_tracker(registration: Registration, grid: PlanGrid, direction: Array, *, reach_mm: float) -> Tracker:
-    """Prepare the tracking of a table that is displaced along `direction` (plan) by up to `reach_mm` from where it was registered."""
-    discs = np.array([(d.x_mm, d.y_mm, d.diameter_mm / 2) for d in registration.fiducials.values()])
-    unit = np.asarray(direction, float) / np.hypot(*direction)
-    along = np.linspace(-reach_mm, reach_mm, 31)
-    places = discs[:, :2] + (along[:, None] * unit)[:, None, :]
-    common = np.sqrt(np.mean(registration.position_u(places) ** 2, axis=1))
-    size = (grid.width_mm, grid.height_mm)
-    projection = registration.projection
-    bias = projection.disc_centroids(discs[:, :2], discs[:, 2]) - projection.to_sensor(discs[:, :2])
-    margin = 3 * np.linalg.norm(projection.jacobian(discs[:, :2]), axis=-1) * discs[:, 2:]
-    return Tracker(
-        discs, registration.projection.as_array, unit, size, reach_mm, registration, bias, margin, along, common
-    )
-
-
-def locate_table(counts: NDArray[np.uint16], tracker: Tracker, near_mm: Array | None = None) -> TablePlace | None:
-    """Locate the table in one frame of counts (row, column).
+def make_tracker(registration: Registration, grid: PlanGrid, direction: Array, *, reach_mm: float) -> TableTracker:
+    """Prepare the tracking of a table that moves along one direction.
 
     Parameters
     ----------
-    counts
-        Uncalibrated: contrast and place of the discs need no temperature.
-    tracker
-        From `make_tracker`.
-    near_mm
-        Displacement of the frame before; without it, or where it does not hold any more, the whole reach is searched.
+    registration : Registration
+        Of the table in one position.
+    grid : PlanGrid
+        The plan.
+    direction : (2,) ndarray
+        Direction (x, y) on the plan along which the table is displaced, of any length.
+    reach_mm : float, mm
+        Largest displacement either way from the registered position.
 
     Returns
     -------
-    TablePlace or None
-        None where fewer than two discs show.
+    TableTracker
     """
-    near = None if near_mm is None else _refined(counts, tracker, near_mm)
-    if near is not None and near.u_mm < SURE_MM and near.discs >= SURE_SHARE * _in_view(counts, tracker, near.shift_mm):
+    discs = np.array([(d.x_mm, d.y_mm, d.diameter_mm / 2) for d in registration.fiducials.values()])
+    centres, radii = discs[:, :2], discs[:, 2:]
+    unit = np.asarray(direction, float) / np.hypot(*direction)
+    along = np.linspace(-reach_mm, reach_mm, 31)
+    displaced = centres + (along[:, None] * unit)[:, None, :]
+    projection = registration.projection
+    return TableTracker(
+        registration=registration,
+        discs=discs,
+        lens=projection.as_array,
+        direction=unit,
+        size_mm=(grid.width_mm, grid.height_mm),
+        reach_mm=reach_mm,
+        bias_px=projection.disc_centroids(centres, discs[:, 2]) - projection.to_sensor(centres),
+        margin_px=3 * np.linalg.norm(projection.jacobian(centres), axis=-1) * radii,
+        common_mm=along,
+        common_u_mm=np.sqrt(np.mean(registration.position_u(displaced) ** 2, axis=1)),
+    )
+
+
+def locate_table(
+    counts: NDArray[np.uint16], tracker: TableTracker, previous_mm: Array | None = None
+) -> TablePosition | None:
+    """Locate the table in one frame.
+
+    Parameters
+    ----------
+    counts : (row, column) ndarray of uint16
+        Raw counts: the contrast and the position of the discs need no calibration.
+    tracker : TableTracker
+        From `make_tracker`.
+    previous_mm : (2,) ndarray, mm, or None
+        Displacement in the previous frame, tried first; None, or a displacement that does not hold any more, searches the whole
+        reach.
+
+    Returns
+    -------
+    TablePosition or None
+        None where fewer than two discs are located.
+    """
+    near = None if previous_mm is None else _refine(counts, tracker, previous_mm)
+    if near is not None and _is_reliable(near, counts, tracker):
         return near
-    step = COARSE_STEP * 2 * float(tracker.discs[:, 2].min())
+    step = _COARSE_STEP * 2 * float(tracker.discs[:, 2].min())
     along = np.arange(-tracker.reach_mm, tracker.reach_mm + step, step)
-    scores = _coarse(counts, tracker.discs, tracker.lens, tracker.direction, along)
+    scores = _coarse_scores(counts, tracker.discs, tracker.lens, tracker.direction, along)
     peaks = np.flatnonzero((scores >= np.r_[-1.0, scores[:-1]]) & (scores >= np.r_[scores[1:], -1.0]))
-    places = [near]
-    for best in peaks[np.argsort(-scores[peaks])][:CANDIDATES]:
-        places.append(_refined(counts, tracker, along[best] * tracker.direction))
-    # Discs at equal distances pass for each other: the place at which the most agree, and agree best, is the right one.
-    found = [place for place in places if place is not None]
-    return max(found, key=lambda place: (place.u_mm < SURE_MM, place.discs, -place.u_mm), default=None)
+    strongest = peaks[np.argsort(-scores[peaks])][:_PEAKS]
+    candidates = [near, *(_refine(counts, tracker, along[peak] * tracker.direction) for peak in strongest)]
+    # Discs at equal distances can be confused with each other: the position on which most discs agree, and agree best, is the right one.
+    positions = [candidate for candidate in candidates if candidate is not None]
+    return max(positions, key=lambda p: (p.u_mm < _RELIABLE_U_MM, p.discs, -p.u_mm), default=None)
 
 
-def _in_view(counts: NDArray[np.uint16], tracker: Tracker, shift_mm: Array) -> int:
-    """How many discs lie within the frame with the table displaced, a disc's width from its edge."""
-    centres = tracker.discs[:, :2] + shift_mm
-    places = tracker.registration.to_sensor(centres)
+def _is_reliable(position: TablePosition, counts: NDArray[np.uint16], tracker: TableTracker) -> bool:
+    """Whether most discs that should be in view are located, and agree."""
+    in_view = _discs_in_view(counts, tracker, position.shift_mm)
+    return position.u_mm < _RELIABLE_U_MM and position.discs >= _RELIABLE_SHARE * in_view
+
+
+def _discs_in_view(counts: NDArray[np.uint16], tracker: TableTracker, shift_mm: Array) -> int:
+    """Number of discs that lie far enough within the frame when the table is displaced."""
+    places = tracker.registration.to_sensor(tracker.discs[:, :2] + shift_mm)
     inside = (places > tracker.margin_px) & (places < np.array(counts.shape[::-1]) - tracker.margin_px)
     return int(inside.all(axis=1).sum())
 
 
-def _refined(counts: NDArray[np.uint16], tracker: Tracker, near_mm: Array) -> TablePlace | None:
-    found = _locate(counts, tracker.discs, tracker.lens, tracker.size_mm, np.asarray(near_mm, float), LEAST_CONTRAST)
-    seen = np.flatnonzero(found[:, 2] > 0)
-    if len(seen) < 2:
+def _refine(counts: NDArray[np.uint16], tracker: TableTracker, predicted_mm: Array) -> TablePosition | None:
+    """Mean displacement of the discs located near a predicted displacement; None where fewer than two agree."""
+    centroids, located = _locate_discs(
+        counts, tracker.discs, tracker.lens, tracker.size_mm, np.asarray(predicted_mm, float), _LEAST_CONTRAST
+    )
+    discs = np.flatnonzero(located)
+    if len(discs) < 2:
         return None
-    shifts = tracker.registration.to_plan(found[seen, :2] - tracker.bias_px[seen]) - tracker.discs[seen, :2]
-    median = np.median(shifts, axis=0)
-    distance = np.linalg.norm(shifts - median, axis=1)
-    kept = distance <= max(ODD_MM, 5 * float(np.median(distance)))
+    shifts = tracker.registration.to_plan(centroids[discs] - tracker.bias_px[discs]) - tracker.discs[discs, :2]
+    distance = np.linalg.norm(shifts - np.median(shifts, axis=0), axis=1)
+    kept = distance <= max(_OUTLIER_MM, 5 * float(np.median(distance)))
     if kept.sum() < 2:
         return None
     mean = shifts[kept].mean(axis=0)
     scatter = np.sqrt(((shifts[kept] - mean) ** 2).sum() / (2 * kept.sum() - 2))
     common = np.interp(mean @ tracker.direction, tracker.common_mm, tracker.common_u_mm)
-    return TablePlace(mean, float(np.hypot(scatter / np.sqrt(kept.sum()), common)), int(kept.sum()))
+    return TablePosition(mean, float(np.hypot(scatter / np.sqrt(kept.sum()), common)), int(kept.sum()))
 
 
 @numba.njit(cache=True, nogil=True)
-def _coarse(counts: Array, discs: Array, lens: Array, direction: Array, along: Array) -> Array:
-    """Contrast of the discs' insides to their rings, added with its sign over the discs in view, for every displacement."""
+def _coarse_scores(counts: Array, discs: Array, lens: Array, direction: Array, along: Array) -> Array:
+    """Sum over the discs in view of their contrast, over the root of their number, for every displacement."""
     scores = np.zeros(len(along))
-    rows, columns = counts.shape
     for k in range(len(along)):
-        total, seen = 0.0, 0
+        total, in_view = 0.0, 0
         for d in range(len(discs)):
-            x, y, radius = discs[d, 0] + along[k] * direction[0], discs[d, 1] + along[k] * direction[1], discs[d, 2]
-            inside, ring, points = 0.0, 0.0, 0
-            for a in range(8):
-                angle = a * np.pi / 4
-                for share, sign in ((0.5, 1), (1.5, -1)):
-                    c, r = projected(x + share * radius * np.cos(angle), y + share * radius * np.sin(angle), lens)
-                    column, row = round(c), round(r)
-                    if 0 <= column < columns and 0 <= row < rows:
-                        points += 1
-                        if sign > 0:
-                            inside += counts[row, column]
-                        else:
-                            ring += counts[row, column]
-            if points == 16:
-                total += (inside - ring) / 8
-                seen += 1
-        if seen > 0:
-            scores[k] = abs(total) / np.sqrt(seen)
+            x, y = discs[d, 0] + along[k] * direction[0], discs[d, 1] + along[k] * direction[1]
+            contrast = _coarse_contrast(counts, x, y, discs[d, 2], lens)
+            if not np.isnan(contrast):
+                total += contrast
+                in_view += 1
+        if in_view > 0:
+            scores[k] = abs(total) / np.sqrt(in_view)
     return scores
 
 
 @numba.njit(cache=True, nogil=True)
-def _locate(counts: Array, discs: Array, lens: Array, size: tuple[float, float], shift: Array, least: float) -> Array:
-    """Centroid (column, row) of every disc and whether it was found, (discs, 3); as `discs.locate_disc`, without its robust fits."""
-    found = np.zeros((len(discs), 3))
-    height, width = counts.shape
-    for d in range(len(discs)):
-        x, y, radius = discs[d, 0] + shift[0], discs[d, 1] + shift[1], discs[d, 2]
-        c0, r0 = projected(x, y, lens)
-        cx, rx = projected(x + 0.5, y, lens)
-        cy, ry = projected(x, y + 0.5, lens)
-        j00, j10, j01, j11 = 2 * (cx - c0), 2 * (rx - r0), 2 * (cy - c0), 2 * (ry - r0)
-        det = j00 * j11 - j01 * j10
-        blur = 1.5 * max(np.hypot(j11, j10), np.hypot(j01, j00)) / abs(det)
-        rim, outer = radius + blur, 2.2 * radius + blur
-        half_c, half_r = int(outer * np.hypot(j00, j01)) + 2, int(outer * np.hypot(j10, j11)) + 2
-        column, row = c0, r0
-        for _ in range(8):
-            left, top = round(column) - half_c, round(row) - half_r
-            if left < 0 or top < 0 or left + 2 * half_c >= width or top + 2 * half_r >= height:
-                found[d, 2] = 0
-                break
-            patch = (left, top, left + 2 * half_c, top + 2 * half_r)
-            radii = (max(radius - blur, 0.45 * radius), rim, outer)
-            table = (discs[d, 0], discs[d, 1], size[0], size[1], blur)
-            plane, contrast, noise = _contrast(counts, patch, (column, row), (j00, j01, j10, j11), radii, table)
-            if not abs(contrast) > least * noise:
-                found[d, 2] = 0
-                break
-            total, moment_c, moment_r = _moments(
-                counts, patch, (column, row), (j00, j01, j10, j11), rim, plane, contrast
-            )
-            area = np.pi * radius * radius * abs(det)
-            if not 0.6 * area < total < 1.4 * area:
-                found[d, 2] = 0
-                break
-            column += moment_c / total
-            row += moment_r / total
-            found[d, 0], found[d, 1], found[d, 2] = column, row, 1
-            # What is left of a step this small is less than a thousandth of it.
-            if abs(moment_c / total) + abs(moment_r / total) < 0.03:
-                break
-        if abs(column - c0) + abs(row - r0) > 2.5 * radius * np.sqrt(abs(det)):
-            found[d, 2] = 0
-    return found
+def _coarse_contrast(counts: Array, x: float, y: float, radius: float, lens: Array) -> float:
+    """Mean of eight pixels within a disc minus mean of eight around it, counts; NaN where not all of them are in view."""
+    rows, columns = counts.shape
+    inside, ring = 0.0, 0.0
+    for a in range(_COARSE_POINTS):
+        angle = a * 2 * np.pi / _COARSE_POINTS
+        for zone in range(2):
+            reach = _COARSE_RADII[zone] * radius
+            c, r = project_point(x + reach * np.cos(angle), y + reach * np.sin(angle), lens)
+            column, row = round(c), round(r)
+            if not (0 <= column < columns and 0 <= row < rows):
+                return np.nan
+            if zone == 0:
+                inside += counts[row, column]
+            else:
+                ring += counts[row, column]
+    return (inside - ring) / _COARSE_POINTS
+
+
+class _DiscView(NamedTuple):
+    """A disc on the sensor near its predicted position: its local affine map, and its zones on the plan around its centre.
+
+    The Jacobian is (column by x, column by y; row by x, row by y), px/mm. Pixels within `core_mm` show the disc alone, those
+    within `rim_mm` any part of it, those between `rim_mm` and `outer_mm` the table around it. `x_mm`, `y_mm` is the disc's listed
+    position: the ring lies on the table wherever the table is.
+    """
+
+    column: float
+    row: float
+    column_by_x: float
+    column_by_y: float
+    row_by_x: float
+    row_by_y: float
+    determinant: float
+    radius_mm: float
+    core_mm: float
+    rim_mm: float
+    outer_mm: float
+    blur_mm: float
+    half_columns: int
+    half_rows: int
+    x_mm: float
+    y_mm: float
+
+
+class _Patch(NamedTuple):
+    """First and last pixel of a window of the sensor, and the centre to which offsets are taken."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+    column: float
+    row: float
 
 
 @numba.njit(cache=True, nogil=True)
-def _contrast(
-    counts: Array,
-    patch: tuple[int, int, int, int],
-    centre: tuple[float, float],
-    jacobian: tuple[float, float, float, float],
-    radii: tuple[float, float, float],
-    table: tuple[float, float, float, float, float],
-) -> tuple[Array, float, float]:
+def _locate_discs(
+    counts: Array, discs: Array, lens: Array, size: tuple[float, float], shift: Array, least_contrast: float
+) -> tuple[Array, Array]:
+    """Centroid (column, row) of every disc, (n, 2) px, and whether it is located, (n,): `discs.locate_disc` without robust fits."""
+    centroids, located = np.zeros((len(discs), 2)), np.zeros(len(discs), np.bool_)
+    for d in range(len(discs)):
+        view = _disc_view(discs[d], shift, lens)
+        centroids[d, 0], centroids[d, 1], located[d] = _locate_disc(counts, view, size, least_contrast)
+    return centroids, located
+
+
+@numba.njit(cache=True, nogil=True)
+def _disc_view(disc: Array, shift: Array, lens: Array) -> _DiscView:
+    """A disc (x, y, radius) of a table displaced by `shift`, mm, as the lens images it."""
+    x, y, radius = disc[0] + shift[0], disc[1] + shift[1], disc[2]
+    c0, r0 = project_point(x, y, lens)
+    cx, rx = project_point(x + 0.5, y, lens)
+    cy, ry = project_point(x, y + 0.5, lens)
+    column_by_x, row_by_x, column_by_y, row_by_y = 2 * (cx - c0), 2 * (rx - r0), 2 * (cy - c0), 2 * (ry - r0)
+    determinant = column_by_x * row_by_y - column_by_y * row_by_x
+    blur = 1.5 * max(np.hypot(row_by_y, row_by_x), np.hypot(column_by_y, column_by_x)) / abs(determinant)
+    outer = 2.2 * radius + blur
+    half_columns = int(outer * np.hypot(column_by_x, column_by_y)) + 2
+    half_rows = int(outer * np.hypot(row_by_x, row_by_y)) + 2
+    return _DiscView(
+        c0, r0, column_by_x, column_by_y, row_by_x, row_by_y, determinant,
+        radius, max(radius - blur, 0.45 * radius), radius + blur, outer, blur, half_columns, half_rows, disc[0], disc[1],
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _locate_disc(
+    counts: Array, view: _DiscView, size: tuple[float, float], least_contrast: float
+) -> tuple[float, float, bool]:
+    """Centroid (column, row) px of one disc by repeated centroids of its coverage, and whether it is located."""
+    height, width = counts.shape
+    column, row = view.column, view.row
+    area = np.pi * view.radius_mm * view.radius_mm * abs(view.determinant)
+    for _ in range(8):
+        left, top = round(column) - view.half_columns, round(row) - view.half_rows
+        right, bottom = left + 2 * view.half_columns, top + 2 * view.half_rows
+        if left < 0 or top < 0 or right >= width or bottom >= height:
+            return column, row, False
+        patch = _Patch(left, top, right, bottom, column, row)
+        plane, contrast, noise = _contrast(counts, patch, view, size)
+        if not abs(contrast) > least_contrast * noise:
+            return column, row, False
+        total, moment_c, moment_r = _moments(counts, patch, view, plane, contrast)
+        if not 0.6 * area < total < 1.4 * area:
+            return column, row, False
+        column += moment_c / total
+        row += moment_r / total
+        # The next step would be less than a thousandth of a step as small as this.
+        if abs(moment_c / total) + abs(moment_r / total) < 0.03:
+            break
+    near = abs(column - view.column) + abs(row - view.row) <= 2.5 * view.radius_mm * np.sqrt(abs(view.determinant))
+    return column, row, near
+
+
+@numba.njit(cache=True, nogil=True)
+def _plan_offset(view: _DiscView, u: float, v: float) -> tuple[float, float]:
+    """Offset (x, y) mm on the plan for an offset (column, row) px on the sensor."""
+    return (
+        (view.row_by_y * u - view.column_by_y * v) / view.determinant,
+        (view.column_by_x * v - view.row_by_x * u) / view.determinant,
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _contrast(counts: Array, patch: _Patch, view: _DiscView, size: tuple[float, float]) -> tuple[Array, float, float]:
     """Plane through the ring around a disc, contrast of the disc to it, and noise of the ring; NaN where there are too few pixels."""
-    j00, j01, j10, j11 = jacobian
-    det = j00 * j11 - j01 * j10
-    cut, rim, outer = radii
-    x0, y0, width, height, blur = table
+    core, rim, outer, blur = view.core_mm, view.rim_mm, view.outer_mm, view.blur_mm
     normal, right = np.zeros((3, 3)), np.zeros(3)
-    inner_sum, inner_c, inner_r, inner_n, ring_n, squares = 0.0, 0.0, 0.0, 0, 0, 0.0
-    for i in range(patch[1], patch[3] + 1):
-        for j in range(patch[0], patch[2] + 1):
-            u, v = j - centre[0], i - centre[1]
-            px, py = (j11 * u - j01 * v) / det, (j00 * v - j10 * u) / det
-            distance = px * px + py * py
+    core_sum, core_c, core_r, core_n, ring_n, squares = 0.0, 0.0, 0.0, 0, 0, 0.0
+    for i in range(patch.top, patch.bottom + 1):
+        for j in range(patch.left, patch.right + 1):
+            u, v = j - patch.column, i - patch.row
+            x, y = _plan_offset(view, u, v)
+            distance = x * x + y * y
             value = float(counts[i, j])
-            if distance < cut * cut:
-                inner_sum, inner_c, inner_r, inner_n = inner_sum + value, inner_c + u, inner_r + v, inner_n + 1
+            if distance < core * core:
+                core_sum, core_c, core_r, core_n = core_sum + value, core_c + u, core_r + v, core_n + 1
                 continue
             in_ring = rim * rim < distance < outer * outer
-            if in_ring and blur < x0 + px < width - blur and blur < y0 + py < height - blur:
+            if in_ring and blur < view.x_mm + x < size[0] - blur and blur < view.y_mm + y < size[1] - blur:
                 basis = (1.0, u, v)
                 for a in range(3):
                     right[a] += basis[a] * value
@@ -255,34 +359,26 @@ def _contrast(
                         normal[a, b] += basis[a] * basis[b]
                 ring_n += 1
                 squares += value * value
-    if ring_n < 12 or inner_n < 3:
+    if ring_n < 12 or core_n < 3:
         return right, np.nan, np.nan
     plane = np.linalg.solve(normal, right)
     noise = float(np.sqrt(max(squares - float(plane @ right), 0.0) / (ring_n - 3)))
-    return plane, inner_sum / inner_n - (plane[0] + (plane[1] * inner_c + plane[2] * inner_r) / inner_n), noise
+    return plane, core_sum / core_n - (plane[0] + (plane[1] * core_c + plane[2] * core_r) / core_n), noise
 
 
 @numba.njit(cache=True, nogil=True)
 def _moments(
-    counts: Array,
-    patch: tuple[int, int, int, int],
-    centre: tuple[float, float],
-    jacobian: tuple[float, float, float, float],
-    rim: float,
-    plane: Array,
-    contrast: float,
+    counts: Array, patch: _Patch, view: _DiscView, plane: Array, contrast: float
 ) -> tuple[float, float, float]:
-    """Sum and first moments of the coverage of a disc, 1 within it and 0 around it."""
-    j00, j01, j10, j11 = jacobian
-    det = j00 * j11 - j01 * j10
+    """Sum and first moments (column, row) of the coverage of a disc, 1 within it and 0 around it."""
     total, moment_c, moment_r = 0.0, 0.0, 0.0
-    for i in range(patch[1], patch[3] + 1):
-        for j in range(patch[0], patch[2] + 1):
-            u, v = j - centre[0], i - centre[1]
-            px, py = (j11 * u - j01 * v) / det, (j00 * v - j10 * u) / det
-            if px * px + py * py < rim * rim:
-                part = (counts[i, j] - plane[0] - plane[1] * u - plane[2] * v) / contrast
-                # The disc has one temperature; the table around it a slope. Coverage is taken against their difference.
-                part /= 1 - (plane[1] * u + plane[2] * v) / contrast
-                total, moment_c, moment_r = total + part, moment_c + part * u, moment_r + part * v
+    for i in range(patch.top, patch.bottom + 1):
+        for j in range(patch.left, patch.right + 1):
+            u, v = j - patch.column, i - patch.row
+            x, y = _plan_offset(view, u, v)
+            if x * x + y * y < view.rim_mm * view.rim_mm:
+                coverage = (counts[i, j] - plane[0] - plane[1] * u - plane[2] * v) / contrast
+                # The disc has a uniform temperature, the table around it a gradient: the contrast varies over the disc.
+                coverage /= 1 - (plane[1] * u + plane[2] * v) / contrast
+                total, moment_c, moment_r = total + coverage, moment_c + coverage * u, moment_r + coverage * v
     return total, moment_c, moment_r

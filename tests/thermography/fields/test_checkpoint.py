@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene, record
-from thermography.fields import still as fields_module
-from thermography.fields import still as reduction_module
+from thermography.fields import still
 from thermography.fields.checkpoint import CheckpointError, recalibrate
 from thermography.fields.still import reduce_frames
 from thermography.radiometry.planck import override
-from thermography.registration.displacement import RegisteredFrom
+from thermography.registration.displacement import RegistrationSpan
 from thermography.registration.register import register
 
 BOUNDS = START + np.array([0, 4, 8, 11, 14]) * np.timedelta64(1, "s")
@@ -21,8 +20,8 @@ BOUNDS = START + np.array([0, 4, 8, 11, 14]) * np.timedelta64(1, "s")
 def film(tmp_path_factory):
     """Fourteen frames in four cycles with a knock in the third; registered on the first."""
     rng = np.random.default_rng(11)
-    still = Scene(disc_K=-4.0)
-    before, after = still.render(), replace(still, shift_px=(3.0, -2.0)).render()
+    table = Scene(disc_K=-4.0)
+    before, after = table.render(), replace(table, shift_px=(3.0, -2.0)).render()
     images = ((before if i < 9 else after) + 0.05 * i + rng.normal(0, 0.05, before.shape) for i in range(14))
     return record(tmp_path_factory.mktemp("film") / "a.seq", images), register(before, DISCS, grid=GRID)
 
@@ -53,7 +52,7 @@ def test_a_broken_run_goes_on_and_ends_the_same(film, tmp_path, monkeypatch):
         assert whole[name].values.tobytes() == again[name].values.tobytes(), name
     assert whole.attrs == again.attrs
     # A third run finds everything done but the last cycle's end, and reads no block.
-    monkeypatch.setattr(fields_module, "reduce_block", None)
+    monkeypatch.setattr(still, "reduce_block", None)
     third = reduce_frames(frames, registration, GRID, BOUNDS, block_s=2, checkpoint=tmp_path / "cp")
     assert whole["temperature"].values.tobytes() == third["temperature"].values.tobytes()
 
@@ -61,7 +60,7 @@ def test_a_broken_run_goes_on_and_ends_the_same(film, tmp_path, monkeypatch):
 def test_a_long_cycle_goes_on_within_it(film, tmp_path, monkeypatch):
     """One cycle over all frames: what was done of it is kept whenever it has grown by some frames."""
     frames, registration = film
-    monkeypatch.setattr(reduction_module, "KEPT_FRAMES", 4)
+    monkeypatch.setattr(still, "STORED_FRAMES", 4)
     whole = reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], block_s=2)
     done, seen = [], []
 
@@ -81,7 +80,7 @@ def test_a_long_cycle_goes_on_within_it(film, tmp_path, monkeypatch):
     # The sums of the whole cycle are there, though two runs added them up.
     third = recalibrate(
         tmp_path / "cp",
-        [RegisteredFrom(0, registration)] * 2,
+        [RegistrationSpan(0, registration)] * 2,
         GRID,
         1,
         lambda parameters: parameters,
@@ -110,7 +109,7 @@ def test_another_emissivity_needs_no_second_pass(film, tmp_path):
     frames = frames[:8]
     reduce_frames(frames, registration, GRID, BOUNDS[:3], checkpoint=tmp_path)
     dim = lambda parameters: override(parameters, emissivity=0.90)  # noqa: E731
-    again = recalibrate(tmp_path, [RegisteredFrom(0, registration)], GRID, 2, dim)
+    again = recalibrate(tmp_path, [RegistrationSpan(0, registration)], GRID, 2, dim)
     direct = reduce_frames(frames, registration, GRID, BOUNDS[:3], override=lambda frame: dim(frame.parameters))
     assert SC660.emissivity != 0.90
     # Sums over a cycle instead of a block: second order in both, float32 in the product.
@@ -122,4 +121,4 @@ def test_another_emissivity_needs_no_second_pass(film, tmp_path):
 def test_an_empty_folder_is_refused(film, tmp_path):
     _, registration = film
     with pytest.raises(CheckpointError, match="holds no finished cycle; reduce the frames first"):
-        recalibrate(tmp_path, [RegisteredFrom(0, registration)], GRID, 2, lambda parameters: parameters)
+        recalibrate(tmp_path, [RegistrationSpan(0, registration)], GRID, 2, lambda parameters: parameters)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from thermography.fields.hotspots import detect_hotspots, follow_hotspots, isotherms
+from thermography.fields.hotspots import detect_hotspots
 
 X = np.arange(140) * 5.0 + 2.5
 Y = np.arange(36) * 5.0 + 2.5
@@ -52,27 +52,6 @@ def test_masked_discs_neither_make_nor_break_hotspots(rng):
     field[4:8, 100:104] = np.nan
     (spot,) = detect_hotspots(field)
     assert np.hypot(spot.x_mm - 300, spot.y_mm - 90) < 15
-
-
-def test_hotspots_keep_their_identity_over_cycles(rng):
-    cycles = [
-        plane((200.0 + 4 * n, 90.0, 0.3 * n, 30.0), (550.0, 60.0, 1.5 if n > 4 else 0.0, 25.0))
-        + rng.normal(0, 0.014, (36, 140))
-        for n in range(1, 10)
-    ]
-    followed = follow_hotspots(xr.concat(cycles, "cycle").assign_coords(cycle=np.arange(1, 10)))
-    assert followed.sizes["hotspot"] == 2
-    moving, late = followed.isel(hotspot=0), followed.isel(hotspot=1)
-    np.testing.assert_allclose(moving["x"], 200 + 4 * np.arange(1, 10), atol=4)
-    np.testing.assert_allclose(moving["peak_rise"], 0.3 * np.arange(1, 10), atol=0.05)
-    assert np.isfinite(late["x"].values).tolist() == [False] * 4 + [True] * 5
-
-
-def test_isotherm_of_a_peak_is_a_circle():
-    lines = isotherms(plane((350.0, 90.0, 2.0, 30.0)), [1.0])[1.0]
-    assert len(lines) == 1
-    radius = np.hypot(*(lines[0] - (350.0, 90.0)).T)
-    np.testing.assert_allclose(radius, 30 * np.sqrt(2 * np.log(2)), atol=0.3)
 
 
 def test_a_stack_is_refused():

@@ -12,8 +12,8 @@ import pytest
 from tests.thermography.plan_scene import DISCS, GRID, START, Scene, cell_truth, record
 from thermography.fields import moving
 from thermography.fields.checkpoint import CheckpointError
+from thermography.fields.inputs import ReductionError
 from thermography.fields.moving import reduce_moving_frames
-from thermography.fields.still import FieldError
 from thermography.registration.register import register
 
 DIRECTION = (-1, 0)
@@ -77,9 +77,9 @@ def test_frames_without_the_table_are_named(travel, tmp_path):
     assert json.loads(fields.attrs["frames_unplaced"]) == ["a.seq#1"]
     assert fields["table_discs"].values.tolist()[1] == 0
     assert np.isnan(fields["table_position"].values[1])
-    with pytest.raises(FieldError, match="the table is found in no frame; check the fiducials"):
+    with pytest.raises(ReductionError, match="the table is found in no frame; check the fiducials"):
         reduce_moving_frames(frames[1:], registration, GRID, edges(0, 2), direction=DIRECTION)
-    with pytest.raises(FieldError, match="no frame in which the table is found lies within a cycle"):
+    with pytest.raises(ReductionError, match="no frame in which the table is found lies within a cycle"):
         reduce_moving_frames(frames[:1], registration, GRID, edges(5, 7), direction=DIRECTION)
 
 

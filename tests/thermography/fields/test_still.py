@@ -8,10 +8,11 @@ import pytest
 
 from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene, cell_truth, record, smooth_field
 from thermography.contract import FIELDS
-from thermography.fields.still import FieldError, reduce_frames
+from thermography.fields.inputs import ReductionError
+from thermography.fields.still import reduce_frames
 from thermography.radiometry.averaging import Accumulator, mean_temperature
 from thermography.radiometry.planck import calibrate, override
-from thermography.registration.displacement import RegisteredFrom
+from thermography.registration.displacement import RegistrationSpan
 from thermography.registration.plan import mask_discs
 from thermography.registration.register import register
 
@@ -142,7 +143,7 @@ def test_knocked_camera_keeps_the_field_in_place(scene, tmp_path):
     knocked = replace(still, shift_px=(3.0, -2.0))
     after = knocked.render()
     frames = record(tmp_path / "a.seq", [image, image, after, after])
-    spans = [RegisteredFrom(0, registration), RegisteredFrom(2, register(after, DISCS, grid=GRID))]
+    spans = [RegistrationSpan(0, registration), RegistrationSpan(2, register(after, DISCS, grid=GRID))]
     fields = reduce_frames(frames, spans, GRID, edges(0, 1, 3, 4))
     assert (fields["count"].max(("x", "y")) == [1, 2, 1]).all()
     assert (fields["quality_flag"].values[1] & 4 == 4).all()
@@ -190,8 +191,8 @@ def test_faults_are_named(scene, tmp_path, change, message):
     if change.get("references") == "small":
         arguments["references"] = record(tmp_path / "b.seq", [image[:8, :8]])
     if change.get("registration") == "late":
-        arguments["registration"] = [RegisteredFrom(1, registration)]
-    with pytest.raises(FieldError, match=message):
+        arguments["registration"] = [RegistrationSpan(1, registration)]
+    with pytest.raises(ReductionError, match=message):
         reduce_frames(arguments.pop("references"), arguments.pop("registration"), GRID, **arguments)
 
 

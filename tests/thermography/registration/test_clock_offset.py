@@ -54,7 +54,7 @@ def test_commanded_position_stands_reads_and_goes_on():
     at = np.array([-1.0, 0.0, 1.0, 4.0, 5.0, 6.0, 7.0])
     path = commanded_position(at, np.array([0.0, 6.0]), np.array([0.0, 20.0]), FEED_MM_S)
     np.testing.assert_allclose(path, [np.nan, 0, 5, 20, 20, 20, np.nan])
-    on_arrival = commanded_position(at, np.array([0.0, 6.0]), np.array([0.0, 20.0]), FEED_MM_S, reading_at=0.0)
+    on_arrival = commanded_position(at, np.array([0.0, 6.0]), np.array([0.0, 20.0]), FEED_MM_S, reading_phase=0.0)
     np.testing.assert_allclose(on_arrival, [np.nan, 0, 0, 10, 15, 20, np.nan])
 
 

@@ -1,4 +1,4 @@
-"""Shifts found from the picture of the table alone."""
+"""Shifts of known size, measured on the fiducials and on the image of the table alone."""
 
 import json
 from dataclasses import replace
@@ -6,10 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.thermography.plan_scene import DISCS, GRID, START, Scene, cell_truth, record
+from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene, cell_truth, record
+from thermography.fields.resampling import plan_window
 from thermography.fields.still import reduce_frames
-from thermography.registration.displacement import image_shift, shifted
-from thermography.registration.register import register
+from thermography.radiometry.planck import counts_from_temperature
+from thermography.registration.displacement import (
+    fiducial_shift,
+    image_shift,
+    monitor_fiducials,
+    register_after_knock,
+    shift_registration,
+)
+from thermography.registration.register import RegistrationError, register
 
 BARE = Scene(discs=())
 
@@ -34,7 +42,7 @@ def test_pictures_that_do_not_agree_give_no_shift(rng, registration):
 
 def test_shifted_registration_puts_the_plan_where_the_picture_went(registration):
     moved = replace(Scene(disc_K=-4.0), shift_px=(3.0, -2.0))
-    assert moved.registration_rms_mm(shifted(registration, np.array([3.0, -2.0]))) < 0.03
+    assert moved.registration_rms_mm(shift_registration(registration, np.array([3.0, -2.0]))) < 0.03
 
 
 def test_knock_while_the_discs_have_no_contrast_is_found_and_mended(rng, registration, tmp_path):
@@ -47,3 +55,34 @@ def test_knock_while_the_discs_have_no_contrast_is_found_and_mended(rng, registr
     assert knock["shift_px"] == pytest.approx([3.0, -2.0], abs=0.1)
     error = fields["temperature"].values[1] - cell_truth()
     assert np.sqrt(np.nanmean(error**2)) < 0.01
+
+
+def test_monitor_and_located_fiducials_show_the_shift_of_each_frame(rng, registration):
+    shifts = [(0.0, 0.0), (0.4, -0.3), (-0.7, 0.2)]
+    frames = np.stack([replace(Scene(disc_K=-4.0), shift_px=shift).render(rng) for shift in shifts])
+    rows, columns = plan_window(registration, GRID)
+    counts = np.round(counts_from_temperature(frames, SC660)).astype(np.uint16)[:, rows, columns]
+    monitor = monitor_fiducials(registration, GRID, (rows, columns))
+    # Counts of 6 mK: 50 mK of noise are 8 counts. The monitor is linear for shifts well below its margin of some pixels.
+    np.testing.assert_allclose(monitor.shifts(counts, 8.0), shifts, atol=0.05)
+    for frame, shift in zip(frames, shifts, strict=True):
+        np.testing.assert_allclose(fiducial_shift(frame, registration, GRID), shift, atol=0.02)
+
+
+def test_discs_without_contrast_show_no_shift(rng, registration):
+    frame = BARE.render(rng)
+    rows, columns = plan_window(registration, GRID)
+    counts = np.round(counts_from_temperature(frame, SC660)).astype(np.uint16)[None, rows, columns]
+    assert np.isnan(monitor_fiducials(registration, GRID, (rows, columns)).shifts(counts, 8.0)).all()
+    assert np.isnan(fiducial_shift(frame, registration, GRID)).all()
+
+
+def test_registration_after_a_knock_is_that_of_the_moved_table_or_names_the_frame(rng, registration):
+    moved = replace(Scene(disc_K=-4.0), shift_px=(3.0, -2.0))
+    shift = np.array([3.0, -2.0])
+    again = register_after_knock(moved.render(rng), registration, shift, GRID, frame_name="a.seq#7")
+    assert moved.registration_rms_mm(again) < 0.05
+    with pytest.raises(
+        RegistrationError, match=r"a\.seq#7: the fiducials moved by \(3\.0, -2\.0\) px and the plan is not"
+    ):
+        register_after_knock(BARE.render(rng), registration, shift, GRID, frame_name="a.seq#7")

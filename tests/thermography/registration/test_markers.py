@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.thermography.plan_scene import DISCS, GRID, Scene
-from thermography.registration.markers import DICTIONARY, MarkerError, find_markers, identify
-from thermography.registration.plan import Fiducial, FiducialError, read_fiducials
+from thermography.registration.markers import DICTIONARY, MarkerError, detect_markers, identify_plan
+from thermography.registration.plan import Fiducial
 from thermography.registration.register import register
 
 #: Four markers of 36 mm, about 28 px, within circles of 52 mm.
@@ -41,7 +41,7 @@ def with_markers(image, numbers, contrast_K):
 @pytest.mark.parametrize("contrast_K", [-4.0, 4.0])
 def test_markers_are_found_dark_and_bright(contrast_K, rng):
     frame = with_markers(SCENE.render(rng), (7, 11, 23, 42), contrast_K)
-    found = find_markers(frame)
+    found = detect_markers(frame)
     assert set(found) == {7, 11, 23, 42}
     for one in MARKERS:
         # Good enough for a hint, which may be wrong by 20 px.
@@ -50,12 +50,12 @@ def test_markers_are_found_dark_and_bright(contrast_K, rng):
 
 def test_hints_by_markers_locate_the_plan_as_the_discs_do(rng):
     frame = with_markers(SCENE.render(rng), (7, 11, 23, 42), -4.0)
-    hinted = identify(frame, [*DISCS, *MARKERS])
+    hinted = identify_plan(frame, [*DISCS, *MARKERS])
     places = SCENE.to_pixels(np.array([(disc.x_mm, disc.y_mm) for disc in DISCS]))
     assert [one.name for one in hinted] == [disc.name for disc in DISCS]
     assert max(np.hypot(*(np.array(one.hint_px) - place)) for one, place in zip(hinted, places, strict=True)) < 20
     own = replace(DISCS[0], column_px=1.0, row_px=2.0)
-    assert identify(frame, [own, *DISCS[1:], *MARKERS])[0].hint_px == (1.0, 2.0)
+    assert identify_plan(frame, [own, *DISCS[1:], *MARKERS])[0].hint_px == (1.0, 2.0)
     registration = register(frame, [*DISCS, *MARKERS], grid=GRID)
     # As accurate as by discs alone: the markers take no part.
     assert SCENE.registration_rms_mm(registration) < 0.03
@@ -74,20 +74,5 @@ def test_another_table_is_refused(rng):
 
 def test_without_markers_in_view_the_discs_do_alone(rng):
     frame = SCENE.render(rng)
-    assert identify(frame, [*DISCS, *MARKERS]) == DISCS
-    assert identify(frame, DISCS) == DISCS
-
-
-def test_marker_column_of_the_fiducial_file(tmp_path):
-    path = tmp_path / "fiducials.csv"
-    rows = [f"F{i},{100 * i},20,16," for i in range(1, 5)]
-    path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,marker", *rows, "M7,120,40,52,7"]))
-    assert [one.marker for one in read_fiducials(path)] == [None] * 4 + [7]
-    path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,marker", *rows, "M7,120,40,52,50"]))
-    with pytest.raises(
-        FiducialError, match=r"fiducials\.csv:6: marker = '50'; give the number of an ArUco marker, 0 to 49"
-    ):
-        read_fiducials(path)
-    path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,marker", *rows[1:], "M7,120,40,52,7"]))
-    with pytest.raises(FiducialError, match="lists 3 fiducials; a plan is located by at least 4"):
-        read_fiducials(path)
+    assert identify_plan(frame, [*DISCS, *MARKERS]) == DISCS
+    assert identify_plan(frame, DISCS) == DISCS

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tests.thermography.plan_scene import DISCS, FOCAL_PX, GRID, Scene
-from thermography.registration.plan import Fiducial, FiducialError, PlanGrid, read_fiducials
-from thermography.registration.projection import Projection, Sightings, fit_homography, fit_projection, leave_one_out
+from thermography.registration.plan import Fiducial
 from thermography.registration.register import Lens, RegistrationError, register, register_points
 
 
@@ -45,23 +44,6 @@ def test_ladder_stays_on_the_lowest_rung_that_is_enough(rng):
     assert straight.model == "homography"
     # The rendered discs are made of 16 rays per pixel, whose 0.01 px the richest rung may take for tangential distortion.
     assert bent.model.startswith("homography+k1")
-
-
-@pytest.mark.parametrize("coefficients", [0, 1, 4])
-def test_leave_one_out_equals_leaving_one_out(rng, coefficients):
-    scene = Scene(k1=-0.3)
-    plan = np.array([(d.x_mm, d.y_mm) for d in DISCS], float)
-    seen = Sightings(
-        scene.to_pixels(plan) + rng.normal(0, 0.05, plan.shape), plan, np.full(12, 8.0), rng.uniform(0.02, 0.1, 12)
-    )
-    ideal = Projection(np.eye(3), np.zeros(4), FOCAL_PX, (319.5, 239.5))
-    projection = fit_projection(seen, fit_projection(seen, fit_homography(seen, ideal), coefficients), coefficients)
-    refitted = [
-        np.linalg.norm(seen.plan_error(fit_projection(seen.without(i), projection, coefficients))[i])
-        for i in range(len(DISCS))
-    ]
-    # The homography alone leaves 3 px of distortion, over which the projection is not quite linear.
-    np.testing.assert_allclose(leave_one_out(seen, projection, coefficients), refitted, rtol=0.05, atol=0.01)
 
 
 def test_calibrated_lens_is_taken_as_given(rng):
@@ -143,28 +125,3 @@ def test_points_on_a_line_are_refused():
     line = [Fiducial(f"L{i}", 50.0 + 100 * i, 90.0, 16.0) for i in range(5)]
     with pytest.raises(RegistrationError, match="lie on a line or on one spot; spread at least four"):
         register_points({d.name: (d.x_mm, 200.0) for d in line}, line, (480, 640))
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("name,x_mm,y_mm\nF1,1,2\n", r":1: no column diameter_mm; the first line must read"),
-        ("name,x_mm,y_mm,diameter_mm\nF1,one,2,16\n", r":2: x_mm = 'one' is not a number"),
-        ("name,x_mm,y_mm,diameter_mm\n,1,2,16\n", r":2: name is empty"),
-        ("name,x_mm,y_mm,diameter_mm\nF1,1,2,-16\n", r":2: diameter_mm = -16; a disc has a positive diameter"),
-        ("name,x_mm,y_mm,diameter_mm,column_px,row_px\nF1,1,2,16,5,\n", r":2: F1 has one of column_px, row_px"),
-        ("name,x_mm,y_mm,diameter_mm\nF1,1,2,16\n", r"lists 1 fiducials; a plan is located by at least 4"),
-    ],
-)
-def test_faults_of_the_fiducial_file_name_their_line(tmp_path, text, message):
-    path = tmp_path / "fiducials.csv"
-    path.write_text(text)
-    with pytest.raises(FiducialError, match=message):
-        read_fiducials(path)
-
-
-def test_plan_must_be_whole_cells():
-    with pytest.raises(ValueError, match=r"width_mm = 702 mm is not a whole number of cells of 5 mm"):
-        PlanGrid(702, 180, 5)
-    with pytest.raises(ValueError, match=r"cell_size_mm = -5 mm; the plan needs a positive length"):
-        PlanGrid(700, 180, -5)

@@ -1,0 +1,131 @@
+"""Cycles assembled from known parts, the noise of images, and the conventions of the written fields by the official checker."""
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from tests.thermography.plan_scene import DISCS, GRID, START, Scene, record
+from thermography.fields.cycle_fields import CyclePart, assemble_fields, noise_of_differences, pixel_noise
+from thermography.fields.moving import reduce_moving_frames
+from thermography.fields.still import reduce_frames
+from thermography.registration.plan import PlanGrid
+from thermography.registration.register import register
+
+
+@pytest.fixture(scope="module")
+def products(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cf")
+    image = Scene(disc_K=-4.0).render()
+    registration = register(image, DISCS, grid=GRID)
+    frames = record(folder / "a.seq", [image, image + 0.5, image + 1.0])
+    bounds = START + np.arange(4) * np.timedelta64(1, "s")
+    paths = {}
+    for name, fields in {
+        "still": reduce_frames(frames, registration, GRID, bounds),
+        "moving": reduce_moving_frames(frames, registration, GRID, bounds, direction=(-1, 0)),
+    }.items():
+        paths[name] = folder / f"{name}.nc"
+        fields.to_netcdf(paths[name], engine="h5netcdf")
+    return paths
+
+
+# The checker opens its own tables and sockets and leaves them to the garbage collector.
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["still", "moving"])
+def test_official_checker_finds_nothing(products, tmp_path, name):
+    runner = pytest.importorskip("compliance_checker.runner")
+    runner.CheckSuite.load_all_available_checkers()
+    report = tmp_path / "report.json"
+    _, errors = runner.ComplianceChecker.run_checker(
+        str(products[name]),
+        ["cf:1.11"],
+        verbose=0,
+        criteria="strict",
+        output_filename=str(report),
+        output_format="json",
+    )
+    checked = json.loads(report.read_text())["cf:1.11"]
+    messages = [
+        f"{item['name']}: {message}"
+        for level in ("high_priorities", "medium_priorities", "low_priorities")
+        for item in checked[level]
+        for message in item["msgs"]
+    ]
+    assert messages == []
+    assert not errors
+
+
+def test_fields_come_back_equal_and_labelled(products):
+    with xr.open_dataset(products["still"], engine="h5netcdf") as fields:
+        assert fields["temperature"].attrs["standard_name"] == "surface_temperature"
+        assert fields["x"].attrs["standard_name"] == "projection_x_coordinate"
+        assert fields["cycle_time"].dtype.kind == "M"
+        assert float(fields["temperature_rise"].isel(cycle=2).median()) == pytest.approx(1.0, abs=0.01)
+
+
+def part(cycle, mean, *, span=0, frames=4, start_s=0.0, noise_K=0.0):
+    grid = np.full((4, 6), float(mean)) if np.isscalar(mean) else mean
+    return CyclePart(
+        cycle, span, frames=frames, first_time=START + np.timedelta64(round(1e9 * start_s), "ns"), seconds=0.0, mean=grid,
+        spread=np.full((4, 6), 0.1), noise_variance=np.full((4, 6), noise_K**2), fell_back=np.zeros((4, 6), bool),
+        count=np.where(np.isfinite(grid), frames, 0),
+    )  # fmt: skip
+
+
+PLAN = PlanGrid(30, 20, 5)
+SURE = np.zeros((4, 6, 2, 2))
+WHOLE = np.ones((4, 6))
+
+
+def test_rise_rate_and_noise_of_three_cycles():
+    parts = [part(0, 20.0, noise_K=0.03), part(1, 21.0, start_s=1800, noise_K=0.04), part(3, 24.0, start_s=7200)]
+    fields = assemble_fields(parts, 4, PLAN, [SURE], [WHOLE])
+    middle = fields.isel(y=2, x=3)
+    np.testing.assert_allclose(middle["temperature"], [20, 21, np.nan, 24])
+    np.testing.assert_allclose(middle["temperature_rise"], [0, 1, np.nan, 4])
+    # Second-order differences over 0.5 h and 1.5 h: the parabola through the three points.
+    slopes = np.polynomial.Polynomial.fit([0, 0.5, 2], [20, 21, 24], 2).deriv()
+    assert float(middle["temperature_rate"][1]) == pytest.approx(slopes(0.5), rel=1e-6)
+    np.testing.assert_allclose(middle["temperature_u"], [0.03, 0.04, np.nan, 0.0], rtol=1e-6)
+    # The first cycle's noise is in every rise but its own.
+    np.testing.assert_allclose(middle["temperature_rise_u"], [0.0, 0.05, np.nan, 0.03], rtol=1e-6)
+    assert middle["count"].values.tolist() == [4, 4, 0, 4]
+    assert middle["quality_flag"].values.tolist() == [0, 0, 16, 0]
+
+
+def test_position_uncertainty_enters_through_the_gradient():
+    ramp = np.broadcast_to(20 + 0.1 * PLAN.x_mm, (4, 6)).copy()
+    covariance = np.zeros((4, 6, 2, 2))
+    covariance[..., 0, 0], covariance[..., 1, 1] = 0.2**2, 0.5**2
+    fields = assemble_fields([part(0, ramp)], 1, PLAN, [covariance], [WHOLE])
+    # 0.1 K/mm along x only, with 0.2 mm; the outermost cells are smoothed.
+    assert float(fields["temperature_u"][0, 2, 2]) == pytest.approx(0.02, rel=0.05)
+    assert float(fields["position_u"][2, 2]) == pytest.approx(np.hypot(0.2, 0.5), rel=1e-6)
+
+
+def test_a_cycle_under_two_registrations_is_weighted_by_frames():
+    other = np.full((4, 6), 22.0)
+    other[0, 0] = np.nan
+    parts = [part(0, 20.0, frames=3, noise_K=0.1), part(0, other, span=1, frames=1, start_s=8, noise_K=0.2)]
+    fields = assemble_fields(parts, 1, PLAN, [SURE, SURE], [WHOLE, 0.9 * WHOLE])
+    assert float(fields["temperature"][0, 1, 1]) == pytest.approx(20.5)
+    assert float(fields["temperature"][0, 0, 0]) == pytest.approx(20.0)
+    assert float(fields["temperature_u"][0, 1, 1]) == pytest.approx(np.sqrt((0.75 * 0.1) ** 2 + (0.25 * 0.2) ** 2))
+    assert int(fields["quality_flag"][0, 1, 1]) == 4
+    assert fields["cycle_time"].values[0] == START + np.timedelta64(2, "s")
+
+
+@pytest.mark.parametrize("shape", [(100, 120), (480, 640)])
+def test_noise_of_an_image_ignores_its_smooth_field(rng, shape):
+    row, column = np.mgrid[: shape[0], : shape[1]]
+    smooth = 20 + 0.05 * column - 0.03 * row + 1e-4 * column * row
+    image, used = smooth + rng.normal(0, 0.05, shape), np.ones(shape, bool)
+    # 10,000 pixels and more give it to 1 %.
+    assert pixel_noise(image, used) == pytest.approx(0.05, rel=0.03)
+    used[::4] = False
+    assert np.isnan(pixel_noise(image, used & False))
+    interior = np.zeros(shape, bool)
+    interior[10:90, 10:110] = True
+    assert noise_of_differences(image, interior) == pytest.approx(0.05, rel=0.05)

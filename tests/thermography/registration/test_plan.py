@@ -1,0 +1,70 @@
+"""The plan's grid and its fiducials: exact geometry, and faults of the fiducial file that name their line."""
+
+import numpy as np
+import pytest
+
+from thermography.registration.plan import Fiducial, FiducialError, PlanGrid, mask_discs, read_fiducials
+
+
+def test_cells_fill_the_plan_from_its_corner():
+    grid = PlanGrid(30, 20, 5)
+    assert grid.shape == (4, 6)
+    assert grid.x_mm.tolist() == [2.5, 7.5, 12.5, 17.5, 22.5, 27.5]
+    assert grid.centres_mm[1, 2].tolist() == [12.5, 7.5]
+
+
+def test_outline_goes_around_the_plan_once():
+    outline = PlanGrid(30, 20, 5).outline_mm(3)
+    corners = outline[[0, 2, 3, 5, 6, 8, 9, 11]].tolist()
+    assert corners == [[0, 0], [30, 0], [30, 0], [30, 20], [30, 20], [0, 20], [0, 20], [0, 0]]
+    assert outline[[1, 4, 7, 10]].tolist() == [[15, 0], [30, 10], [15, 20], [0, 10]]
+
+
+def test_margins_of_plan_and_discs():
+    grid, disc = PlanGrid(30, 20, 5), Fiducial("F1", 10, 10, 8)
+    points = np.array([(0.0, 0.0), (2.0, 10.0), (29.0, 10.0), (31.0, 10.0)])
+    assert grid.contains(points).tolist() == [True, True, True, False]
+    assert grid.contains(points, margin_mm=2.0).tolist() == [False, True, False, False]
+    around = np.array([(13.9, 10.0), (14.1, 10.0), (16.1, 10.0)])
+    assert mask_discs(around, [disc], margin_mm=0.0).tolist() == [True, False, False]
+    assert mask_discs(around, [disc], margin_mm=np.array([0.0, 2.0, 2.0])).tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name,x_mm,y_mm\nF1,1,2\n", r":1: no column diameter_mm; the first line must read"),
+        ("name,x_mm,y_mm,diameter_mm\nF1,one,2,16\n", r":2: x_mm = 'one' is not a number"),
+        ("name,x_mm,y_mm,diameter_mm\n,1,2,16\n", r":2: name is empty"),
+        ("name,x_mm,y_mm,diameter_mm\nF1,1,2,-16\n", r":2: diameter_mm = -16; a disc has a positive diameter"),
+        ("name,x_mm,y_mm,diameter_mm,column_px,row_px\nF1,1,2,16,5,\n", r":2: F1 has one of column_px, row_px"),
+        ("name,x_mm,y_mm,diameter_mm\nF1,1,2,16\n", r"lists 1 fiducials; a plan is located by at least 4"),
+    ],
+)
+def test_faults_of_the_fiducial_file_name_their_line(tmp_path, text, message):
+    path = tmp_path / "fiducials.csv"
+    path.write_text(text)
+    with pytest.raises(FiducialError, match=message):
+        read_fiducials(path)
+
+
+def test_plan_must_be_whole_cells():
+    with pytest.raises(ValueError, match=r"width_mm = 702 mm is not a whole number of cells of 5 mm"):
+        PlanGrid(702, 180, 5)
+    with pytest.raises(ValueError, match=r"cell_size_mm = -5 mm; the plan needs a positive length"):
+        PlanGrid(700, 180, -5)
+
+
+def test_marker_column_of_the_fiducial_file(tmp_path):
+    path = tmp_path / "fiducials.csv"
+    rows = [f"F{i},{100 * i},20,16," for i in range(1, 5)]
+    path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,marker", *rows, "M7,120,40,52,7"]))
+    assert [one.marker for one in read_fiducials(path)] == [None] * 4 + [7]
+    path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,marker", *rows, "M7,120,40,52,50"]))
+    with pytest.raises(
+        FiducialError, match=r"fiducials\.csv:6: marker = '50'; give the number of an ArUco marker, 0 to 49"
+    ):
+        read_fiducials(path)
+    path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,marker", *rows[1:], "M7,120,40,52,7"]))
+    with pytest.raises(FiducialError, match="lists 3 fiducials; a plan is located by at least 4"):
+        read_fiducials(path)

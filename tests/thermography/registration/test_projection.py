@@ -1,0 +1,103 @@
+"""The projection against OpenCV and against conics; its fit against refits."""
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.thermography.plan_scene import DISCS, FOCAL_PX, Scene
+from thermography.errors import ThermographyError
+from thermography.registration.projection import (
+    DiscObservations,
+    Projection,
+    fit_homography,
+    fit_projection,
+    leave_one_out_mm,
+    parameter_covariance,
+    parameter_jacobian,
+    select_lens_model,
+)
+
+PLAN = np.array([(disc.x_mm, disc.y_mm) for disc in DISCS], float)
+BENT = Projection(Scene().plan_to_pixel, np.array([-1.2, 0.4, 1e-3, -2e-3]), FOCAL_PX, (319.5, 239.5))
+
+
+def test_distortion_is_that_of_opencv_and_can_be_undone():
+    # OpenCV takes three-dimensional points; with an identity pose and z = 1 they are the normalised coordinates.
+    undistorted = cv2.perspectiveTransform(PLAN[None], BENT.plan_to_sensor)[0]
+    normalised = np.column_stack([(undistorted - BENT.principal_point_px) / FOCAL_PX, np.ones(len(PLAN))])
+    matrix = np.array([[FOCAL_PX, 0, 319.5], [0, FOCAL_PX, 239.5], [0, 0, 1]])
+    peer, _ = cv2.projectPoints(normalised, np.zeros(3), np.zeros(3), matrix, BENT.distortion)
+    np.testing.assert_allclose(BENT.to_sensor(PLAN), peer[:, 0], atol=1e-9)
+    np.testing.assert_allclose(BENT.undistort(BENT.to_sensor(PLAN)), undistorted, atol=1e-7)
+    np.testing.assert_allclose(BENT.to_plan(BENT.to_sensor(PLAN)), PLAN, atol=1e-7)
+
+
+def test_centroid_of_a_disc_is_the_centre_of_its_conic():
+    """The image of a circle under a homography is an ellipse; its centre follows from the conic matrix."""
+    tilted = Projection(
+        np.array([[1.0, 0.1, 20], [0.05, 0.9, 30], [4e-4, 2e-4, 1]]), np.zeros(4), 640.0, (319.5, 239.5)
+    )
+    x, y, radius = 300.0, 120.0, 40.0
+    circle = np.array([[1, 0, -x], [0, 1, -y], [-x, -y, x * x + y * y - radius**2]])
+    inverse = np.linalg.inv(tilted.plan_to_sensor)
+    conic = inverse.T @ circle @ inverse
+    centre = np.linalg.solve(conic[:2, :2], -conic[:2, 2])
+    shift = centre - tilted.to_sensor(np.array([x, y]))
+    assert np.hypot(*shift) > 0.3
+    centroid = tilted.disc_centroids(np.array([[x, y]]), np.array([radius]))[0]
+    # The inscribed polygon of 24 corners has (2 + cos 15 deg) / 3 of the circle's second moment, to which the shift is proportional.
+    share = (2 + np.cos(2 * np.pi / 24)) / 3
+    np.testing.assert_allclose(centroid, centre - (1 - share) * shift, atol=1e-3 * np.hypot(*shift))
+
+
+def test_exact_points_give_the_exact_projection_and_the_simplest_model():
+    true = Projection(Scene().plan_to_pixel, np.zeros(4), 640.0, (319.5, 239.5))
+    radii = np.full(len(PLAN), 8.0)
+    observations = DiscObservations(true.disc_centroids(PLAN, radii), PLAN, radii, np.full(len(PLAN), 0.01))
+    fitted, coefficients = select_lens_model(observations, fit_homography(observations, true))
+    assert coefficients == 0
+    np.testing.assert_allclose(fitted.to_sensor(PLAN), true.to_sensor(PLAN), atol=1e-6)
+    bent = DiscObservations(BENT.disc_centroids(PLAN, radii), PLAN, radii, np.full(len(PLAN), 0.01))
+    fitted, coefficients = select_lens_model(bent, fit_homography(bent, true))
+    assert coefficients == 4
+    np.testing.assert_allclose(fitted.to_sensor(PLAN), BENT.to_sensor(PLAN), atol=1e-3)
+
+
+def test_covariance_is_that_of_repeated_observations(rng):
+    true = Projection(Scene().plan_to_pixel, np.zeros(4), 640.0, (319.5, 239.5))
+    radii, u_px = np.full(len(PLAN), 8.0), rng.uniform(0.02, 0.1, len(PLAN))
+    exact, places = true.disc_centroids(PLAN, radii), np.array([(350.0, 90.0), (20.0, 20.0)])
+    observed = [exact + rng.normal(0, u_px[:, None], PLAN.shape) for _ in range(200)]
+    fits = [fit_projection(DiscObservations(points, PLAN, radii, u_px), true, 0) for points in observed]
+    scatter = np.std([fit.to_sensor(places) for fit in fits], axis=0)
+    covariance = parameter_covariance(DiscObservations(exact, PLAN, radii, u_px), true, 0)
+    derivative = parameter_jacobian(true, PLAN, 0)(places)
+    stated = np.sqrt(np.diagonal(derivative @ covariance @ np.swapaxes(derivative, 1, 2), axis1=1, axis2=2))
+    # 200 fits give a standard deviation to 5 %.
+    np.testing.assert_allclose(scatter, stated, rtol=0.2)
+
+
+def test_discs_on_a_line_determine_no_homography():
+    line = np.column_stack([np.arange(5) * 100.0, np.full(5, 90.0)])
+    observations = DiscObservations(line, line, np.full(5, 8.0), np.full(5, 0.01))
+    with pytest.raises(ThermographyError, match="lie on a line or on one spot; spread at least four"):
+        fit_homography(observations, Projection(np.eye(3), np.zeros(4), 640.0, (319.5, 239.5)))
+
+
+@pytest.mark.parametrize("coefficients", [0, 1, 4])
+def test_leave_one_out_equals_leaving_one_out(rng, coefficients):
+    scene = Scene(k1=-0.3)
+    plan = np.array([(d.x_mm, d.y_mm) for d in DISCS], float)
+    observations = DiscObservations(
+        scene.to_pixels(plan) + rng.normal(0, 0.05, plan.shape), plan, np.full(12, 8.0), rng.uniform(0.02, 0.1, 12)
+    )
+    ideal = Projection(np.eye(3), np.zeros(4), FOCAL_PX, (319.5, 239.5))
+    projection = fit_projection(
+        observations, fit_projection(observations, fit_homography(observations, ideal), coefficients), coefficients
+    )
+    refitted = [
+        np.linalg.norm(observations.residuals_mm(fit_projection(observations.without(i), projection, coefficients))[i])
+        for i in range(len(DISCS))
+    ]
+    # The homography alone leaves 3 px of distortion, over which the projection is not quite linear.
+    np.testing.assert_allclose(leave_one_out_mm(observations, projection, coefficients), refitted, rtol=0.05, atol=0.01)
