@@ -21,6 +21,8 @@ SOURCES = ((5, 6), (17, 12), (9, 26))  # row, column
 TAU_S = (1200.0, 4500.0, 9000.0)
 HALO_CELLS = 5.0
 START = np.datetime64("2026-03-09T08:00:00", "ns")
+#: Plain correlation beyond this is "significant" at 0.05 for 100 independent values.
+NAIVE_LIMIT = 0.1966
 
 
 @dataclass(frozen=True)

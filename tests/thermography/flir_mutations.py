@@ -7,8 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
+from thermography.io.flir import index_frames, read_frame
 from thermography.io.flir_writer import write_jpeg, write_sequence
-from thermography.io.frame import CalibratedRange, CameraIdentity, CameraParameters, CameraSettings, Frame
+from thermography.io.frame import (
+    CalibratedRange,
+    CameraIdentity,
+    CameraParameters,
+    CameraSettings,
+    FlirFormatError,
+    Frame,
+)
 
 #: The constants of an SC660, as its files store them (float32).
 PARAMETERS = CameraParameters(
@@ -118,3 +126,39 @@ def mutate(data: bytes, rng: np.random.Generator) -> bytes:
                 source = int(rng.integers(len(changed)))
                 changed[at : at + 64] = changed[source : source + int(rng.integers(1, 128))]
     return bytes(changed)
+
+
+def read_everything(path: Path) -> tuple[int, int]:
+    """Read a file in both ways; return how many frames were read and how many refused."""
+    read = refused = 0
+    try:
+        assert read_frame(path).counts.ndim == 2
+        read += 1
+    except FlirFormatError as error:
+        assert str(path) in str(error) and "at 0x" in str(error) and "expected" in str(error), str(error)
+        refused += 1
+    frames, rejected = index_frames([path])
+    refused += len(rejected)
+    assert all(str(path) in each.reason for each in rejected)
+    for frame in frames:
+        try:
+            counts = frame.read().counts
+        except FlirFormatError:
+            refused += 1
+            continue
+        assert counts.dtype == np.uint16 and counts.shape == frame.shape
+        read += 1
+    return read, refused
+
+
+def fuzz(folder: Path, inputs: int, seed: int) -> tuple[int, int]:
+    """Read damaged copies of intact files, and every tenth time random bytes; return frames read and refused."""
+    rng = np.random.default_rng(seed)
+    intact = seeds(folder)
+    path = folder / "damaged"
+    totals = np.zeros(2, int)
+    for index in range(inputs):
+        data = mutate(intact[index % len(intact)], rng) if index % 10 else rng.bytes(int(rng.integers(2000)))
+        path.write_bytes(data)
+        totals += read_everything(path)
+    return int(totals[0]), int(totals[1])

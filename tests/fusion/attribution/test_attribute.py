@@ -1,18 +1,11 @@
 """The map on films of known truth: a source that drives the axis, fields that drive nothing, and one warm-up."""
 
-import os
-
 import numpy as np
 import pytest
 import xarray as xr
-from statsmodels.stats.proportion import proportion_confint
 
 from fusion.attribution.attribute import ATTRIBUTABLE, NOT_SEPARABLE, CorrelationError, correlate
-from fusion.attribution.leading_source import find_source
 from tests.fusion import field_simulator as simulator
-
-#: Plain correlation beyond this is "significant" at 0.05 for 100 independent values.
-NAIVE_LIMIT = 0.1966
 
 
 def peak(maps, channel="joint"):
@@ -45,7 +38,7 @@ def test_a_field_that_drives_nothing_is_not_blamed_though_every_plain_map_is_red
     made = simulator.null_session("rw", rng)
     maps = correlate(made.fused, thin(made.field), draws=99, checks=50)
     assert maps.attrs["verdict"] == "not attributable"
-    assert float(np.abs(maps["naive_correlation"]).max()) > 2 * NAIVE_LIMIT
+    assert float(np.abs(maps["naive_correlation"]).max()) > 2 * simulator.NAIVE_LIMIT
 
 
 def test_one_warm_up_is_not_separable_whatever_the_drift(rng):
@@ -145,65 +138,3 @@ def test_a_film_without_seen_cells_is_refused(rng):
     made = simulator.null_session("rw", rng)
     with pytest.raises(CorrelationError, match="no plan cell is seen in at least 80 % of the frames"):
         correlate(made.fused, made.field * np.nan)
-
-
-def wilson(count, runs):
-    low, high = proportion_confint(count, runs, method="wilson")
-    return f"{count / runs:.3f} [{low:.3f}, {high:.3f}] of {runs}"
-
-
-RUNS = int(os.environ.get("THERMOFUSE_RUNS", "300"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "bar"), [("ar", 0.07), ("rw", 0.07), ("duty", 0.07), ("irw", 0.10), ("warm", 0.15)])
-def test_rate_of_false_alarms(kind, bar):
-    """Chance that a field which drives nothing shows any significant cell or mode."""
-    anything = cells = naive = not_separable = 0
-    promised = []
-    for seed in range(RUNS):
-        made = simulator.null_session(kind, np.random.default_rng([seed, 77]))
-        maps = correlate(made.fused, made.field[:, ::3, ::3], checks=20, seed=seed)
-        cells += bool((maps["p_value"] <= 0.05).any())
-        modes = bool((maps["modes/p_value"] <= 0.05).any()) if "modes" in maps.children else False
-        anything += modes or bool((maps["p_value"] <= 0.05).any())
-        naive += bool((np.abs(maps["naive_correlation"].sel(channel="common")) > NAIVE_LIMIT).any())
-        not_separable += maps.attrs["verdict"] == "not separable"
-        promised.append(float(maps["false_alarm_rate"]))
-    print(f"\n{kind}: any cell or mode {wilson(anything, RUNS)}; any cell {wilson(cells, RUNS)}; ", end="")
-    print(
-        f"plain correlation {wilson(naive, RUNS)}; not separable {not_separable}; printed by the maps {np.mean(promised):.3f}"
-    )
-    # The bar must lie within reach of what was measured: the lower end of the 95 % interval.
-    assert proportion_confint(anything, RUNS, method="wilson")[0] <= bar
-    assert kind != "warm" or not_separable >= 0.95 * RUNS
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("lag_s", "bar"), [(0.0, 0.90), (1800.0, 0.60)])
-def test_power_to_find_the_right_source(lag_s, bar):
-    """The session's answer: a source is found, and within five cells of the one that drives the axis."""
-    runs = min(RUNS, 200)
-    right = wrong = alone = cells = 0
-    for seed in range(runs):
-        source = seed % 3
-        made = simulator.driven_session(np.random.default_rng([seed, 78]), source=source, lag_s=lag_s)
-        maps = correlate(made.fused, thin(made.field), checks=1, seed=seed)
-        cells += bool((maps["p_value"] <= 0.05).any())
-        found = find_source(maps)
-        if found.verdict == "attributable":
-            hit = names(found, source)
-            right, wrong = right + (hit is True), wrong + (hit is False)
-            alone += hit is False and not found.others_mm
-    print(f"\nlag {lag_s:.0f} s: right source {wilson(right, runs)}, wrong {wilson(wrong, runs)} ", end="")
-    print(f"(without naming another as equal: {wilson(alone, runs)}); any cell {wilson(cells, runs)}")
-    assert proportion_confint(right, runs, method="wilson")[1] >= bar
-    assert proportion_confint(wrong, runs, method="wilson")[0] <= 0.03
-
-
-def names(found, source):
-    """True for the right source, False for a wrong one, None for no source within five cells."""
-    place = found.y_mm / 10 - 0.5, found.x_mm / 10 - 0.5
-    distance = [simulator.distance_cells(*place, k) for k in range(3)]
-    nearest = int(np.argmin(distance))
-    return nearest == source if distance[nearest] <= 5 else None

@@ -1,13 +1,10 @@
 """Randomised duty: the stated law, and a test that keeps its level in a warm-up."""
 
-import os
 
 import numpy as np
 import pytest
 import xarray as xr
-from statsmodels.stats.proportion import proportion_confint
 
-from fusion.alignment.first_order_lag import respond
 from fusion.attribution.randomised_duty import (
     DutyLaw,
     RandomisationError,
@@ -16,24 +13,7 @@ from fusion.attribution.randomised_duty import (
     read_duty,
 )
 from tests.fusion import field_simulator as simulator
-
-MIDDLE = np.arange(simulator.CYCLES) * simulator.PERIOD_S
-FINE = np.arange(0.0, simulator.CYCLES * simulator.PERIOD_S, 60.0)
-NAMES = ["spindle", "pump", "drive"]
-
-
-def run_schedule(law, rng):
-    courses = np.column_stack([law.course(FINE, rng) for _ in NAMES])
-    time = simulator.START + (FINE * 1e9).astype("timedelta64[ns]")
-    return xr.DataArray(courses, dims=("time", "source"), coords={"time": time, "source": NAMES})
-
-
-def driven(duty, source, rng, um=3.0, nuisance_um=0.1):
-    heated = respond(duty.values[:, [source]], FINE, time_constant_s=simulator.TAU_S[source])
-    moved = np.interp(MIDDLE, FINE, respond(heated, FINE, time_constant_s=1800.0)[:, 0])
-    walks = nuisance_um * np.cumsum(rng.standard_normal((2, simulator.CYCLES)), axis=1)
-    still = np.zeros((simulator.CYCLES, 1, 1))
-    return simulator.session(still, um * moved + walks[0], um * moved + walks[1], rng).fused
+from tests.fusion.duty_simulator import FINE, driven, run_schedule
 
 
 def test_the_law_keeps_its_mean_and_least_dwell(rng):
@@ -119,29 +99,3 @@ def test_a_logged_load_that_was_never_switched_is_refused(rng):
 def test_a_log_that_the_law_cannot_have_made_is_refused(rng, names, law, message):
     with pytest.raises(RandomisationError, match=message):
         read_duty(logged(rng), names, law, source="drivers.csv")
-
-
-@pytest.mark.slow
-def test_level_and_power_of_the_randomisation_test():
-    runs = int(os.environ.get("THERMOFUSE_RUNS", "400"))
-    law = DutyLaw(1800.0)
-    false = right = wrong = 0
-    for seed in range(runs):
-        rng = np.random.default_rng([seed, 31])
-        duty = run_schedule(law, rng)
-        kind = ("warm", "rw", "duty")[seed % 3]
-        still = np.zeros((simulator.CYCLES, 1, 1))
-        null = simulator.session(
-            still, 3 * simulator.smooth_series(kind, rng), 2 * simulator.smooth_series(kind, rng), rng
-        ).fused
-        false += randomisation_test(null, duty, law, draws=199, seed=seed).attrs["source"] != ""
-        source = seed % 3
-        named = randomisation_test(driven(duty, source, rng), duty, law, draws=199, seed=seed).attrs["source"]
-        right += named == NAMES[source]
-        wrong += named not in ("", NAMES[source])
-    for what, count in (("false alarms", false), ("right source", right), ("wrong source", wrong)):
-        low, high = proportion_confint(count, runs, method="wilson")
-        print(f"\n{what}: {count / runs:.3f} [{low:.3f}, {high:.3f}] of {runs}", end="")
-    low, high = proportion_confint(false, runs, method="wilson")
-    assert low <= 0.07 and high >= 0.03
-    assert proportion_confint(right, runs, method="wilson")[1] >= 0.70

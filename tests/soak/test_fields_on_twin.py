@@ -1,4 +1,8 @@
-"""Registration, fields, knocks and clock on campaigns of the twin, against its truth: the figures that the documentation quotes."""
+"""Registration, fields, knocks and clock on campaigns of the twin, against its truth.
+
+Reproduces the figures of docs/method/registration.md and docs/method/fields.md: registration and field of one frame per cycle under two
+distortions, the knock of 3 px, and the place of a moving table with its clock offset.
+"""
 
 from __future__ import annotations
 

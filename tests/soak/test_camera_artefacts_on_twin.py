@@ -1,4 +1,4 @@
-"""Flat-field steps on frames of the twin, whose table moves and warms under the camera: found where planted, none elsewhere."""
+"""Flat-field steps on frames of the twin, whose table moves and warms under the camera: docs/method/radiometry.md, "The camera itself"."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from fusion.twin.machine.recipe import Recipe
 from thermography.io.flir import index_frames
 from thermography.radiometry.camera_artefacts import find_repeats, find_steps, read_levels
 
+pytestmark = pytest.mark.slow
+
 
 def _record(folder: Path, *, ffc_step_K: float, table: str, cycles: int) -> tuple:
     """Write a campaign of the twin with a small detector; return its frames and the planted offset of each, K."""
@@ -25,7 +27,6 @@ def _record(folder: Path, *, ffc_step_K: float, table: str, cycles: int) -> tupl
     return frames, truth.frames["camera_offset_K"].values
 
 
-@pytest.mark.slow
 def test_no_step_in_a_thousand_frames_without_one(tmp_path: Path) -> None:
     frames, _ = _record(tmp_path / "still", ffc_step_K=0.0, table="moving", cycles=41)
     assert len(frames) >= 1000
@@ -35,7 +36,6 @@ def test_no_step_in_a_thousand_frames_without_one(tmp_path: Path) -> None:
     assert steps == [] and find_repeats(levels) == []
 
 
-@pytest.mark.slow
 def test_planted_steps_on_a_moving_table(tmp_path: Path) -> None:
     frames, offset = _record(tmp_path / "moving", ffc_step_K=0.3, table="moving", cycles=12)
     # The offset acts at the detector; through emissivity 0.97 and the air it reads that much larger on the surface.
