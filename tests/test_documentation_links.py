@@ -1,0 +1,105 @@
+"""The method pages and the code do not drift apart: pages, modules, files and tests named in either exist, and quoted constants hold.
+
+A page quotes a constant as ``module.NAME = value``, the default of an argument as ``module.function(argument) = value``, both in backticks.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+PACKAGES = ("thermography", "interferometry", "fusion")
+DOTTED = rf"(?:{'|'.join(PACKAGES)})(?:\.\w+)+"
+QUOTED = re.compile(rf"`({DOTTED})(?:\((\w+)\))? = ([^`]+)`")
+
+
+def name_of(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def resolve(dotted: str) -> object:
+    """The module, or the attribute of a module or class, that a dotted name stands for."""
+    parts = dotted.split(".")
+    for length in range(len(parts), 0, -1):
+        try:
+            found: object = importlib.import_module(".".join(parts[:length]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[length:]:
+            found = getattr(found, part)
+        return found
+    raise ModuleNotFoundError(dotted)
+
+
+def equal(quoted: object, actual: object) -> bool:
+    """Numbers to nine digits, one by one in sequences and mappings; everything else exactly."""
+    if isinstance(actual, np.ndarray):
+        actual = actual.tolist()
+    if isinstance(quoted, dict) and isinstance(actual, dict):
+        return quoted.keys() == actual.keys() and all(equal(value, actual[key]) for key, value in quoted.items())
+    if isinstance(quoted, (list, tuple)) and isinstance(actual, (list, tuple)):
+        return len(quoted) == len(actual) and all(equal(a, b) for a, b in zip(quoted, actual, strict=True))
+    if isinstance(quoted, (int, float)) and isinstance(actual, (int, float, np.number)):
+        return bool(np.isclose(quoted, float(actual), rtol=1e-9, atol=0.0))
+    return quoted == actual
+
+
+@pytest.mark.parametrize("document", PAGES, ids=name_of)
+def test_every_quoted_constant_has_the_value_of_the_code(document: Path) -> None:
+    wrong = []
+    for dotted, argument, text in QUOTED.findall(document.read_text(encoding="utf-8")):
+        place = f"{dotted}({argument})" if argument else dotted
+        try:
+            found = resolve(dotted)
+            actual = inspect.signature(found).parameters[argument].default if argument else found  # type: ignore[arg-type]
+        except (ModuleNotFoundError, AttributeError, KeyError):
+            wrong.append(f"{place} does not exist")
+            continue
+        if not equal(ast.literal_eval(text), actual):
+            wrong.append(f"{place} is {actual!r}, the page says {text}")
+    assert not wrong, f"{name_of(document)}: " + "; ".join(wrong)
+
+
+@pytest.mark.parametrize("document", PAGES, ids=name_of)
+def test_every_module_named_in_a_page_exists(document: Path) -> None:
+    missing = []
+    for dotted in sorted(set(re.findall(rf"`({DOTTED})[`(]", document.read_text(encoding="utf-8")))):
+        try:
+            resolve(dotted)
+        except (ModuleNotFoundError, AttributeError):
+            missing.append(dotted)
+    assert not missing, f"{name_of(document)} names {', '.join(missing)}"
+
+
+@pytest.mark.parametrize("document", PAGES, ids=name_of)
+def test_every_file_and_test_named_in_a_page_exists(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    missing = []
+    for name, test in re.findall(r"\b((?:tests|data|fusion|docs)/[\w./-]*\w)(?:::(\w+))?", text):
+        path = ROOT / name
+        if not path.exists() or (test and not re.search(rf"^def {test}\(", path.read_text(encoding="utf-8"), re.M)):
+            missing.append(f"{name}::{test}" if test else name)
+    missing += [link for link in re.findall(r"\]\(([\w./-]+\.md)", text) if not (document.parent / link).exists()]
+    assert not missing, f"{name_of(document)} names {', '.join(missing)}"
+
+
+def test_every_page_cited_in_the_code_exists() -> None:
+    missing = []
+    for folder in (*PACKAGES, "tests"):
+        for source in sorted((ROOT / folder).rglob("*.py")):
+            cited = re.findall(r"docs/[\w/-]+\.md", source.read_text(encoding="utf-8"))
+            missing += [f"{name_of(source)} cites {name}" for name in cited if not (ROOT / name).exists()]
+    assert not missing, "; ".join(missing)
+
+
+def test_every_page_of_the_method_is_listed_in_its_index() -> None:
+    listed = set(re.findall(r"\]\(([\w-]+\.md)\)", (ROOT / "docs/method/index.md").read_text(encoding="utf-8")))
+    assert {page.name for page in (ROOT / "docs/method").glob("*.md")} == listed | {"index.md"}
