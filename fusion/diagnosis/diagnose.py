@@ -34,7 +34,7 @@ from fusion.diagnosis.scatter import ScatterFit, fit_scatter
 
 Cause = Literal["structural", "local_temperature", "stick_slip", "step", "undetermined"]
 
-#: Minimum probability of each cause, set and checked on simulated campaigns by tests/fusion/diagnosis/test_diagnosis_thresholds.py.
+#: Minimum probability of each cause, set and checked on simulated campaigns by tests/soak/test_diagnosis_rates.py.
 THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "stick_slip": 0.4, "step": 0.6}
 #: Log-likelihood (nats) that an explanation by the direction of approach must gain over scatter equal in both directions: amounts along
 #: the motion, more scatter in one direction, a random walk in one direction (beside its parameter). Scatter equal in both directions

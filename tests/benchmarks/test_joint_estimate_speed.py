@@ -1,4 +1,7 @@
-"""Speed of the joint estimate, as ratios against a dense solution of the same model measured in the same run."""
+"""Speed of the joint estimate, as ratios against a dense solution of the same model measured in the same run.
+
+Reproduces the rows of docs/measured.md, "Speed and memory", on the joint estimate.
+"""
 
 from __future__ import annotations
 

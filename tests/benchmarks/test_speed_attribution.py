@@ -1,4 +1,7 @@
-"""Speed of the screen at full size, and as a ratio to nilearn (if installed) on one regressor measured in the same run."""
+"""Speed of the screen at full size, and as a ratio to nilearn (if installed) on one regressor measured in the same run.
+
+Reproduces the rows of docs/measured.md, "Speed and memory", on the screen.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Speed and memory of file to fields, as ratios against named peers measured in the same run on the same file."""
+"""Speed and memory of file to fields, as ratios against named peers measured in the same run on the same file.
+
+Reproduces the rows of docs/measured.md, "Speed and memory", on file to fields.
+"""
 
 from __future__ import annotations
 

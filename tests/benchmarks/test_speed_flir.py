@@ -1,4 +1,7 @@
-"""Speeds of reading and calibrating, as ratios to named readers measured in the same run, on one core."""
+"""Speeds of reading and calibrating, as ratios to named readers measured in the same run, on one core.
+
+Reproduces the rows of docs/measured.md, "Speed and memory", on reading and calibrating.
+"""
 
 from __future__ import annotations
 
