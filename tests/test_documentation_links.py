@@ -9,6 +9,7 @@ import ast
 import importlib
 import inspect
 import re
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,17 @@ def resolve(dotted: str) -> object:
     raise ModuleNotFoundError(dotted)
 
 
+def near(dotted: str) -> str:
+    """What the module calls a name that it does not have: the same with or without a leading underscore, or one that looks alike."""
+    module, _, name = dotted.rpartition(".")
+    try:
+        known = dir(resolve(module))
+    except (ModuleNotFoundError, AttributeError):
+        return ""
+    alike = get_close_matches(name, known, n=1)
+    return f"; did you mean {module}.{alike[0]}?" if alike else ""
+
+
 def equal(quoted: object, actual: object) -> bool:
     """Numbers to nine digits, one by one in sequences and mappings; everything else exactly."""
     if isinstance(actual, np.ndarray):
@@ -61,7 +73,7 @@ def test_every_quoted_constant_has_the_value_of_the_code(document: Path) -> None
             found = resolve(dotted)
             actual = inspect.signature(found).parameters[argument].default if argument else found  # type: ignore[arg-type]
         except (ModuleNotFoundError, AttributeError, KeyError):
-            wrong.append(f"{place} does not exist")
+            wrong.append(f"{place} does not exist{near(dotted)}")
             continue
         if not equal(ast.literal_eval(text), actual):
             wrong.append(f"{place} is {actual!r}, the page says {text}")
@@ -75,7 +87,7 @@ def test_every_module_named_in_a_page_exists(document: Path) -> None:
         try:
             resolve(dotted)
         except (ModuleNotFoundError, AttributeError):
-            missing.append(dotted)
+            missing.append(f"{dotted}{near(dotted)}")
     assert not missing, f"{name_of(document)} names {', '.join(missing)}"
 
 
