@@ -103,11 +103,11 @@ def test_every_file_and_test_named_in_a_page_exists(document: Path) -> None:
     assert not missing, f"{name_of(document)} names {', '.join(missing)}"
 
 
-def test_every_page_cited_in_the_code_exists() -> None:
+def test_every_page_and_test_cited_in_the_code_exists() -> None:
     missing = []
     for folder in (*PACKAGES, "tests"):
         for source in sorted((ROOT / folder).rglob("*.py")):
-            cited = re.findall(r"docs/[\w/-]+\.md", source.read_text(encoding="utf-8"))
+            cited = re.findall(r"(?:docs/[\w/-]+\.md|tests/[\w/]+\.py)", source.read_text(encoding="utf-8"))
             missing += [f"{name_of(source)} cites {name}" for name in cited if not (ROOT / name).exists()]
     assert not missing, "; ".join(missing)
 

@@ -52,7 +52,8 @@ def rate(count: int, of: int = RUNS) -> str:
 def could_tell(one: Outcome, name: str, rms_um: float) -> bool:
     """Whether the loop said beforehand that an effect of this size could be found."""
     effect = name.partition(":")[0]
-    best = [entry.best_um for entry in one.found.identifiable if entry.effect == effect]
+    limits = [limit for scored in one.found.state.rounds for limit in scored.detection_limits]
+    best = [limit.best_um for limit in limits if limit.effect == effect]
     return bool(best) and best[0] is not None and best[0] <= rms_um
 
 

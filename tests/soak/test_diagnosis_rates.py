@@ -21,7 +21,7 @@ from tests.soak.rates import campaigns, rate, wilson
 pytestmark = pytest.mark.slow
 
 RUNS = campaigns(200)
-#: Wanted share of right names; None: only wrong names count.
+#: Minimum share of right causes; None: only wrong causes are counted.
 BARS = {
     "structural": 0.95,
     "local_temperature": 0.90,
@@ -39,19 +39,19 @@ class Flag:
     direction: str = "both"
 
 
-def verdicts(cause: str) -> list[Diagnosis]:
+def diagnoses_of(cause: str) -> list[Diagnosis]:
     return [diagnose([Flag()], odd_position(cause, np.random.default_rng([seed, 41])))[0] for seed in range(RUNS)]
 
 
 @pytest.mark.parametrize("cause", list(BARS))
 def test_right_names_and_no_wrong_ones(cause):
-    found = verdicts(cause)
-    names = Counter(one.cause for one in found)
+    diagnoses = diagnoses_of(cause)
+    names = Counter(diagnosis.cause for diagnosis in diagnoses)
     right = CAUSES[cause]
     print(f"\n{cause}: {dict(names)}; {right} {rate(names[right], RUNS)}")
     if right in THRESHOLDS:
         by_threshold = {
-            tried: round(float(np.mean([one.evidence[f"probability_{right}"] >= tried for one in found])), 2)
+            tried: round(float(np.mean([d.evidence[f"probability_{right}"] >= tried for d in diagnoses])), 2)
             for tried in TRIED
         }
         print(f"  share with probability of {right} above a threshold: {by_threshold}; set: {THRESHOLDS[right]}")
