@@ -1,6 +1,5 @@
 """Randomised duty: the stated law, and a test that keeps its level in a warm-up."""
 
-
 import numpy as np
 import pytest
 import xarray as xr
