@@ -112,7 +112,7 @@ def test_finds_the_kind_of_drift_and_the_noise(rng, integrated):
     # 1920 readings determine a standard deviation to 0.4 / sqrt(2 * 1900) = 0.0065 um; 4 of these are allowed.
     assert fit.sigma == pytest.approx(0.4, abs=0.026)
     if not integrated:
-        # Steps of 0.4 and 0.3 um per cycle of 252.8 s; the study's spread of such estimates is about 15 %.
+        # Steps of 0.4 and 0.3 um per cycle of 252.8 s; such estimates scatter by about 15 % (docs/method/drift-estimation.md).
         np.testing.assert_allclose(fit.drift_rate * np.sqrt(252.8 / 3600), [0.4, 0.3], rtol=0.45)
 
 
