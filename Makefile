@@ -33,7 +33,7 @@ test: lint
 
 # Long simulations: the figures that the documentation quotes come from here.
 soak: $(VENV)/.test
-	$(BIN)/pytest -m slow -s
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest tests/soak -m slow -s
 
 # Speeds, as ratios against named peers measured in the same run.
 benchmarks: $(VENV)/.test

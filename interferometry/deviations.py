@@ -70,6 +70,10 @@ def build_deviations(
         Keeps ``contract.DEVIATIONS``: ``deviation`` (um), ``time`` (UTC) and ``quality_flag`` (cycle, direction, target), ``position``
         (mm; target). Missing readings are flagged.
 
+    Notes
+    -----
+    Target positions, directions of approach and deviations as in ISO 230-2:2014, clause 3.
+
     Examples
     --------
     >>> import numpy as np

@@ -115,6 +115,10 @@ def correlate(
     CorrelationError, ChannelError, RegionError
         If no cell is seen, too few frames or cycles remain, or a region contains no seen cell.
 
+    Notes
+    -----
+    Test, equations and error rates: docs/method/attribution.md.
+
     Examples
     --------
     >>> rng = np.random.default_rng(1)

@@ -88,6 +88,10 @@ def read_deviations(
     LaserFormatError
         The file cannot be used as a whole.
 
+    Notes
+    -----
+    Quantities as in ISO 230-2:2014, clause 3.
+
     Examples
     --------
     >>> import tempfile
@@ -304,6 +308,10 @@ def read_environment(path: str | Path) -> xr.Dataset:
     ------
     LaserFormatError
         A column is missing, or fewer than half of the lines can be used.
+
+    Notes
+    -----
+    The conditions that the index of air needs (Ciddor 1996, Appl. Opt. 35, 1566).
 
     Examples
     --------

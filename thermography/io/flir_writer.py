@@ -127,6 +127,10 @@ def write_sequence(
     ThermographyError
         Where counts, time, housekeeping or encoding of a frame do not fit the format.
 
+    Notes
+    -----
+    FFF records follow one another in a sequence; the tests read the file back with exiftool, flirpy and this package.
+
     Examples
     --------
     >>> from tempfile import TemporaryDirectory

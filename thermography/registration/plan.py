@@ -178,6 +178,10 @@ def read_fiducials(path: str | Path) -> list[Fiducial]:
     OSError
         The file cannot be read.
 
+    Notes
+    -----
+    Columns and their meaning: docs/method/registration.md.
+
     Examples
     --------
     >>> import tempfile
