@@ -1,4 +1,4 @@
-"""The command: run, simulate, inspect, iso230, schema, export, plan. Bad input ends with one paragraph and exit code 2."""
+"""The command line: run, simulate, inspect, iso230, schema, export, plan. Bad input ends with one paragraph and exit code 2."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from interferometry.errors import InterferometryError
 from thermography.errors import ThermographyError
 
 app = typer.Typer(
-    help="Explain the thermal drift of a machine-tool axis from FLIR frames and laser readings.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -55,6 +54,24 @@ def _answering() -> Iterator[None]:
     except KeyboardInterrupt:
         errors.print("thermofuse: stopped; finished stages are kept, add --resume to continue", highlight=False)
         raise typer.Exit(STOPPED) from None
+
+
+def _print_version(asked: bool) -> None:
+    """Print name and version and stop, where asked."""
+    if asked:
+        from fusion.pipeline.provenance import versions
+
+        console.print(f"thermofuse {versions()['thermofuse']}", highlight=False)
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
+    ] = False,
+) -> None:
+    """Explain the thermal drift of a machine-tool axis from FLIR frames and laser readings."""
 
 
 @app.command()
@@ -97,11 +114,11 @@ def run(
 
 
 def _folders(campaigns: list[Path], out: Path | None) -> list[tuple[Path, Path]]:
-    """Return each campaign with its results folder; several share `out` as subfolders named after their own folder."""
+    """Return each campaign with its results folder; two share `out` as subfolders named after the folders of their files."""
     if len(campaigns) == 1:
         return [(campaigns[0], out or campaigns[0].parent / "results")]
     names = [path.resolve().parent.name for path in campaigns]
-    unique = names if len(set(names)) == len(names) else [f"{name}_{at}" for at, name in enumerate(names, start=1)]
+    unique = names if len(set(names)) == len(names) else [f"{name}_{k}" for k, name in enumerate(names, start=1)]
     base = out or Path("results")
     return [(path, base / name) for path, name in zip(campaigns, unique, strict=True)]
 
@@ -128,7 +145,7 @@ def inspect(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="FLIR, laser or environment files.")],
     thumbnails: Annotated[Path | None, typer.Option(help="Folder for a small PNG of every thermal file.")] = None,
 ) -> None:
-    """Tell what files hold and what looks wrong."""
+    """Print what files hold, with warnings about implausible content."""
     from fusion.report.terminal import describe_file, write_thumbnail
 
     with _answering():
@@ -191,18 +208,20 @@ def plan(
     source: Annotated[
         list[str], typer.Option(metavar="NAME=TIME", help="A heat source that can be switched, with its time constant.")
     ],
-    effect: Annotated[str, typer.Option(help="Smallest drift that one source should be found at.")] = "1 um",
+    effect: Annotated[str, typer.Option(help="Smallest drift of one source to be detected.")] = "1 um",
     drift: Annotated[
         str, typer.Option(help="Random walk of the axis in one hour (the report's unexplained drift).")
     ] = "0.4 um",
     noise: Annotated[str, typer.Option(help="Noise of one cycle's mean.")] = "0.1 um",
     cycle: Annotated[str, typer.Option(help="Length of one cycle.")] = "252 s",
-    power: Annotated[float, typer.Option(min=0.1, max=0.99, help="Wanted chance to name the weakest source.")] = 0.8,
+    power: Annotated[
+        float, typer.Option(min=0.1, max=0.99, help="Wanted probability of detecting the weakest source.")
+    ] = 0.8,
     seed: Annotated[int, typer.Option(help="Another seed is another, equally valid schedule.")] = 0,
 ) -> None:
-    """Propose a duty schedule for a new test.
+    """Propose a random duty schedule for a new test.
 
-    A random one, which tells heat sources apart that are otherwise taken for each other.
+    It separates heat sources that are collinear when they are switched together.
     """
     from fusion.report.terminal import duty_lines
 
@@ -212,5 +231,9 @@ def plan(
 
 
 def main() -> None:
-    """Run the command line."""
-    app()
+    """Run the command line, as the script ``thermofuse`` or as a module; the exit code is that of the process."""
+    app(prog_name="thermofuse")
+
+
+if __name__ == "__main__":
+    main()

@@ -36,6 +36,11 @@ class Dataset:
 def read_registry(path: Path = REGISTRY) -> dict[str, Dataset]:
     """Return the listed files by name.
 
+    Parameters
+    ----------
+    path : Path
+        CSV with name, address, sha256, bytes, licence, what.
+
     Raises
     ------
     DatasetError

@@ -195,7 +195,7 @@ def recommend_measurement(maps: xr.DataTree, source: LeadingSource) -> str:
         return f"Switch the heat sources at random times instead of letting all of them warm up once. {plan}."
     if source.verdict == "not attributable":
         return (
-            f"From {source.detectable_um_per_K:.2g} um/K on, a source at the best place would have been found in four sessions of five. "
+            f"From {source.detectable_um_per_K:.2g} µm/K on, a source at the best place would have been found in four sessions of five. "
             f"For less: more cycles, or loads that switch more often. {plan}."
         )
     if source.others_mm:

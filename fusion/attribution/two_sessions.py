@@ -327,7 +327,7 @@ def _conclude(channel: str, pair: _Pair, separable: bool) -> ChannelAgreement:
         verdict, reason = "attributable", "both sessions find this place, with one sign and one size"
     elif p_value <= LEVEL:
         verdict = "not attributable"
-        sizes = f"{sensitivity[0]:+.2f} and {sensitivity[1]:+.2f} um/K"
+        sizes = f"{sensitivity[0]:+.2f} and {sensitivity[1]:+.2f} µm/K"
         reason = f"both sessions find something near here, but not at one place with one size: {sizes}"
     else:
         verdict, reason = "not attributable", "no place is found by both sessions"

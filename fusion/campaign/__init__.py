@@ -1,1 +1,1 @@
-"""What a user writes: the campaign file, its quantities, the files it names, read and checked before the long work (level 0)."""
+"""Input (level 0): the campaign file, its quantities, and the files that it names, read and checked before any calculation."""

@@ -1,10 +1,11 @@
-"""The campaign file: what a user writes, checked whole before anything is computed."""
+"""The campaign file, checked completely before anything is computed."""
 
 from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,6 +16,7 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    ValidationInfo,
     WithJsonSchema,
     model_validator,
 )
@@ -22,14 +24,15 @@ from pydantic_core import PydanticCustomError
 
 from fusion.campaign.messages import Place, describe, find_line, key_lines, suggest
 from fusion.campaign.quantities import QuantityError, read_quantity
+from fusion.effects.effect import Effect
+from fusion.effects.library import library
+from fusion.effects.thermal import QUASI_STATIC
 from fusion.errors import FusionError
 
-#: Names of the effects that a campaign may declare; a user's own are added by the entry point of `fusion.effects.library`.
-EFFECT_NAMES = (
-    "axis_expansion", "table_offset", "thermal_lag", "unseen_heat_source", "dead_path", "air_index",
-    "material_compensation", "angular_growth", "reversal_drift", "step_event", "periodic_disturbance", "pitch_error",
-    "camera_offset", "reflected_source", "laser_warm_up", "sensor_fault",
-)  # fmt: skip
+#: What a record may be declared with: every displacement a linear function of the temperatures.
+RECORD_EFFECTS = (QUASI_STATIC,)
+#: Effects that need positions along an axis; a record that declares them is run without, and the results say so.
+_ALONG_AN_AXIS = ("axis_expansion", "table_offset")
 
 
 class CampaignError(FusionError):
@@ -67,6 +70,72 @@ def _fraction(value: object) -> object:
     return value
 
 
+@dataclass(frozen=True)
+class _Surroundings:
+    """What the values of a campaign file are checked against: its folder, the effects, and whether it holds a record."""
+
+    folder: Path
+    effects: Mapping[str, Effect]
+    record: bool
+
+
+def _existing(name: str, info: ValidationInfo) -> str:
+    """Accept the name of a file that exists."""
+    if isinstance(info.context, _Surroundings):
+        path = (info.context.folder / name).resolve()
+        if not path.is_file():
+            text = f"no such file {path}; {_near_file(path)}paths are relative to the campaign file"
+            raise PydanticCustomError("file", "{text}", {"text": text})
+    return name
+
+
+def _matching(pattern: str, info: ValidationInfo) -> str:
+    """Accept a pattern that matches at least one file."""
+    if isinstance(info.context, _Surroundings) and not _matches(info.context.folder, pattern):
+        text = f"matches no file in {info.context.folder}; paths are relative to the campaign file"
+        raise PydanticCustomError("pattern", "{text}", {"text": text})
+    return pattern
+
+
+def _filled(patterns: tuple[str, ...]) -> tuple[str, ...]:
+    """Accept a list that is not empty; `min_length` would count a pattern without a match as absent."""
+    if not patterns:
+        raise PydanticCustomError("too_short", "this list is empty")
+    return patterns
+
+
+def _declarable(name: str, info: ValidationInfo) -> str:
+    """Accept an effect that can be declared for this kind of campaign: one whose columns are known before the readings."""
+    if not isinstance(info.context, _Surroundings):
+        return name
+    effects = info.context.effects
+    if info.context.record:
+        allowed: tuple[str, ...] = RECORD_EFFECTS
+        accepted = name in (*allowed, *_ALONG_AN_AXIS)
+    else:
+        allowed = tuple(effect.name for effect in effects.values() if effect.declarable)
+        accepted = name in allowed
+    if accepted:
+        return name
+    choice = f"can be declared here: {', '.join(allowed)}"
+    if name in effects and not effects[name].declarable:
+        text = f"the parameters of this effect are not known beforehand; remove it, the closed loop tries it anyway; {choice}"
+    elif name in (*effects, *RECORD_EFFECTS):
+        text = f"this effect has no meaning for a {'record' if info.context.record else 'campaign with positions'}; {choice}"
+    else:
+        text = f"unknown effect; {suggest(name, (*effects, *RECORD_EFFECTS))}{choice}"
+    raise PydanticCustomError("effect", "{text}", {"text": text})
+
+
+def _each_once(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Accept a list that names everything once."""
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        text = f"{', '.join(repeated)} named more than once; name each effect once"
+        raise PydanticCustomError("repeated", "{text}", {"text": text})
+    return names
+
+
 def _written(example: str) -> WithJsonSchema:
     """How a quantity looks in the file, for the JSON Schema."""
     return WithJsonSchema({"type": "string", "description": "number with unit", "examples": [example]})
@@ -85,6 +154,15 @@ Feed = Annotated[float, _quantity("mm/min"), _within(0.0, 1e6, "a feed rate in m
 Fraction = Annotated[float, BeforeValidator(_fraction), _within(0.0, 1.0, "this fraction")]
 
 
+ExistingFile = Annotated[str, AfterValidator(_existing)]
+FramePatterns = Annotated[
+    tuple[Annotated[str, AfterValidator(_matching)], ...],
+    AfterValidator(_filled),
+    Field(json_schema_extra={"minItems": 1}),
+]
+DeclaredEffects = Annotated[tuple[Annotated[str, AfterValidator(_declarable)], ...], AfterValidator(_each_once)]
+
+
 class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
 
@@ -97,9 +175,9 @@ class CampaignTable(_Table):
 
 
 class ThermographyTable(_Table):
-    """``[thermography]``: the frames and what the camera should have been told."""
+    """``[thermography]``: the frames, and the camera parameters that override the stored ones."""
 
-    frames: tuple[str, ...] = Field(min_length=1)
+    frames: FramePatterns
     emissivity: Fraction | None = None
     reflected_temperature_degC: Celsius | None = Field(default=None, alias="reflected_temperature")
     atmospheric_temperature_degC: Celsius | None = Field(default=None, alias="atmospheric_temperature")
@@ -127,8 +205,8 @@ class PlanTable(_Table):
 
     size_mm: tuple[PositiveMillimetres, PositiveMillimetres] = Field(alias="size")
     cell_size_mm: PositiveMillimetres = Field(alias="cell_size")
-    fiducials: str
-    regions: str | None = None
+    fiducials: ExistingFile
+    regions: ExistingFile | None = None
     axis: AxisTable
 
     @model_validator(mode="after")
@@ -151,10 +229,10 @@ class PlanTable(_Table):
 
 
 class InterferometryTable(_Table):
-    """``[interferometry]``: the readings and what the laser's compensation needs."""
+    """``[interferometry]``: the readings, and the parameters of the laser's compensation."""
 
-    deviations: str
-    environment: str | None = None
+    deviations: ExistingFile
+    environment: ExistingFile | None = None
     dead_path_mm: Millimetres = Field(default=0.0, alias="dead_path")
     expansion_coefficient_ppm_per_K: PartsPerMillion = Field(default=11.7, alias="expansion_coefficient")
     feed_mm_per_min: Feed | None = Field(default=None, alias="feed")
@@ -165,9 +243,9 @@ class InterferometryTable(_Table):
 
 
 class DriversTable(_Table):
-    """``[drivers]``: anything else that was logged, and which of it was switched on and off at random by a stated law."""
+    """``[drivers]``: other logged quantities, and the law by which some of them were switched at random."""
 
-    file: str
+    file: ExistingFile
     randomised: tuple[str, ...] = ()
     mean_dwell_s: PositiveSeconds | None = Field(default=None, alias="mean_dwell")
     least_dwell_s: Seconds = Field(default=0.0, alias="least_dwell")
@@ -189,7 +267,7 @@ class RecordTable(_Table):
     Columns are named as in the file's heading, ``"name [unit]"`` or ``"name (unit)"``; ``*`` stands for any text.
     """
 
-    file: str
+    file: ExistingFile
     sheet: str | None = None
     time: str
     start: str | None = None
@@ -199,9 +277,9 @@ class RecordTable(_Table):
 
 
 class ModelTable(_Table):
-    """``[model]``: the effects that the user believes to act."""
+    """``[model]``: the effects that are known to act."""
 
-    declared: tuple[str, ...] = ("axis_expansion", "table_offset")
+    declared: DeclaredEffects = ("axis_expansion", "table_offset")
 
 
 class Campaign(_Table):
@@ -229,11 +307,10 @@ class Campaign(_Table):
         """Return the thermal files that the glob patterns match, each once, sorted by name."""
         if self.thermography is None:
             return ()
-        found = {path for pattern in self.thermography.frames for path in _matches(self.folder, pattern)}
-        return tuple(sorted(found))
+        return tuple(sorted({path for pattern in self.thermography.frames for path in _matches(self.folder, pattern)}))
 
     def input_files(self) -> dict[str, Path]:
-        """Return every file the campaign reads, keyed by its path relative to the campaign file."""
+        """Return every file that the campaign reads, keyed by its path relative to the campaign file."""
         files = {relative_name(self.path, self.folder): self.path}
         for table in ("thermography", "plan", "interferometry", "drivers", "record"):
             files |= self.files_of(table)
@@ -264,27 +341,51 @@ def campaign_schema() -> dict[str, Any]:
 
 
 def relative_name(path: Path, folder: Path) -> str:
-    """Return `path` as seen from `folder`, with forward slashes, or its bare name where it lies elsewhere."""
+    """Return `path` as seen from `folder`, with forward slashes, or its bare name where it lies elsewhere.
+
+    Parameters
+    ----------
+    path : Path
+        Absolute path.
+    folder : Path
+        Folder of the campaign file.
+    """
     try:
         return path.relative_to(folder).as_posix()
     except ValueError:
         return path.name
 
 
-def load_campaign(path: str | Path, *, effect_names: Iterable[str] = EFFECT_NAMES) -> Campaign:
-    """Read and check a campaign file.
+def load_campaign(path: str | Path, *, effects: Mapping[str, Effect] | None = None) -> Campaign:
+    """Read and check a campaign file, before anything is computed.
 
     Parameters
     ----------
     path : str or Path
         The TOML file; relative paths inside it start from its folder.
-    effect_names : iterable of str
-        Names that ``[model] declared`` may hold.
+    effects : mapping of str to Effect, optional
+        Effects by name, of which ``[model] declared`` may hold the declarable ones; left out: the library with the user's own.
+
+    Returns
+    -------
+    Campaign
+        Numbers in the unit that their name states; the files that it names exist.
 
     Raises
     ------
     CampaignError
-        With every fault found, one per line: file, line, key, value, remedy.
+        With every fault, one per line: file, line, key, value, remedy.
+
+    Notes
+    -----
+    The README shows a whole file; `campaign_schema` describes every key. Quantities are written with their unit, ``"5 mm"``.
+
+    Examples
+    --------
+    >>> load_campaign("absent.toml")  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+        ...
+    fusion.campaign.config.CampaignError: ...absent.toml: no such campaign file; check the name or give its full path
     """
     path = Path(path).resolve()
     if path.is_dir():
@@ -306,21 +407,20 @@ def load_campaign(path: str | Path, *, effect_names: Iterable[str] = EFFECT_NAME
 
     faults = _check_instruments(content, place)
     content.pop("path", None)
+    surroundings = _Surroundings(path.parent, library() if effects is None else effects, "record" in content)
     try:
-        campaign = Campaign.model_validate({**content, "path": path})
+        campaign = Campaign.model_validate({**content, "path": path}, context=surroundings)
     except ValidationError as error:
-        found = sorted(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
-        details = [item for item in found if not (faults and item["type"] == "missing" and len(item["loc"]) == 1)]
-        raise CampaignError("\n".join([*faults, *(describe(item, Campaign, place) for item in details)])) from None
-    faults += _check_files(campaign, place)
-    faults += _check_effects(campaign, tuple(effect_names), place)
+        ordered = sorted(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
+        details = [item for item in ordered if not (faults and item["type"] == "missing" and len(item["loc"]) == 1)]
+        faults += [describe(item, Campaign, place) for item in details]
     if faults:
         raise CampaignError("\n".join(faults))
     return campaign
 
 
 def _check_instruments(content: dict[str, Any], place: Place) -> list[str]:
-    """A campaign holds the two instruments with the plan, or a record, not both and not neither."""
+    """Return the fault of a campaign that holds neither both instruments with the plan nor a record, or both."""
     instruments = [name for name in ("thermography", "plan", "interferometry") if name in content]
     if "path" in content:
         return [f"{place(('path',))}: unknown key path; remove it"]
@@ -348,53 +448,9 @@ def _matches(folder: Path, pattern: str) -> list[Path]:
     return [path.resolve() for path in folder.glob(pattern) if path.is_file()]
 
 
-def _check_files(campaign: Campaign, place: Place) -> list[str]:
-    """Every file that is named exists, every pattern matches something."""
-    faults = []
-    if campaign.thermography is not None:
-        for pattern in campaign.thermography.frames:
-            if not _matches(campaign.folder, pattern):
-                faults.append(
-                    f'{place(("thermography", "frames"))}: thermography.frames = "{pattern}" '
-                    f"matches no file in {campaign.folder}; paths are relative to the campaign file"
-                )
-    named: list[tuple[tuple[str, ...], str | None]] = []
-    if campaign.plan is not None:
-        named.append((("plan", "fiducials"), campaign.plan.fiducials))
-        named.append((("plan", "regions"), campaign.plan.regions))
-    if campaign.interferometry is not None:
-        named.append((("interferometry", "deviations"), campaign.interferometry.deviations))
-        named.append((("interferometry", "environment"), campaign.interferometry.environment))
-    if campaign.drivers is not None:
-        named.append((("drivers", "file"), campaign.drivers.file))
-    if campaign.record is not None:
-        named.append((("record", "file"), campaign.record.file))
-    for key, name in named:
-        if name is not None and not campaign.resolve(name).is_file():
-            faults.append(
-                f'{place(key)}: {".".join(key)} = "{name}": no such file {campaign.resolve(name)}; '
-                f"{_near_file(campaign.resolve(name))}paths are relative to the campaign file"
-            )
-    return faults
-
-
 def _near_file(path: Path) -> str:
+    """Return the hint that names the nearest file of the same folder."""
     if not path.parent.is_dir():
         return ""
     names = [item.name for item in path.parent.iterdir() if item.is_file()]
     return suggest(path.name, names)
-
-
-def _check_effects(campaign: Campaign, known: tuple[str, ...], place: Place) -> list[str]:
-    """Every declared effect is one that the library knows, and is named once."""
-    where = place(("model", "declared"))
-    faults = []
-    for name in campaign.model.declared:
-        if name not in known:
-            faults.append(
-                f'{where}: model.declared holds the unknown effect "{name}"; '
-                f"{suggest(name, known)}known: {', '.join(known)}"
-            )
-    for name in sorted({name for name in campaign.model.declared if campaign.model.declared.count(name) > 1}):
-        faults.append(f'{where}: model.declared names "{name}" more than once; name each effect once')
-    return faults

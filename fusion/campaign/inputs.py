@@ -1,7 +1,4 @@
-"""The inputs of a campaign, read and checked before the long work; everything left out is noted.
-
-Before the long work: do both recordings meet in time, and do their clocks seem to agree?
-"""
+"""Inputs of a campaign with both instruments: read, checked for overlap in time and plausible clocks; omissions are noted."""
 
 from __future__ import annotations
 
@@ -30,15 +27,37 @@ from interferometry.iso230 import Iso230Budget
 from thermography.io.flir import FrameReference, index_frames
 from thermography.registration.plan import Fiducial, PlanGrid, read_fiducials
 
-#: So many left-out things are named in a message; all of them are in the products.
+#: Maximum number of omitted items listed in a message; the products hold all of them.
 _NAMED = 5
-#: What the closed loop and the correlation need at least.
+#: Smallest campaign that closed loop and attribution can use.
 _LEAST_CYCLES, _LEAST_TARGETS, _LEAST_FRAMES = 12, 3, 12
 
 
 @dataclass(frozen=True)
 class Source:
-    """What a campaign with both instruments holds, before anything is calculated."""
+    """Inputs of a campaign with both instruments, before anything is calculated.
+
+    Attributes
+    ----------
+    campaign, thermography, plan, interferometry
+        The campaign file and its tables.
+    deviations : Dataset
+        Readings that keep ``interferometry.contract.DEVIATIONS``.
+    environment, drivers : Dataset or None
+        Logs along ``time`` (UTC); None where nothing was logged.
+    fiducials : list of Fiducial
+        Fiducials of the plan.
+    frames, frames_rejected : list
+        Usable thermograms sorted by time, and file, index and reason of the others.
+    regions : list of Region
+        Named regions of the plan.
+    duty : tuple or None
+        Randomised loads over time and the law that they were drawn from.
+    notices : list of Notice
+        Everything that was left out.
+    iso_budget : Iso230Budget or None
+        Uncertainty contributions to ISO 230-2 values; None for those of the readings as recorded.
+    """
 
     campaign: Campaign
     thermography: ThermographyTable
@@ -57,7 +76,7 @@ class Source:
 
     @property
     def needs_camera(self) -> bool:
-        """Whether the readings are compensated again with what the camera saw."""
+        """Whether the readings are compensated again with the temperature from the camera."""
         return self.interferometry.material_temperature == "camera"
 
     @property
@@ -77,7 +96,17 @@ class Source:
 
 
 def read_source(campaign: Campaign) -> Source:
-    """Read readings, logs, fiducials and the frames' headers of a campaign, and refuse what cannot be run.
+    """Read readings, logs, fiducials and the frames' headers of a campaign, with every check that needs no calculation.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        A checked campaign with both instruments.
+
+    Returns
+    -------
+    Source
+        What was read, with a notice for everything that was left out.
 
     Raises
     ------
@@ -97,23 +126,23 @@ def read_source(campaign: Campaign) -> Source:
     by_camera = interferometry.material_temperature == "camera"
     drivers = read_drivers(campaign.resolve(campaign.drivers.file)) if campaign.drivers is not None else None
     frames, rejected = index_frames(campaign.frame_paths())
-    listed = [
+    rejected_frames = [
         {
-            "file": relative_name(one.path, campaign.folder),
-            "index": one.index,
-            "reason": one.reason.replace(f"{campaign.folder}/", ""),
+            "file": relative_name(frame.path, campaign.folder),
+            "index": frame.index,
+            "reason": frame.reason.replace(f"{campaign.folder}/", ""),
         }
-        for one in rejected
+        for frame in rejected
     ]
     timed = [frame for frame in frames if not np.isnat(frame.time)]
-    listed += [
+    rejected_frames += [
         {"file": relative_name(frame.path, campaign.folder), "index": frame.index, "reason": "the frame has no time"}
         for frame in frames
         if np.isnat(frame.time)
     ]
     source = Source(
         campaign, thermography, plan, interferometry, deviations if by_camera else compensated.deviations, environment, drivers,
-        read_fiducials(campaign.resolve(plan.fiducials)), timed, listed,
+        read_fiducials(campaign.resolve(plan.fiducials)), timed, rejected_frames,
         [] if plan.regions is None else read_regions(campaign.resolve(plan.regions)), _randomised(campaign, drivers),
         [] if by_camera else compensated.notices, compensated.budget,
     )  # fmt: skip
@@ -122,16 +151,31 @@ def read_source(campaign: Campaign) -> Source:
 
 
 def compensate_by_camera(source: Source, fields: xr.Dataset) -> tuple[Source, list[Notice]]:
-    """Compensate the readings again with the temperature that the camera saw along the axis, where the campaign asks for it."""
+    """Compensate the readings again with the temperature that the camera measured along the axis, where the campaign asks for it.
+
+    Parameters
+    ----------
+    source : Source
+        Inputs of the campaign.
+    fields : Dataset
+        Keeps ``thermography.contract.FIELDS``, on the laser's clock.
+
+    Returns
+    -------
+    Source
+        With the compensated readings and their ISO 230-2 budget.
+    list of Notice
+        What was done.
+    """
     if not source.needs_camera:
         return source, []
-    seen = see_material(fields, source.axis, source.deviations)
-    redone = compensate_readings(source.deviations, source.environment, source.interferometry, seen=seen)
+    material = see_material(fields, source.axis, source.deviations)
+    redone = compensate_readings(source.deviations, source.environment, source.interferometry, material=material)
     return replace(source, deviations=redone.deviations, iso_budget=redone.budget), redone.notices
 
 
 def _randomised(campaign: Campaign, drivers: xr.Dataset | None) -> tuple[xr.DataArray, DutyLaw] | None:
-    """The columns that were switched at random, and the law that they were drawn from; None where none was."""
+    """Return the randomised loads and the law that they were drawn from; None where no load was randomised."""
     table = campaign.drivers
     if table is None or drivers is None or table.mean_dwell_s is None:
         return None
@@ -141,10 +185,10 @@ def _randomised(campaign: Campaign, drivers: xr.Dataset | None) -> tuple[xr.Data
 
 
 def _notices(source: Source) -> list[Notice]:
-    """Everything that is left out of the input or missing from it."""
-    notices = frames_notices(source.frames_rejected)
-    _refuse_too_few(source)
-    notices += check_clocks(
+    """Return a notice for everything that is left out of the input or missing from it."""
+    notices = _frames_notices(source.frames_rejected)
+    _raise_if_too_small(source)
+    _raise_if_clocks_disagree(
         source.deviations,
         source.frame_times,
         clock_offset_s=source.thermography.clock_offset_s,
@@ -158,15 +202,15 @@ def _notices(source: Source) -> list[Notice]:
         notices.append(
             Notice(
                 "no_environment",
-                "No environment was logged, so effects of the air and of the material compensation cannot be told apart from the drift.",
+                "No environment was logged, so effects of the air and of the material compensation cannot be separated from the drift.",
                 "Log air temperature, pressure, humidity and material temperature, and name the file as interferometry.environment.",
             )
         )
     return notices
 
 
-def _refuse_too_few(source: Source) -> None:
-    """Refuse a campaign that is too small for what is made of it, before the long work."""
+def _raise_if_too_small(source: Source) -> None:
+    """Raise if the campaign is too small for a model of the drift."""
     sizes = source.deviations.sizes
     if sizes["cycle"] < _LEAST_CYCLES or sizes["target"] < _LEAST_TARGETS:
         raise SourceError(
@@ -188,8 +232,8 @@ class SourceError(FusionError):
     """The inputs of a campaign cannot be used together; the message says which and what to do."""
 
 
-def frames_notices(rejected: list[dict[str, Any]]) -> list[Notice]:
-    """Return one notice that counts the frames left out and names the first of them."""
+def _frames_notices(rejected: list[dict[str, Any]]) -> list[Notice]:
+    """Return one notice that counts the rejected frames and lists the first of them."""
     if not rejected:
         return []
     named = [f"{item['file']} ({_reason(item)})" for item in rejected]
@@ -209,7 +253,15 @@ def _reason(item: dict[str, Any]) -> str:
 
 
 def left_out_notices(dataset: xr.Dataset, code: str) -> list[Notice]:
-    """Return one notice that counts the lines of a file that were left out and names the first of them."""
+    """Return one notice that counts the rejected lines of a file and lists the first of them.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        Table whose attribute ``left_out`` lists the rejected lines as JSON.
+    code : str
+        Code of the notice.
+    """
     lines = json.loads(dataset.attrs.get("left_out", "[]"))
     if not lines:
         return []
@@ -224,12 +276,26 @@ def left_out_notices(dataset: xr.Dataset, code: str) -> list[Notice]:
 
 
 def counted(number: int, noun: str) -> str:
-    """Return a number with its noun, in the plural where it has to be."""
+    """Return a number with its noun, plural unless the number is 1.
+
+    Parameters
+    ----------
+    number : int
+        How many.
+    noun : str
+        In the singular.
+    """
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def listed(names: Iterable[str]) -> str:
-    """Return the first few names, and how many more there are."""
+    """Return the first names, and how many more there are.
+
+    Parameters
+    ----------
+    names : iterable of str
+        All of them; the first five are listed.
+    """
     names = list(names)
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return "; ".join(names[:_NAMED]) + more
@@ -237,15 +303,15 @@ def listed(names: Iterable[str]) -> str:
 
 _QUARTER_HOUR_S = 900.0
 _DAY_S = 86_400.0
-#: A shift by whole quarter hours is taken for a wrong time zone where it lifts the share of readings covered from below the
-#: first to above the second.
+#: A shift by whole quarter hours counts as a wrong time zone where it raises the share of readings within the frames from below
+#: the first value to above the second.
 _COVERED_NOW, _COVERED_SHIFTED = 0.6, 0.95
 
 
-def check_clocks(
+def _raise_if_clocks_disagree(
     deviations: xr.Dataset, frame_time: NDArray[np.datetime64], *, clock_offset_s: float | None, source: str
-) -> list[Notice]:
-    """Return a notice for readings outside the frames' time; refuse recordings that never meet or differ by a time zone.
+) -> None:
+    """Raise if the recordings do not overlap in time or their clocks differ by a time zone.
 
     Parameters
     ----------
@@ -270,9 +336,7 @@ def check_clocks(
     frames = camera_on_laser_clock(frame_time, clock_offset_s or 0.0)
     covered = _covered(readings, frames, 0.0)
     shift = _likely_zone_shift(readings, frames)
-    span = (
-        f"frames {shown(frames[0])} to {shown(frames[-1])}, readings {shown(readings.min())} to {shown(readings.max())}"
-    )
+    span = f"frames {_shown(frames[0])} to {_shown(frames[-1])}, readings {_shown(readings.min())} to {_shown(readings.max())}"
     if covered < _COVERED_NOW and shift is not None:
         raise AlignmentError(
             f"{source}: the clocks look {abs(shift) / 3600:g} h apart, as in two time zones ({span}, so {covered:.0%} of the readings lie "
@@ -284,17 +348,16 @@ def check_clocks(
             f"{source}: frames and readings never meet ({span}); set thermography.clock_offset (camera clock minus laser clock), "
             "or check that both folders belong to the same test"
         )
-    return []
 
 
 def _covered(readings: NDArray[np.datetime64], frames: NDArray[np.datetime64], shift_s: float) -> float:
-    """Return the share of readings between the first and the last frame, the frames being `shift_s` earlier than they say."""
+    """Return the share of readings between the first and the last frame, with the frames moved back by `shift_s`."""
     shift = np.timedelta64(round(shift_s * 1e9), "ns")
     return float(np.mean((readings >= frames[0] - shift) & (readings <= frames[-1] - shift)))
 
 
 def _likely_zone_shift(readings: NDArray[np.datetime64], frames: NDArray[np.datetime64]) -> float | None:
-    """Return the shift in s by whole quarter hours within a day that makes frames and readings meet best, if nearly all do."""
+    """Return the shift in s by whole quarter hours within a day of the best overlap, None unless nearly all readings are covered."""
     shifts = np.arange(-_DAY_S, _DAY_S + 1, _QUARTER_HOUR_S)
     shares = np.array([_covered(readings, frames, float(shift)) for shift in shifts])
     best = np.flatnonzero(shares == shares.max())
@@ -302,6 +365,6 @@ def _likely_zone_shift(readings: NDArray[np.datetime64], frames: NDArray[np.date
     return float(shifts[nearest]) if shares[nearest] >= _COVERED_SHIFTED and shifts[nearest] != 0 else None
 
 
-def shown(time: np.datetime64) -> str:
+def _shown(time: np.datetime64) -> str:
     """Return a time to the second with its zone."""
     return f"{np.datetime_as_string(time, unit='s')}Z"

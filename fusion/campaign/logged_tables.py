@@ -28,7 +28,7 @@ from interferometry.io.delimited import (
     read_timed_rows,
 )
 
-#: What pandas says of a line that has more fields than the header.
+#: Warning of pandas about a line with more fields than the header.
 _SKIPPED = re.compile(r"Skipping line (\d+): expected (\d+) fields, saw (\d+)")
 _HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
 
@@ -39,6 +39,13 @@ class TableError(CampaignError):
 
 def split_heading(path: Path, heading: str) -> tuple[str, str]:
     """Return name and unit of a heading such as ``"t1 [degC]"`` or ``"t1(°C)"``.
+
+    Parameters
+    ----------
+    path : Path
+        File, for the message.
+    heading : str
+        Heading of a column.
 
     Raises
     ------
@@ -56,6 +63,13 @@ def split_heading(path: Path, heading: str) -> tuple[str, str]:
 def match_columns(patterns: Iterable[str], headings: Iterable[str]) -> tuple[str, ...]:
     """Return the headings that column names or patterns (``*`` for any text) select, in the order of the file.
 
+    Parameters
+    ----------
+    patterns : iterable of str
+        Names or patterns; brackets stand for themselves.
+    headings : iterable of str
+        Headings of the file.
+
     Raises
     ------
     CampaignError
@@ -65,15 +79,20 @@ def match_columns(patterns: Iterable[str], headings: Iterable[str]) -> tuple[str
     selected: set[str] = set()
     for pattern in patterns:
         escaped = pattern.replace("[", "[[]")
-        found = {heading for heading in headings if heading == pattern or fnmatch.fnmatchcase(heading, escaped)}
-        if not found:
+        matching = {heading for heading in headings if heading == pattern or fnmatch.fnmatchcase(heading, escaped)}
+        if not matching:
             raise CampaignError(f'no column is named "{pattern}"; the file has: {", ".join(headings)}')
-        selected |= found
+        selected |= matching
     return tuple(heading for heading in headings if heading in selected)
 
 
 def read_drivers(path: Path) -> xr.Dataset:
-    """Read what else was logged: a column ``time`` and columns named ``"name [unit]"``.
+    """Read logged drivers: a column ``time`` and columns named ``"name [unit]"``.
+
+    Parameters
+    ----------
+    path : Path
+        CSV with a header; see the README for the accepted times.
 
     Returns
     -------
@@ -99,6 +118,11 @@ def read_drivers(path: Path) -> xr.Dataset:
 
 def read_record(campaign: Campaign) -> xr.Dataset:
     """Read a ``[record]``: temperatures, displacements and drivers over time.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        A checked campaign with a ``[record]``.
 
     Returns
     -------
@@ -154,7 +178,7 @@ def read_record(campaign: Campaign) -> xr.Dataset:
             "driver_units": (("driver_name",), np.array(driver_units, dtype=object)),
         },
         coords={"time": time[keep][order], "sensor": sensors, "channel": channels, "driver_name": drivers},
-        attrs={"source": path.name, "left_out": json.dumps([asdict(one) for one in left_out])},
+        attrs={"source": path.name, "left_out": json.dumps([asdict(line) for line in left_out])},
     )
 
 
@@ -176,7 +200,7 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, list[RejectedLine]]:
     with path.open(encoding="utf-8-sig") as file:
         before, header = find_header(file)
     delimiter = delimiter_of(header)
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", pd.errors.ParserWarning)
         frame = pd.read_csv(
             path,
@@ -189,11 +213,11 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, list[RejectedLine]]:
             on_bad_lines="warn",
             encoding="utf-8-sig",
         )
-    if any("loss of data" in str(one.message) for one in told):
+    if any("loss of data" in str(warning.message) for warning in caught):
         raise FusionError("the lines hold more fields than the header names; name every column")
     # Lines are counted in the file.
     frame.index += before
-    skipped = [found for one in told for found in _SKIPPED.findall(str(one.message))]
+    skipped = [fields for warning in caught for fields in _SKIPPED.findall(str(warning.message))]
     return frame, [
         RejectedLine(path.name, int(line), f"{saw} fields", f"{due} were expected") for line, due, saw in skipped
     ]

@@ -6,6 +6,7 @@ Where a key stands in a TOML file, so that an error can name the line.
 from __future__ import annotations
 
 import difflib
+import json
 import re
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -29,13 +30,31 @@ _REMEDIES = {
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
-    """Return ``"did you mean X? "`` for the nearest known name, or nothing where none is near."""
+    """Return ``"did you mean X? "`` for the nearest known name, or nothing where none is near.
+
+    Parameters
+    ----------
+    name : str
+        What was written.
+    known : iterable of str
+        What could have been meant.
+    """
     near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
     return f"did you mean {near[0]}? " if near else ""
 
 
 def describe(item: ErrorDetails, model: type[BaseModel], place: Place) -> str:
-    """Turn one pydantic error of a `model` into a sentence with place, key, value and remedy."""
+    """Turn one pydantic error of a `model` into a sentence with place, key, value and remedy.
+
+    Parameters
+    ----------
+    item : dict
+        Error of pydantic.
+    model : type of BaseModel
+        Model that was validated; its aliases are the keys of the file.
+    place : callable
+        From the path of a key to file and line.
+    """
     names = tuple(
         part for part in item["loc"] if isinstance(part, str) and not part.startswith(("function-", "tuple["))
     )
@@ -57,9 +76,8 @@ def describe(item: ErrorDetails, model: type[BaseModel], place: Place) -> str:
 
 
 def _shown(value: object) -> str:
-    if isinstance(value, str):
-        return f'"{value}"'
-    text = str(value).lower() if isinstance(value, bool) else str(value)
+    """Return a value as it is written in TOML, cut where it is long."""
+    text = json.dumps(value, ensure_ascii=False, default=str)
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
@@ -88,6 +106,16 @@ def key_lines(text: str) -> dict[tuple[str, ...], int]:
     """Return the line number (from 1) of every key and table header of a TOML text.
 
     Keys inside inline tables have no line of their own; `find_line` answers with that of the key that holds them.
+
+    Parameters
+    ----------
+    text : str
+        Content of a TOML file.
+
+    Returns
+    -------
+    dict
+        Line by path of the key.
     """
     lines: dict[tuple[str, ...], int] = {}
     table: tuple[str, ...] = ()
@@ -103,7 +131,15 @@ def key_lines(text: str) -> dict[tuple[str, ...], int]:
 
 
 def find_line(lines: dict[tuple[str, ...], int], path: tuple[str, ...]) -> int:
-    """Return the line of a key, else that of the nearest table or key that would hold it, else 1."""
+    """Return the line of a key, else that of the nearest table or key that would hold it, else 1.
+
+    Parameters
+    ----------
+    lines : dict
+        Result of `key_lines`.
+    path : tuple of str
+        Path of a key.
+    """
     for depth in range(len(path), 0, -1):
         if path[:depth] in lines:
             return lines[path[:depth]]

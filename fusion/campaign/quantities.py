@@ -8,7 +8,7 @@ import re
 from fusion.errors import FusionError
 
 #: Accepted units per canonical unit, as ``(factor, offset)``: canonical = value * factor + offset.
-UNITS: dict[str, dict[str, tuple[float, float]]] = {
+_UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "mm": {
         "nm": (1e-6, 0.0), "um": (1e-3, 0.0), "mm": (1.0, 0.0), "cm": (10.0, 0.0), "m": (1e3, 0.0), "in": (25.4, 0.0),
     },
@@ -45,7 +45,13 @@ class QuantityError(FusionError):
 
 
 def unit_name(text: str) -> str:
-    """Return the house spelling of a unit (``"°C"`` -> ``"degC"``), or the text itself where none is known."""
+    """Return the house spelling of a unit (``"°C"`` -> ``"degC"``), or the text itself where none is known.
+
+    Parameters
+    ----------
+    text : str
+        Unit as it was written.
+    """
     text = text.strip()
     return _SPELLINGS.get(text) or _WORDS.get(text.lower(), text)
 
@@ -53,12 +59,24 @@ def unit_name(text: str) -> str:
 def conversion(unit: str, target: str) -> tuple[float, float]:
     """Return ``(factor, offset)`` that bring values in `unit` to the canonical unit `target`.
 
+    Parameters
+    ----------
+    unit : str
+        Unit as it was written.
+    target : str
+        Canonical unit: mm, um, degC, s, ppm/K or mm/min.
+
+    Returns
+    -------
+    tuple of float
+        ``value * factor + offset`` is in the unit `target`.
+
     Raises
     ------
     QuantityError
         If `unit` does not measure what `target` measures.
     """
-    known = UNITS[target]
+    known = _UNITS[target]
     name = unit_name(unit)
     if name not in known:
         raise QuantityError(f'"{unit}" is not a unit of {_KINDS[target]}; use one of {", ".join(known)}')
@@ -73,7 +91,7 @@ def read_quantity(value: object, target: str) -> float:
     value : object
         Text such as ``"5 mm"``; anything else is refused, a bare number because its unit would be a guess.
     target : str
-        Canonical unit, a key of `UNITS`.
+        Canonical unit, a key of `_UNITS`.
 
     Raises
     ------

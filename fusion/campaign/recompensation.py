@@ -1,4 +1,4 @@
-"""The laser's compensation in a campaign: left as recorded, or undone and done again with logged air and the axis' own temperature."""
+"""Compensation of the laser in a campaign: as recorded, or repeated with the logged air and the temperature of the axis."""
 
 from __future__ import annotations
 
@@ -25,12 +25,22 @@ _NO_LOG = "log air temperature, pressure and humidity, and name the file as [int
 
 
 class RecompensationError(CampaignError):
-    """The compensation cannot be done again with what the campaign holds; the message says what is missing."""
+    """The compensation cannot be repeated with the data of the campaign; the message says what is missing."""
 
 
 @dataclass(frozen=True)
 class Compensated:
-    """Readings as they are to be evaluated, what their evaluation by ISO 230-2 has to allow for, and what the user should know."""
+    """Readings as they are to be evaluated.
+
+    Attributes
+    ----------
+    deviations : Dataset
+        Keeps ``interferometry.contract.DEVIATIONS``.
+    budget : Iso230Budget or None
+        Uncertainty contributions to ISO 230-2 values; None for readings as recorded.
+    notices : list of Notice
+        What was done, or could not be done.
+    """
 
     deviations: xr.Dataset
     budget: Iso230Budget | None = None
@@ -39,7 +49,15 @@ class Compensated:
 
 @dataclass(frozen=True)
 class SeenMaterial:
-    """Temperature of the measured length as the camera saw it, (cycle, direction, target) in degC, and its standard uncertainty in K."""
+    """Temperature of the measured length from the camera.
+
+    Attributes
+    ----------
+    temperature : (cycle, direction, target) DataArray
+        Mean between axis position 0 and the target at the time of the reading, degC.
+    u_K : float
+        Standard uncertainty, K.
+    """
 
     temperature: xr.DataArray
     u_K: float
@@ -50,22 +68,32 @@ def compensate_readings(
     environment: xr.Dataset | None,
     table: InterferometryTable,
     *,
-    seen: SeenMaterial | None = None,
+    material: SeenMaterial | None = None,
 ) -> Compensated:
-    """Leave the readings as the instrument compensated them, but for a dead path; or compensate them again.
+    """Leave the readings as the instrument compensated them, apart from a stated dead path; or compensate them again.
 
     Parameters
     ----------
-    deviations : Dataset keeping ``interferometry.contract.DEVIATIONS``
-    environment : Dataset along ``time``, or None where none was logged
-    table : ``[interferometry]`` of the campaign
-    seen : what takes the place of the logged probe
+    deviations : Dataset
+        Keeps ``interferometry.contract.DEVIATIONS``.
+    environment : Dataset or None
+        Log of air and material along ``time``; None where it was not logged.
+    table : InterferometryTable
+        ``[interferometry]`` of the campaign.
+    material : SeenMaterial, optional
+        Temperature of the measured length in place of the logged probe.
+
+    Returns
+    -------
+    Compensated
+        New readings; the given ones are not changed.
 
     Raises
     ------
-    RecompensationError, CompensationError
-        No air was logged, or not at the times of the readings; the factor that the file states is impossible; keys contradict
-        each other.
+    RecompensationError
+        If the air was not logged or keys of the campaign contradict each other.
+    CompensationError
+        If the log does not cover the readings or the stated environment factor is impossible.
     """
     if table.compensation == "as recorded":
         if table.material_temperature == "camera" or table.environment_factor_mm is not None:
@@ -73,35 +101,35 @@ def compensate_readings(
                 'material_temperature = "camera" and environment_factor under [interferometry] belong to compensation = "redo"; '
                 "add it, or leave them out"
             )
-        corrected, notices = correct_dead_path(deviations, environment, table.dead_path_mm)
+        corrected, notices = _correct_dead_path(deviations, environment, table.dead_path_mm)
         return Compensated(corrected, None, notices)
     if environment is None:
         raise RecompensationError(f'[interferometry] compensation = "redo" needs the air: {_NO_LOG}')
     log, coefficient = environment.dropna("time"), table.expansion_coefficient_ppm_per_K
-    stated = stated_factor_um(deviations, table)
+    stated = _stated_factor_um(deviations, table)
     applied = stated or followed_factor_um(deviations, log, expansion_coefficient_ppm_per_K=coefficient)
-    sensors = SensorUncertainty() if seen is None else SensorUncertainty(material_temperature_K=seen.u_K)
+    sensors = SensorUncertainty() if material is None else SensorUncertainty(material_temperature_K=material.u_K)
     redone = compensate(
         deviations,
         log,
         applied_factor_um=applied,
         expansion_coefficient_ppm_per_K=coefficient,
-        material_temperature_degC=None if seen is None else seen.temperature,
+        material_temperature_degC=None if material is None else material.temperature,
         dead_path_mm=abs(table.dead_path_mm),
         away=table.dead_path_mm >= 0,
         uncertainty=sensors,
     )
-    material = log["material_temperature"] if seen is None else seen.temperature
+    temperature = log["material_temperature"] if material is None else material.temperature
     budget = Iso230Budget(
         machine_temperature_K=sensors.material_temperature_K,
         expansion_coefficient_ppm_per_K=sensors.expansion_coefficient_ppm_per_K,
-        difference_from_20_degC_K=abs(float(material.mean()) - REFERENCE_TEMPERATURE_DEGC),
+        difference_from_20_degC_K=abs(float(temperature.mean()) - REFERENCE_TEMPERATURE_DEGC),
         nominal_expansion_ppm_per_K=coefficient,
     )
-    return Compensated(redone, budget, [_redone(redone, stated is not None, seen)])
+    return Compensated(redone, budget, [_redone(redone, stated is not None, material)])
 
 
-def stated_factor_um(deviations: xr.Dataset, table: InterferometryTable) -> tuple[float, float] | None:
+def _stated_factor_um(deviations: xr.Dataset, table: InterferometryTable) -> tuple[float, float] | None:
     """Return the environment factors at the start and the end of the test in um, None where neither campaign nor file states them."""
     if table.environment_factor_mm is not None:
         start, end = table.environment_factor_mm
@@ -112,33 +140,44 @@ def stated_factor_um(deviations: xr.Dataset, table: InterferometryTable) -> tupl
     return (float(start), float(end)) if np.isfinite([start, end]).all() else None
 
 
-def _redone(redone: xr.Dataset, stated: bool, seen: SeenMaterial | None) -> Notice:
+def _redone(redone: xr.Dataset, stated: bool, material: SeenMaterial | None) -> Notice:
+    """Return the notice that says what the new compensation replaced, and by how much it moved the readings."""
     added = redone["correction_scale"] + redone["correction_dead_path"]
     undone = (
         "the environment factor that the instrument applied"
         if stated
         else "a compensation that followed the logged air and the logged probe"
     )
-    material = (
+    probe = (
         "the logged probe"
-        if seen is None
-        else f"the temperature that the camera saw along the axis (u {seen.u_K:.2g} K)"
+        if material is None
+        else f"the temperature that the camera measured along the axis (u {material.u_K:.2g} K)"
     )
     u = float(redone["compensation_u"].max())
     return Notice(
         "compensation_redone",
-        f"The laser's compensation was done again: {undone} was taken out, the logged air and {material} put in. This moved the "
-        f"readings by {float(added.min()):+.2f} to {float(added.max()):+.2f} um; standard uncertainty up to {u:.2f} um.",
-        'nothing; compensation = "as recorded" under [interferometry] leaves the readings as they are',
+        f"The laser's compensation was done again: {undone} was removed, the logged air and {probe} were used instead. This moved the "
+        f"readings by {float(added.min()):+.2f} to {float(added.max()):+.2f} µm; standard uncertainty up to {u:.2f} µm. "
+        'The setting compensation = "as recorded" under [interferometry] leaves the readings as they are.',
+        "",
         float(np.abs(added).max()),
     )
 
 
 def see_material(fields: xr.Dataset, axis: AxisGeometry, deviations: xr.Dataset) -> SeenMaterial:
-    """Return the mean temperature that the camera saw between axis position 0 and each target, at each reading's time.
+    """Return the mean temperature that the camera measured between axis position 0 and each target, at the time of each reading.
 
-    Readings before the first or after the last frame take that frame. The camera's accuracy (the data sheet's +-2 K) is the same
-    error in every frame and place: it does not average out along the axis, but it makes no drift.
+    Readings before the first or after the last frame take the temperature of that frame. The camera's accuracy (data sheet: ±2 K) is
+    one common error of all frames and places: it does not average out along the axis, but causes no drift.
+
+    Parameters
+    ----------
+    fields : Dataset
+        Keeps ``thermography.contract.FIELDS``, on the laser's clock.
+    axis : AxisGeometry
+        Where the measured line lies on the plan.
+    deviations : Dataset
+        Keeps ``interferometry.contract.DEVIATIONS``.
     """
     position = deviations["position"].values
     line = MeasuredLine(fields, axis, position)
@@ -152,12 +191,12 @@ def see_material(fields: xr.Dataset, axis: AxisGeometry, deviations: xr.Dataset)
     return SeenMaterial(deviations["deviation"].copy(data=at_readings), u_K)
 
 
-def correct_dead_path(
+def _correct_dead_path(
     deviations: xr.Dataset, environment: xr.Dataset | None, dead_path_mm: float
 ) -> tuple[xr.Dataset, list[Notice]]:
-    """Take out what the air of a known dead path adds to the readings, for a reflector that moves away from the laser.
+    """Subtract the error of the air in a known dead path, for a reflector that moves away from the laser.
 
-    The readings' own path is left as the instrument compensated it.
+    The measured path is left as the instrument compensated it.
     """
     if dead_path_mm == 0.0:
         return deviations, []
@@ -166,17 +205,17 @@ def correct_dead_path(
         return deviations, [Notice("dead_path_uncorrected", message, _NO_LOG)]
     log = environment.dropna("time")
     start = log["time"].values[0]
-    at, known = (
+    readings_s, log_s = (
         (times.astype("datetime64[ns]") - start) / np.timedelta64(1, "s")
         for times in (deviations["time"].values, log["time"].values)
     )
     names = ("air_temperature", "air_pressure", "relative_humidity")
-    index = air_index(*(np.interp(at, known, log[name].values) for name in names))
-    first = float(index.ravel()[np.nanargmin(at)])
+    index = air_index(*(np.interp(readings_s, log_s, log[name].values) for name in names))
+    first = float(index.ravel()[np.nanargmin(readings_s)])
     error = dead_path_error_um(index, first, dead_path_mm=dead_path_mm)
     size = float(np.nanmax(error) - np.nanmin(error))
-    message = f"The dead path of {dead_path_mm:g} mm is corrected for the logged air: {size:.2f} um from least to most."
+    message = f"The dead path of {dead_path_mm:g} mm is corrected for the logged air: {size:.2f} µm from least to most."
     corrected = deviations.assign(deviation=deviations["deviation"] - error)
     corrected["deviation"].attrs.update(deviations["deviation"].attrs)
-    remedy = "nothing, unless the reflector moves towards the laser: then give the dead path a minus sign"
+    remedy = "Give the dead path a minus sign if the reflector moves towards the laser."
     return corrected, [Notice("dead_path_corrected", message, remedy, size)]

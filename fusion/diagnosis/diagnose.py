@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
+from fusion.diagnosis.causes import CAUSES
 from fusion.diagnosis.explanations import (
     LAGS_S,
     ProfileFit,
@@ -31,8 +32,7 @@ from fusion.diagnosis.explanations import (
     warm_up_share,
 )
 from fusion.diagnosis.scatter import ScatterFit, fit_scatter
-
-Cause = Literal["structural", "local_temperature", "stick_slip", "step", "undetermined"]
+from fusion.products.results import Cause
 
 #: Minimum probability of each cause, set and checked on simulated campaigns by tests/soak/test_diagnosis_rates.py.
 THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "stick_slip": 0.4, "step": 0.6}
@@ -44,15 +44,6 @@ APPROACH_NATS = {"along": 2.1, "one_direction": 4.0, "slow": 2.0}
 WARM_UP_SHARE = 0.98
 #: Levels of the bootstrap tests; local temperature is the cause that costs most when it is wrong.
 LEVELS = {"step": 0.05, "local_temperature": 0.02}
-
-CHECKS: dict[str, str] = {
-    "structural": "guideway, screw and nut at this position: preload, wear, contamination, loose scale or cover; repeat at small "
-    "steps around it",
-    "local_temperature": "what heats the table here (drive, pipe, chips, sun); repeat with that source switched on and off",
-    "stick_slip": "lubrication, seals and wipers, drive gain at low speed; repeat at another feed rate and after lubrication",
-    "step": "fixture, optics and clamps at the time of the step; look for an event in the machine's log",
-    "undetermined": "repeat with a varied duty cycle and a temperature sensor at this position, or with more cycles",
-}
 
 
 class Flagged(Protocol):
@@ -241,9 +232,9 @@ def _judge(case: _Case, direction: str) -> Diagnosis:
     against = _objections(case, leading, probability[leading])
     cause: Cause = "undetermined" if against or leading == "slow" else leading  # type: ignore[assignment]
     runner_up = max((name for name in probability if name != leading), key=lambda name: probability[name])
-    against.append(f"next best explanation: {runner_up}, probability {probability[runner_up]:.2f}")
+    against.append(f"next best explanation: {_in_words(runner_up)}, probability {probability[runner_up]:.2f}")
     against += [
-        f"{name}: p = {fit.p_value:.3f}, so a random walk alone can explain it"
+        f"{_in_words(name)}: p = {fit.p_value:.3f}, so a random walk alone can explain it"
         for name, fit in case.tested.items()
         if fit.p_value > LEVELS[name]
     ]
@@ -255,8 +246,13 @@ def _judge(case: _Case, direction: str) -> Diagnosis:
         evidence=_evidence(case, probability),
         for_it=tuple(_support(case, leading)),
         against_it=tuple(against),
-        check=CHECKS[cause],
+        check=CAUSES[cause].check,
     )
+
+
+def _in_words(explanation: str) -> str:
+    """Return the name of an explanation in words; a random walk is no cause."""
+    return "random walk" if explanation == "slow" else CAUSES[explanation].words  # type: ignore[index]
 
 
 def _objections(case: _Case, leading: str, probability: float) -> list[str]:
@@ -264,7 +260,7 @@ def _objections(case: _Case, leading: str, probability: float) -> list[str]:
     reasons = []
     threshold = THRESHOLDS.get(leading, 0.0)
     if probability < threshold:
-        reasons.append(f"probability {probability:.2f} of {leading} is below its threshold {threshold:.2f}")
+        reasons.append(f"probability {probability:.2f} of {_in_words(leading)} is below its threshold {threshold:.2f}")
     fit = case.tested.get(leading)
     if fit is not None and fit.hold_out_gain <= 0:
         reasons.append(
@@ -273,7 +269,7 @@ def _objections(case: _Case, leading: str, probability: float) -> list[str]:
     if leading == "local_temperature" and case.temperature is not None:
         positive, negative = case.temperature.by_direction
         if positive * negative < 0:
-            reasons.append(f"the sign differs between directions ({positive:+.3f} and {negative:+.3f} um/K)")
+            reasons.append(f"the sign differs between directions ({positive:+.3f} and {negative:+.3f} µm/K)")
         if case.warm_up_share >= WARM_UP_SHARE:
             reasons.append(
                 f"{case.warm_up_share:.1%} of the local temperature's variance is one warm-up curve: collinear with any other slow cause"
@@ -287,23 +283,23 @@ def _support(case: _Case, leading: str) -> list[str]:
     """Return the sentences in favour of the leading explanation."""
     residual = case.residual
     scatter = float(np.nanstd(residual.values))
-    sentences = [f"standard deviation {scatter:.2f} um, typical of the other targets {residual.typical_um:.2f} um"]
+    sentences = [f"standard deviation {scatter:.2f} µm, typical of the other targets {residual.typical_um:.2f} µm"]
     if leading == "step":
         fit = case.step
         sentences.append(
-            f"step of {fit.coefficient:+.2f} +- {fit.coefficient_u:.2f} um at cycle {case.step_cycle} (p = {fit.p_value:.3f}), "
+            f"step of {fit.coefficient:+.2f} ± {fit.coefficient_u:.2f} µm at cycle {case.step_cycle} (p = {fit.p_value:.3f}), "
             f"hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
         )
     elif leading == "local_temperature" and case.temperature is not None:
         fit = case.temperature
         sentences.append(
-            f"{fit.coefficient:+.3f} +- {fit.coefficient_u:.3f} um per K of local temperature rise, lag {LAGS_S[fit.best]:.0f} s "
+            f"{fit.coefficient:+.3f} ± {fit.coefficient_u:.3f} µm per K of local temperature rise, lag {LAGS_S[fit.best]:.0f} s "
             f"(p = {fit.p_value:.3f}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
         )
     elif leading == "stick_slip":
         positive, negative = residual.scatter_um
         sentences.append(
-            f"standard deviation {positive:.2f} um in the positive direction, {negative:.2f} um in the negative direction"
+            f"standard deviation {positive:.2f} µm in the positive direction, {negative:.2f} µm in the negative direction"
         )
         sentences.append(
             f"scatter that depends on the direction of approach raises the log-likelihood by {case.approach_gain:+.1f} nats"

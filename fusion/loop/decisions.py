@@ -88,9 +88,9 @@ _SENTENCES: Mapping[Reason, str] = {
     Reason.TOO_MANY_EVENTS: "more than {most} events would be needed: that is a switching, for which the library has no name",
     Reason.HOLD_OUT_ERROR: (
         "withdrawn: it was found in the training part (p = {p_value:.2g}), but the error on the hold-out set is not smaller with it "
-        "({without_um:.3g} um without, {with_um:.3g} um with)"
+        "({without_um:.3g} µm without, {with_um:.3g} µm with)"
     ),
-    Reason.SECOND_LOOK_ERROR: "withdrawn: the error on the hold-out set rose from {without_um:.3f} to {with_um:.3f} um with it",
+    Reason.SECOND_LOOK_ERROR: "withdrawn: the error on the hold-out set rose from {without_um:.3f} to {with_um:.3f} µm with it",
     Reason.WRONG_PATTERN: (
         "withdrawn: its course in time is present, but the pattern along the axis and by direction is not that of this effect "
         "(p = {p_value:.1g})"
@@ -102,7 +102,7 @@ _SENTENCES: Mapping[Reason, str] = {
     Reason.BESIDE_WRONG_PATTERN: "withdrawn: it was found beside {beside}, whose name was withdrawn afterwards",
     Reason.NOT_REPEATED: (
         "withdrawn: it was found in the training part (p = {p_value:.2g}), but the {parts} earlier part(s) of the record on which the same "
-        "procedure added it were predicted no better ({without_um:.3g} to {with_um:.3g} um)"
+        "procedure added it were predicted no better ({without_um:.3g} to {with_um:.3g} µm)"
     ),
 }
 

@@ -14,7 +14,7 @@ from fusion.campaign.inputs import Source, counted
 from fusion.diagnosis.residual_tests import ResidualTests, examine_residual
 from fusion.effects.effect import Effect, Prior
 from fusion.effects.library import library
-from fusion.effects.thermal import EXPANSION_U_PPM_PER_K, QUASI_STATIC
+from fusion.effects.thermal import EXPANSION_U_PPM_PER_K
 from fusion.loop.axis import close_loop, on_corrected_fields, set_aside_sites
 from fusion.loop.camera_correction import FieldError, correct_fields, corrected_variables, find_field_errors
 from fusion.loop.result import LoopResult
@@ -24,11 +24,6 @@ from fusion.products import store
 from fusion.products.grouped import joined
 from fusion.products.progress import Report
 from fusion.products.results import Notice, Outcome
-
-
-def effect_names() -> tuple[str, ...]:
-    """Return the names that a campaign may declare, a user's own effects included."""
-    return (*library(), QUASI_STATIC)
 
 
 @dataclass(frozen=True)

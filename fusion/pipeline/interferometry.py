@@ -26,7 +26,18 @@ LABELS = {
 
 
 def evaluate_interferometry(source: Source) -> Outcome:
-    """Evaluate the readings conventionally, by the paper's differences, by ISO 230-2 and by the joint estimate."""
+    """Evaluate the readings conventionally, by the paper's differences, by ISO 230-2 and by the joint estimate.
+
+    Parameters
+    ----------
+    source : Source
+        Inputs of the campaign; its readings are compensated.
+
+    Returns
+    -------
+    Outcome
+        Content of deviations.nc; parts ``iso230``, ``neighbours`` and ``drift``.
+    """
     deviations = source.deviations
     drift = estimate_drift(deviations)
     deviations = flag_outliers(deviations, drift)
@@ -42,7 +53,7 @@ def evaluate_interferometry(source: Source) -> Outcome:
         drift=drift,
     )
     parts = {
-        "iso230": iso_part(windows),
+        "iso230": _iso_part(windows),
         "neighbours": {
             "conventional_s_um": by_direction(comparison["conventional"]),
             "pair_s_um": by_direction(comparison["differenced"]),
@@ -54,10 +65,10 @@ def evaluate_interferometry(source: Source) -> Outcome:
             "scatter_um": by_direction(drift["scatter"]),
         },
     }
-    return Outcome(dataset, parts, tuple(reading_notices(deviations, drift)))
+    return Outcome(dataset, parts, tuple(_reading_notices(deviations, drift)))
 
 
-def reading_notices(deviations: xr.Dataset, drift: xr.Dataset) -> list[Notice]:
+def _reading_notices(deviations: xr.Dataset, drift: xr.Dataset) -> list[Notice]:
     """Return notices for missing readings, with what they cost the profile, and for readings that were given little weight."""
     notices = []
     gaps = np.isnan(deviations["deviation"].values)
@@ -69,8 +80,9 @@ def reading_notices(deviations: xr.Dataset, drift: xr.Dataset) -> list[Notice]:
             Notice(
                 "readings_missing",
                 f"{counted(int(gaps.sum()), 'reading')} of {gaps.size} missing, in {counted(len(cycles), 'cycle')}: {listed(cycles)}. "
-                f"This widens the profile's standard uncertainty by up to {wider:.3f} µm.",
-                "Nothing has to be done: the joint estimate allows for gaps; conventional values use the readings that are there.",
+                f"This widens the profile's standard uncertainty by up to {wider:.3f} µm. The joint estimate allows for gaps; conventional "
+                "values use the remaining readings.",
+                remedy="",
                 effect_um=wider,
             )
         )
@@ -83,14 +95,14 @@ def reading_notices(deviations: xr.Dataset, drift: xr.Dataset) -> list[Notice]:
         notices.append(
             Notice(
                 "outliers",
-                f"{counted(len(named), 'reading')} far from the joint estimate given little weight: {listed(named)}.",
-                "Look at what happened there; flagged in deviations.nc, still in the conventional values.",
+                f"{counted(len(named), 'reading')} far from the joint estimate down-weighted: {listed(named)}.",
+                "Check what happened at the down-weighted readings (flagged in deviations.nc); conventional values contain them.",
             )
         )
     return notices
 
 
-def iso_part(windows: xr.Dataset) -> dict[str, Any]:
+def _iso_part(windows: xr.Dataset) -> dict[str, Any]:
     """Return the axis values of the first window, as the standard's test would have found them."""
     first = windows.isel(window=0)
     values = {f"{name}_um": {"value": float(first[name]), "u": float(first[f"{name}_u"])} for name in iso230.QUANTITIES}
@@ -98,17 +110,40 @@ def iso_part(windows: xr.Dataset) -> dict[str, Any]:
 
 
 def by_direction(values: xr.DataArray) -> dict[str, list[float]]:
-    """Return an array over direction and target as lists per direction."""
+    """Return an array over direction and target as lists per direction.
+
+    Parameters
+    ----------
+    values : (direction, target) DataArray
+        One number per target and direction of approach.
+    """
     return {str(name): np.asarray(values.sel(direction=name), float).tolist() for name in values["direction"].values}
 
 
 def align_recordings(source: Source, fields: xr.Dataset, deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
-    """Give every reading the field, the environment and the drivers at its own time; note readings outside the frames' time."""
+    """Give every reading the field, the environment and the drivers at its own time; note readings outside the frames' time.
+
+    Parameters
+    ----------
+    source : Source
+        Inputs of the campaign.
+    fields : Dataset
+        Keeps ``thermography.contract.FIELDS``, on the laser's clock.
+    deviations : Dataset
+        Keeps ``interferometry.contract.DEVIATIONS``.
+
+    Returns
+    -------
+    Dataset
+        Result of `fusion.alignment.align.align`.
+    list of Notice
+        Readings that lie outside the frames.
+    """
     fused = align(deviations, fields, source.axis, environment=source.environment, drivers=source.drivers)
-    return fused, outside_notices(fused)
+    return fused, _outside_notices(fused)
 
 
-def outside_notices(fused: xr.Dataset) -> list[Notice]:
+def _outside_notices(fused: xr.Dataset) -> list[Notice]:
     """Return a notice for readings that lie outside the frames' time."""
     outside = (fused["deviation"].notnull() & ~fused["inside_frames"]).values
     if not outside.any():
@@ -118,7 +153,7 @@ def outside_notices(fused: xr.Dataset) -> list[Notice]:
         Notice(
             "readings_outside_frames",
             f"{counted(int(outside.sum()), 'reading')} outside the frames' time, in {counted(len(cycles), 'cycle')} ({listed(cycles)}); "
-            "evaluated, but without a part in what joins drift and field.",
+            "evaluated, but not used where drift and field are compared.",
             "Start the camera before the first cycle and stop it after the last one.",
         )
     ]

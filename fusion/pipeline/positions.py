@@ -8,6 +8,7 @@ from typing import Any
 
 import xarray as xr
 
+from fusion.diagnosis.causes import CAUSES
 from fusion.diagnosis.diagnose import Diagnosis, diagnose
 from interferometry.anomalies import Anomaly, detect_anomalies
 from interferometry.drift.estimate import estimate_drift
@@ -82,7 +83,8 @@ def temper(anomaly: Anomaly, diagnosis: Diagnosis) -> Diagnosis:
     if diagnosis.cause == "undetermined" or anomaly.p_value <= _CAUSE_LEVEL:
         return diagnosis
     doubt = f"the position itself is flagged only near the limit (p = {anomaly.p_value:.2g}); before a cause, it needs more cycles"
-    return replace(diagnosis, cause="undetermined", against_it=(doubt, *diagnosis.against_it))
+    check = CAUSES["undetermined"].check
+    return replace(diagnosis, cause="undetermined", check=check, against_it=(doubt, *diagnosis.against_it))
 
 
 def sites_of(positions: Sequence[JudgedPosition], targets: int) -> list[tuple[int, str]]:

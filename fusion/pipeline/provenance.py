@@ -1,4 +1,4 @@
-"""Where a result comes from: versions, inputs with their SHA-256, parameters, times, the command that was given."""
+"""Provenance of a run: versions, inputs with their SHA-256, parameters, times, and the command."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fusion.products.progress import Report, silent
 from fusion.products.store import file_sha256
 
 #: Packages whose version can change a number in the results.
-PACKAGES = (
+_PACKAGES = (
     "thermofuse", "numpy", "scipy", "xarray", "opencv-python-headless", "scikit-image", "numba", "imagecodecs", "OpenEXR",
     "GTC", "ref-index", "pandas", "h5netcdf",
 )  # fmt: skip
@@ -23,17 +23,30 @@ PACKAGES = (
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of every package that takes part in the calculation."""
-    found = {"python": platform.python_version()}
-    for name in PACKAGES:
+    installed = {"python": platform.python_version()}
+    for name in _PACKAGES:
         try:
-            found[name] = metadata.version(name)
+            installed[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            installed[name] = "not installed"
+    return installed
 
 
 def hash_inputs(files: Mapping[str, Path], *, report: Report = silent) -> dict[str, dict[str, Any]]:
-    """Return size and SHA-256 of each input, keyed by its name relative to the campaign file."""
+    """Return size and SHA-256 of each input, keyed by its name relative to the campaign file.
+
+    Parameters
+    ----------
+    files : mapping of str to Path
+        Files by their name relative to the campaign file.
+    report : callable
+        ``report(label, done, total)``, for progress.
+
+    Returns
+    -------
+    dict
+        ``bytes`` and ``sha256`` by name.
+    """
     hashed = {}
     for done, (name, path) in enumerate(files.items()):
         report("input files", done, len(files))
@@ -45,23 +58,23 @@ def hash_inputs(files: Mapping[str, Path], *, report: Report = silent) -> dict[s
 def describe_run(
     campaign: Campaign, inputs: Mapping[str, Mapping[str, Any]], *, started: datetime, seconds: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Return the provenance record of a run; it names no machine and no user.
+    """Return the provenance of a run, without names of machine or user.
 
     Parameters
     ----------
     campaign : Campaign
-        What was asked for; stored as it was understood, with units in the names.
+        Stored as it was understood, with units in the names.
     inputs : mapping
         Result of `hash_inputs`.
     started : datetime
         Start of the run, UTC.
     seconds : mapping
-        Wall time of each stage in s; 0 for a stage that was taken over from an earlier run.
+        Wall time of each stage, s; 0 for a stage that was kept from an earlier run.
     """
     return {
         "software": "thermofuse",
         "versions": versions(),
-        "command": [Path(sys.argv[0]).name, *(_without_folder(argument) for argument in sys.argv[1:])],
+        "command": [Path(sys.argv[0]).stem, *(_without_folder(argument) for argument in sys.argv[1:])],
         "started": started.isoformat(timespec="seconds"),
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "stage_seconds": {name: round(value, 2) for name, value in seconds.items()},

@@ -112,8 +112,9 @@ def record_notices(record: Record) -> list[Notice]:
         notices.append(
             Notice(
                 "record_pauses",
-                f"Nothing was logged in {counted(pauses.size, 'pause')}, the longest {duration(float(pauses.max()))}.",
-                "Nothing has to be done: pauses are left out; drivers are interpolated linearly across the pause.",
+                f"Nothing was logged in {counted(pauses.size, 'pause')}, the longest {duration(float(pauses.max()))}; pauses are left out "
+                "and drivers interpolated linearly across them.",
+                "",
             )
         )
     missing = int(np.isnan(record.displacement).sum())
@@ -122,7 +123,7 @@ def record_notices(record: Record) -> list[Notice]:
             Notice(
                 "record_displacements_missing",
                 f"{counted(missing, 'block mean')} of {record.displacement.size} of the displacements missing; left out of every fit.",
-                "Nothing has to be done: the estimates allow for gaps.",
+                "",
             )
         )
     if record.duplicates:

@@ -1,4 +1,4 @@
-"""The main job: reads, checks contracts, calls the steps, writes products, records where everything comes from."""
+"""Run of a campaign: read and check, one stage after the other, products, provenance, report."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ from fusion.pipeline import attribution, drift_model, interferometry, thermal
 from fusion.pipeline import record as record_stage
 from fusion.pipeline.provenance import describe_run, hash_inputs, versions
 from fusion.products.progress import Report, silent
-from fusion.products.results import Notice, Outcome, assemble
+from fusion.products.results import Notice, Outcome, Results, assemble
 from fusion.products.store import (
     Product,
     StageStamps,
     annotate,
     digest,
     open_folder,
-    plain,
     read_dataset,
     read_tree,
     write_dataset,
@@ -44,7 +43,27 @@ FILES = {
 
 @dataclass
 class Run:
-    """One run of a campaign into one folder: what it was asked, what it found, how long each stage took."""
+    """One run of a campaign into one folder.
+
+    Attributes
+    ----------
+    campaign : Campaign
+        The checked campaign file.
+    folder : Path
+        Results folder.
+    report : callable
+        ``report(label, done, total)``, for progress.
+    stamps : StageStamps
+        Stages that are done.
+    inputs : mapping
+        Size and SHA-256 of each input.
+    started : datetime
+        Start of the run, UTC.
+    parts, notices : dict, list
+        Parts of results.json and notices of the stages so far.
+    seconds, keys : dict
+        Wall time (s) and input digest by stage.
+    """
 
     campaign: Campaign
     folder: Path
@@ -65,18 +84,18 @@ class Run:
         compute: Callable[[], Outcome[Product]],
         read: Callable[[Path], Product],
     ) -> Product:
-        """Return the product of a stage: computed and stamped, or taken over where the stamp says nothing has changed.
+        """Return the product of a stage: computed and stamped, or kept where its input has not changed.
 
         Parameters
         ----------
         name : str
             Name of the stage.
         tables : tuple of str
-            Tables of the campaign file that decide its result, with the files that they name.
+            Tables of the campaign file that its result depends on, with the files that they name.
         after : tuple of str
-            Stages it builds on; it is done again whenever one of them is.
+            Stages that its result depends on; it is computed again whenever one of them is.
         compute : callable
-            Does the work.
+            Computes the stage.
         read : callable
             Reads the product that a kept stage has written.
         """
@@ -101,13 +120,13 @@ class Run:
         return outcome.dataset
 
     def key_of(self, name: str, tables: tuple[str, ...], after: tuple[str, ...]) -> str:
-        """Return a digest of everything that decides the result of a stage."""
+        """Return a digest of everything that the result of a stage depends on."""
         asked = self.campaign.model_dump(mode="json", include=set(tables))
         files = {file: self.inputs[file] for table in tables for file in self.campaign.files_of(table)}
         return digest(name, versions(), asked, files, [self.keys[earlier] for earlier in after])
 
     def checkpoint(self, key: str) -> Path:
-        """Return the folder in which the cycles of a long recording are kept as they are finished; those of other input go."""
+        """Return the folder that keeps the finished cycles of a long recording; folders of other inputs are removed."""
         chosen = self.folder / ".stages" / f"cycles_{key[:16]}"
         for stale in chosen.parent.glob("cycles_*"):
             if stale != chosen:
@@ -115,7 +134,7 @@ class Run:
         return chosen
 
     def described(self, product: Product) -> Product:
-        """Return a product with what NetCDF files have to say of themselves."""
+        """Return a product with title, history and provenance."""
         history = f"{self.started.isoformat(timespec='seconds')} thermofuse run {self.campaign.path.name}"
         origin = {"software": "thermofuse", "versions": versions(), "inputs": dict(self.inputs)}
         return annotate(product, title=self.campaign.campaign.title, history=history, provenance=origin)
@@ -123,7 +142,7 @@ class Run:
 
 def run_campaign(
     path: str | Path, out: str | Path, *, resume: bool = False, scheduler: str | None = None, report: Report = silent
-) -> dict[str, Any]:
+) -> Results:
     """Run the whole pipeline on a campaign file and write its products.
 
     Parameters
@@ -133,7 +152,7 @@ def run_campaign(
     out : str or Path
         Results folder; must be empty or absent unless `resume`.
     resume : bool
-        Keep the stages that were finished from the same input, do the rest.
+        Keep the stages that were finished from the same input and compute the others.
     scheduler : str, optional
         Address of a dask scheduler for the per-frame work.
     report : callable
@@ -141,15 +160,25 @@ def run_campaign(
 
     Returns
     -------
-    dict
-        The content of ``results.json``.
+    Results
+        The content of ``results.json``, with every finding as an attribute.
 
     Raises
     ------
-    ValueError
-        A subclass of this package or of the instruments', when the input cannot be used; nothing is written then.
+    FusionError, ThermographyError, InterferometryError
+        If the input cannot be used, with file, place, value and remedy. What the checks before the first stage find leaves no folder.
+
+    Notes
+    -----
+    Products in `out`: ``results.json``, ``report.html``, ``fields.nc``, ``deviations.nc``, ``fusion.nc``, ``maps/``,
+    ``provenance.json``; each is written whole or not at all. The method is described in docs/method/index.md.
+
+    Every finding is an attribute of the result::
+
+        results = run_campaign("campaign.toml", "results")
+        accuracy, verdict = results.iso230.A_um, results.loop.verdict
     """
-    campaign = load_campaign(path, effect_names=drift_model.effect_names())
+    campaign = load_campaign(path)
     folder = Path(out)
     if campaign.record is not None:
         record = record_stage.read_source(campaign)
@@ -167,15 +196,15 @@ def _open_run(campaign: Campaign, folder: Path, *, resume: bool, report: Report)
     return Run(campaign, folder, report, StageStamps(folder), inputs, started)
 
 
-def _run_instruments(run: Run, source: Source, *, scheduler: str | None) -> dict[str, Any]:
-    """Run the main job on camera and laser, stage after stage."""
+def _run_instruments(run: Run, source: Source, *, scheduler: str | None) -> Results:
+    """Run a campaign with both instruments, stage after stage."""
     folder, report = run.folder, run.report
     run.notices.extend(source.notices)
-    seen = ("thermography", "plan", "interferometry")
-    checkpoint = run.checkpoint(run.key_of("fields", seen, ()))
+    tables = ("thermography", "plan", "interferometry")
+    checkpoint = run.checkpoint(run.key_of("fields", tables, ()))
     fields = run.stage(
         "fields",
-        seen,
+        tables,
         (),
         lambda: thermal.reduce_thermography(source, checkpoint=checkpoint, scheduler=scheduler, report=report),
         read_dataset,
@@ -212,20 +241,20 @@ def _run_instruments(run: Run, source: Source, *, scheduler: str | None) -> dict
     return _finish(run, {"fields": fields, "deviations": deviations, "fusion": fusion})
 
 
-def _run_record(run: Run, source: record_stage.RecordSource) -> dict[str, Any]:
-    """Run the main job on a record: one table, one stage."""
+def _run_record(run: Run, source: record_stage.RecordSource) -> Results:
+    """Run a record: one table, one stage."""
     record = run.stage(
         "record", ("record", "model"), (), lambda: record_stage.model_record(source, report=run.report), read_dataset
     )
     return _finish(run, {"record": record})
 
 
-def _finish(run: Run, datasets: Mapping[str, Any]) -> dict[str, Any]:
+def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
     """Write results, provenance and report from what the stages found."""
-    results = plain(assemble(run.campaign.campaign.title, run.parts, run.notices))
+    results = assemble(run.campaign.campaign.title, run.parts, run.notices)
     provenance = describe_run(run.campaign, run.inputs, started=run.started, seconds=run.seconds)
     run.report("report", 0, 1)
-    write_json(run.folder / "results.json", results)
+    write_json(run.folder / "results.json", results.as_json())
     write_json(run.folder / "provenance.json", provenance)
     write_text(run.folder / "report.html", render_report(results, provenance, datasets))
     run.report("report", 1, 1)

@@ -1,4 +1,4 @@
-"""The thermal stage: camera checked, plan registered, frames reduced to one field per cycle, everything left out told."""
+"""Thermal stage: check of the camera, registration of the plan, reduction to one field per cycle, notices of all omissions."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from thermography.radiometry.planck import calibrate
 from thermography.registration.clock_offset import estimate_clock_offset
 from thermography.registration.register import Registration, register
 
-#: The plan is registered on the mean of so many first frames: noise falls, and the table has hardly warmed yet.
+#: Number of first frames whose mean is registered: the noise falls, and the table has hardly warmed.
 _REGISTRATION_FRAMES = 5
-#: Of a video, so many frames at most are looked at for steps of the camera's zero: a step stays.
+#: Maximum number of frames examined for steps of the camera's zero; a step persists, so a subset of a video suffices.
 _CHECKED_FRAMES = 1000
-#: Longer recordings keep what is finished on disk while they are reduced; for shorter ones that would cost more than it saves.
+#: Number of frames above which finished cycles are stored during the reduction; below, this costs more than it saves.
 _CHECKPOINT_FRAMES = 2000
-#: Frames in which bad pixels are looked for: enough to tell a noisy pixel, over a time in which the table hardly changes.
+#: Number of frames examined for bad pixels: enough to identify a noisy pixel while the table hardly changes.
 _PIXEL_FRAMES = 24
 _KELVIN = 273.15
 
@@ -48,10 +48,31 @@ _KELVIN = 273.15
 def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | None, report: Report) -> Outcome:
     """Check the camera, register the plan on the first frames, and reduce all frames to one field per cycle.
 
-    A long recording keeps what is finished of it in the folder `checkpoint`, so that a run that is stopped goes on from there.
+    Parameters
+    ----------
+    source : Source
+        Inputs of the campaign.
+    checkpoint : Path
+        Folder that keeps the finished cycles of a long recording, from which an interrupted run goes on.
+    scheduler : str or None
+        Address of a dask scheduler for the per-frame work.
+    report : callable
+        ``report(label, done, total)``, for progress.
+
+    Returns
+    -------
+    Outcome
+        Fields on the laser's clock that keep ``thermography.contract.FIELDS``; parts ``registration`` and ``alignment``.
+
+    Raises
+    ------
+    ThermographyError
+        If the plan cannot be registered or the clock offset cannot be estimated.
+    ContractError
+        If the fields break their contract.
     """
-    override = Overrides(campaign_constants(source))
-    notices = camera_notices(source, override, report=report)
+    override = Overrides(_campaign_constants(source))
+    notices = _camera_notices(source, override, report=report)
     if source.thermography.table == "still":
         notices += pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:_PIXEL_FRAMES]]))
     report("registration", 0, 1)
@@ -60,17 +81,17 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
     reference = np.mean([calibrate(frame.read_counts(), override(frame)) for frame in first], axis=0)
     registration = register(reference, source.fiducials, grid=source.grid)
     report("registration", 1, 1)
-    fields, clock, found = _reduce_on_clock(
+    fields, clock, clock_notices = _reduce_on_clock(
         source, registration, override, checkpoint=checkpoint, scheduler=scheduler, report=report
     )
     check(fields, FIELDS, name="the fields")
-    notices += [*found, *registration_notices(registration), *frame_notices(fields)]
+    notices += [*clock_notices, *_registration_notices(registration), *_frame_notices(fields)]
     fields = fields.assign_coords(cycle=source.deviations["cycle"].values)
     for name in ("time", "cycle_time", "frame_time"):
         if name in fields.variables:
             moved = camera_on_laser_clock(fields[name].values, clock["value"])
             fields[name] = (fields[name].dims, moved, fields[name].attrs)
-    fields = fields.assign(registration_variables(registration, reference)).assign(target_places(source))
+    fields = fields.assign(_registration_variables(registration, reference)).assign(_target_places(source))
     parts = {
         "registration": {
             "rms_mm": registration.rms_mm,
@@ -151,7 +172,7 @@ def _reduce(
     return reduce_frames(source.frames, registration, source.grid, bounds, **common)
 
 
-def campaign_constants(source: Source) -> dict[str, float]:
+def _campaign_constants(source: Source) -> dict[str, float]:
     """Return the camera parameters that the campaign file overrides, in the units of the parameters."""
     table = source.thermography
     given = {
@@ -168,8 +189,8 @@ def _kelvin(celsius: float | None) -> float | None:
     return None if celsius is None else celsius + _KELVIN
 
 
-def camera_notices(source: Source, override: Overrides, *, report: Report) -> list[Notice]:
-    """Return a notice for jumps of the whole picture and for frames that the camera wrote twice."""
+def _camera_notices(source: Source, override: Overrides, *, report: Report) -> list[Notice]:
+    """Return a notice for jumps of the mean level of the thermogram and for frames that the camera wrote twice."""
     every = -(-len(source.frames) // _CHECKED_FRAMES)
     report("camera check", 0, 1)
     levels = read_levels(source.frames[::every], override)
@@ -188,10 +209,16 @@ def camera_notices(source: Source, override: Overrides, *, report: Report) -> li
 
 
 def pixel_notices(counts: np.ndarray) -> list[Notice]:
-    """Return a notice for pixels that do not follow their neighbours in the first frames, (time, row, column)."""
+    """Return a notice for pixels that do not follow their neighbours in the first frames, (time, row, column).
+
+    Parameters
+    ----------
+    counts : (time, row, column) ndarray of uint16
+        Raw counts of the first frames of a still table.
+    """
     flags = find_bad_pixels(counts)
-    found = int(np.count_nonzero(flags))
-    if not found:
+    count = int(np.count_nonzero(flags))
+    if not count:
         return []
     kinds = {"dead": DEAD, "off its neighbours": OFFSET, "noisy": NOISY}
     named = ", ".join(
@@ -200,22 +227,22 @@ def pixel_notices(counts: np.ndarray) -> list[Notice]:
     return [
         Notice(
             "bad_pixels",
-            f"{counted(found, 'pixel')} do not follow their neighbours ({named}); they count in their cells like others.",
+            f"{counted(count, 'pixel')} do not follow their neighbours ({named}); they are included in the cell averages.",
             "Have the camera replace them (a one-point correction, or its maker's service); single cells may be off by their error.",
         )
     ]
 
 
-def registration_variables(registration: Registration, reference: np.ndarray) -> xr.Dataset:
+def _registration_variables(registration: Registration, reference: np.ndarray) -> xr.Dataset:
     """Return the registration as variables: the fiducials with their errors, the homography, and the frame it was made on."""
     names = list(registration.located)
     places = [registration.located[name] for name in names]
-    known = [registration.fiducials[name] for name in names]
+    fiducials = [registration.fiducials[name] for name in names]
     along = {
-        "fiducial_x": ([one.x_mm for one in known], "mm"),
-        "fiducial_y": ([one.y_mm for one in known], "mm"),
-        "fiducial_column": ([one.column_px for one in places], "1"),
-        "fiducial_row": ([one.row_px for one in places], "1"),
+        "fiducial_x": ([fiducial.x_mm for fiducial in fiducials], "mm"),
+        "fiducial_y": ([fiducial.y_mm for fiducial in fiducials], "mm"),
+        "fiducial_column": ([located.column_px for located in places], "1"),
+        "fiducial_row": ([located.row_px for located in places], "1"),
         "fiducial_residual": ([registration.residual_mm[name] for name in names], "mm"),
         "fiducial_leave_one_out": ([registration.leave_one_out_mm[name] for name in names], "mm"),
     }
@@ -227,7 +254,7 @@ def registration_variables(registration: Registration, reference: np.ndarray) ->
     return xr.Dataset(variables)
 
 
-def registration_notices(registration: Registration) -> list[Notice]:
+def _registration_notices(registration: Registration) -> list[Notice]:
     """Return one notice for all fiducials that were not used."""
     if not registration.left_out:
         return []
@@ -241,49 +268,49 @@ def registration_notices(registration: Registration) -> list[Notice]:
     ]
 
 
-#: What the reduction tells of frames, as attribute: code, sentence that follows the count, remedy.
+#: Attributes of the fields that list frames: sentence that follows their number, remedy.
 _FRAME_ATTRIBUTES = {
     "frames_outside_cycles": (
-        "belong to no cycle; they count for the field at a reading's own time, not for a cycle's mean",
-        "Nothing has to be done, unless the clocks disagree.",
+        "belong to no cycle, normal unless the clocks disagree; used for the field at the time of a reading, not in cycle averages",
+        "",
     ),
     "knocks": (
-        "show the table moved for good; the plan was registered anew from there on",
+        "show that the table moved and did not return; the plan was registered again from there on",
         "Fasten camera and table, and check what happened at that time.",
     ),
-    "frames_shaken": ("were shaken for this one frame", "Shield the camera from vibration."),
+    "frames_shaken": ("are shaken", "Shield the camera from vibration."),
     "frames_unplaced": (
         "do not show where the table is and were left out",
         "Keep at least three fiducials in view at every axis position.",
     ),
     "frames_unchecked": (
-        "have too little contrast to check the registration",
-        "Nothing has to be done while neither camera nor table are touched.",
+        "have too little contrast to check the registration, which holds as long as neither camera nor table is touched",
+        "",
     ),
 }
 
 
-def frame_notices(fields: xr.Dataset) -> list[Notice]:
+def _frame_notices(fields: xr.Dataset) -> list[Notice]:
     """Return one notice for each kind of frame that the reduction reports."""
     notices = []
     for name, (text, remedy) in _FRAME_ATTRIBUTES.items():
-        found = json.loads(fields.attrs.get(name, "[]"))
-        if found:
-            named = listed([str(one) if isinstance(one, str) else _words(one) for one in found])
-            notices.append(Notice(name, f"{counted(len(found), 'frame')} {text}: {named}.", remedy))
+        frames = json.loads(fields.attrs.get(name, "[]"))
+        if frames:
+            named = listed([frame if isinstance(frame, str) else _words(frame) for frame in frames])
+            notices.append(Notice(name, f"{counted(len(frames), 'frame')} {text}: {named}.", remedy))
     return notices
 
 
-def _words(found: Any) -> str:
+def _words(value: Any) -> str:
     """Return a record such as ``{"frame": "a.jpg", "shift_px": [3, 0]}`` as words; folders stay out of it."""
-    if isinstance(found, Mapping):
-        return ", ".join(f"{name.replace('_', ' ')} {_words(value)}" for name, value in found.items())
-    if isinstance(found, list):
-        return "(" + ", ".join(_words(value) for value in found) + ")"
-    return f"{found:.3g}" if isinstance(found, float) else Path(str(found)).name
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name.replace('_', ' ')} {_words(item)}" for name, item in value.items())
+    if isinstance(value, list):
+        return "(" + ", ".join(_words(item) for item in value) + ")"
+    return f"{value:.3g}" if isinstance(value, float) else Path(str(value)).name
 
 
-def target_places(source: Source) -> xr.Dataset:
+def _target_places(source: Source) -> xr.Dataset:
     """Return the plan points of the targets, along ``target``."""
     x, y = source.axis.points(source.deviations["position"].values)
     targets = source.deviations["target"].values
@@ -292,19 +319,29 @@ def target_places(source: Source) -> xr.Dataset:
 
 
 def write_exr(folder: Path, fields: xr.Dataset, *, report: Report) -> list[Path]:
-    """Write the fields of every cycle as OpenEXR maps and return the files."""
+    """Write the fields of every cycle as OpenEXR maps and return the files.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the maps.
+    fields : Dataset
+        Content of fields.nc.
+    report : callable
+        ``report(label, done, total)``, for progress.
+    """
     total = fields.sizes["cycle"]
     paths = []
     for done, cycle in enumerate(fields["cycle"].values):
         report("OpenEXR maps", done, total)
-        maps = exr_maps(fields.sel(cycle=cycle))
+        maps = _exr_maps(fields.sel(cycle=cycle))
         path = folder / f"cycle_{cycle:04d}.exr"
         paths.append(write_atomically(path, lambda temporary, maps=maps: write_maps(temporary, maps)))  # type: ignore[misc]
     report("OpenEXR maps", total, total)
     return paths
 
 
-def exr_maps(field: xr.Dataset) -> dict[str, np.ndarray]:
+def _exr_maps(field: xr.Dataset) -> dict[str, np.ndarray]:
     """Return the maps of one cycle for OpenEXR; the mask is 1 where the table was seen."""
     maps = {
         "temperature": field["temperature"],

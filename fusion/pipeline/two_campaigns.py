@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from fusion.attribution.two_sessions import ChannelAgreement, SourceAgreement, compare_sessions
+from fusion.products.results import read_results
 from fusion.products.store import read_dataset, read_tree, write_dataset, write_json, write_text
 from fusion.report.html import render_report
-from fusion.report.model_section import readable
 from fusion.report.plots_attribution import CHANNELS
 from fusion.report.wording import duration, measured, number, p_value
 
@@ -42,7 +42,7 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
         {name: read(folder / f"{name}.nc") for name, read in _READERS.items()} for folder in folders
     ]
     comparison = compare_sessions(*(product["fusion"].children["correlation"] for product in products))
-    titles = [str(_read_json(folder, "results")["campaign"]) for folder in folders]
+    titles = [read_results(folder).campaign for folder in folders]
     write_dataset(out / "joint.nc", comparison.maps)
     write_json(
         out / "joint.json",
@@ -61,8 +61,8 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
         "sources": table,
     }
     for folder, product, other in zip(folders, products, reversed(titles), strict=True):
-        results, provenance = _read_json(folder, "results"), _read_json(folder, "provenance")
-        report = render_report(results, provenance, product, joint={"other": other, **joint})
+        provenance = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
+        report = render_report(read_results(folder), provenance, product, joint={"other": other, **joint})
         write_text(folder / "report.html", report)
     if not table:
         return [("sources", "neither session shows one")]
@@ -108,11 +108,7 @@ def source_row(source: SourceAgreement, titles: Sequence[str]) -> list[str]:
 def _channel_text(channel: ChannelAgreement) -> str:
     """The agreement on one part of the drift as a sentence."""
     first, second = (number(value, 2) for value in channel.sensitivity_um_per_K)
-    return readable(
+    return (
         f"{channel.verdict}: {channel.reason}; x {channel.x_mm:.0f} mm, y {channel.y_mm:.0f} mm, larger p of both "
-        f"{p_value(channel.p_value)}, {first} and {second} um/K"
+        f"{p_value(channel.p_value)}, {first} and {second} µm/K"
     )
-
-
-def _read_json(folder: Path, name: str) -> Mapping[str, Any]:
-    return json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))

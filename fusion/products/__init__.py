@@ -1,1 +1,1 @@
-"""What a run leaves behind (level 5): products on disk, typed results, progress."""
+"""Products of a run (level 5): files on disk, typed results, contracts of Datasets, progress."""

@@ -1,4 +1,4 @@
-"""The border check: does a Dataset keep the written contract of the instrument that made it?"""
+"""Check of a Dataset against the contract of the instrument that made it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fusion.errors import FusionError
 
 
 class ContractError(FusionError):
-    """A Dataset that breaks its contract; the message lists every broken promise."""
+    """A Dataset that breaks its contract; the message lists every violation."""
 
 
 def check(dataset: xr.Dataset, contract: Mapping[str, tuple[tuple[str, ...], str, str]], *, name: str) -> xr.Dataset:
@@ -19,11 +19,11 @@ def check(dataset: xr.Dataset, contract: Mapping[str, tuple[tuple[str, ...], str
     Parameters
     ----------
     dataset : Dataset
-        What an instrument delivered.
+        Result of an instrument package.
     contract : mapping
-        ``variable -> (dims, units, kind)``; kind is a NumPy dtype kind. An empty unit is not asked for.
+        ``variable -> (dims, units, kind)``; kind is a NumPy dtype kind, an empty unit is not checked.
     name : str
-        What the Dataset is called in the message.
+        Name of the Dataset in the message.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a long step tells while it works: a bar on a terminal, plain lines elsewhere, silence in a library."""
+"""Progress of a long step: bars on a terminal, plain lines elsewhere, nothing in a library."""
 
 from __future__ import annotations
 
@@ -17,11 +17,25 @@ _SECONDS_BETWEEN_LINES = 10.0
 
 
 def silent(label: str, done: int, total: int) -> None:
-    """Report nothing."""
+    """Report nothing.
+
+    Parameters
+    ----------
+    label : str
+        Step of the work.
+    done, total : int
+        Finished parts and their number.
+    """
 
 
 class Reporter(AbstractContextManager["Reporter"]):
-    """Shows the progress of a run on `console`: bars on a terminal, otherwise one line at each start, end and every ten seconds."""
+    """Shows the progress of a run: bars on a terminal, otherwise one line at each start, end and every ten seconds.
+
+    Parameters
+    ----------
+    console : Console
+        Where the progress is shown.
+    """
 
     def __init__(self, console: Console) -> None:
         self._console = console

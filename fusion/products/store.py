@@ -1,7 +1,4 @@
-"""Products on disk: written whole or not at all, and stamped so that a finished stage is not done twice.
-
-What a NetCDF product says of itself: CF conventions, title, history, provenance, a long name for every variable.
-"""
+"""Products on disk: written whole or not at all, described by the CF conventions, and stamped so that a finished stage is kept."""
 
 from __future__ import annotations
 
@@ -17,18 +14,30 @@ import xarray as xr
 
 from fusion.errors import FusionError
 
-STAMPS = ".stages/stamps.json"
+_STAMPS = ".stages/stamps.json"
 _PARTIAL = ".partial"
 #: A product is one Dataset, or a tree of them whose nodes become the groups of one NetCDF file.
 Product = TypeVar("Product", xr.Dataset, xr.DataTree)
 
 
 class OutputError(FusionError):
-    """A results folder that cannot be written to as asked; the message says what to do."""
+    """A results folder that cannot be written to; the message says what to do."""
 
 
 def open_folder(folder: Path, *, resume: bool) -> Path:
     """Create the results folder, or accept an existing one only if it is empty or the run is resumed.
+
+    Parameters
+    ----------
+    folder : Path
+        Results folder; what an interrupted write left in it is removed.
+    resume : bool
+        Whether a run that is in it is continued.
+
+    Returns
+    -------
+    Path
+        The folder.
 
     Raises
     ------
@@ -52,6 +61,18 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
     """Let `write` fill a temporary file beside `path`, then put it in place in one step.
 
     A run that is killed leaves the old file or none, never half of the new one.
+
+    Parameters
+    ----------
+    path : Path
+        Product; its folder is created where it is absent.
+    write : callable
+        Writes the whole product to the path that it is given.
+
+    Returns
+    -------
+    Path
+        The product.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{path.stem}{_PARTIAL}{path.suffix}")
@@ -64,12 +85,28 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
 
 
 def write_text(path: Path, text: str) -> Path:
-    """Write UTF-8 text whole or not at all."""
+    """Write UTF-8 text whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        Product.
+    text : str
+        Its whole content.
+    """
     return write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 def write_json(path: Path, content: object) -> Path:
-    """Write JSON whole or not at all; numbers that are not finite become null, as JSON has no word for them."""
+    """Write JSON whole or not at all; numbers that are not finite become null, as JSON has no word for them.
+
+    Parameters
+    ----------
+    path : Path
+        Product.
+    content : object
+        Anything that `plain` can express.
+    """
     return write_text(path, json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
@@ -78,6 +115,13 @@ def write_dataset(path: Path, product: xr.Dataset | xr.DataTree) -> Path:
 
     Every node of a tree becomes a group with coordinates of its own, so that ``xarray.open_dataset(path, group=...)`` needs no other
     group to make sense of it.
+
+    Parameters
+    ----------
+    path : Path
+        Product.
+    product : Dataset or DataTree
+        Described with `annotate`.
     """
     tree = xr.DataTree(product) if isinstance(product, xr.Dataset) else product
 
@@ -110,19 +154,37 @@ def _encoding(dataset: xr.Dataset) -> dict[Any, dict[str, object]]:
 
 
 def read_dataset(path: Path) -> xr.Dataset:
-    """Read a Dataset written by `write_dataset` into memory."""
+    """Read a Dataset written by `write_dataset` into memory.
+
+    Parameters
+    ----------
+    path : Path
+        Product.
+    """
     with xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as dataset:
         return dataset.load()
 
 
 def read_tree(path: Path) -> xr.DataTree:
-    """Read a tree written by `write_dataset` into memory."""
+    """Read a tree written by `write_dataset` into memory.
+
+    Parameters
+    ----------
+    path : Path
+        Product.
+    """
     with xr.open_datatree(path, engine="h5netcdf", decode_timedelta=False) as tree:
         return tree.load()
 
 
 def plain(value: Any) -> Any:
-    """Return `value` in JSON's own types: arrays as lists, NumPy scalars as numbers, times as ISO text, NaN as None."""
+    """Return `value` in JSON's own types: arrays as lists, NumPy scalars as numbers, times as ISO text, NaN as None.
+
+    Parameters
+    ----------
+    value : object
+        Mappings, sequences, arrays, NumPy scalars, times (UTC), paths, or JSON's own types.
+    """
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -141,23 +203,35 @@ def plain(value: Any) -> Any:
 
 
 def file_sha256(path: Path) -> str:
-    """Return the SHA-256 of a file as hexadecimal text."""
+    """Return the SHA-256 of a file as hexadecimal text.
+
+    Parameters
+    ----------
+    path : Path
+        File of any size.
+    """
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def digest(*parts: object) -> str:
-    """Return one SHA-256 over anything that `plain` can express; equal input gives equal text on every machine."""
+    """Return one SHA-256 over anything that `plain` can express; equal input gives equal text on every machine.
+
+    Parameters
+    ----------
+    *parts : object
+        Anything that `plain` can express.
+    """
     text = json.dumps(plain(parts), sort_keys=True, ensure_ascii=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 class StageStamps:
-    """Which stages of a run are done, from which input, with which files; kept in the results folder."""
+    """Stages of a run that are done, with their input and their files; stored in the results folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._path = folder / STAMPS
+        self._path = folder / _STAMPS
         self._stamps: dict[str, dict[str, Any]] = {}
         if self._path.exists():
             self._stamps = json.loads(self._path.read_text(encoding="utf-8"))
@@ -183,7 +257,7 @@ class StageStamps:
         write_json(self._path, self._stamps)
 
 
-CONVENTIONS = "CF-1.11"
+_CONVENTIONS = "CF-1.11"
 #: What `annotate` writes for the whole file.
 GLOBAL_ATTRIBUTES = ("Conventions", "title", "history", "provenance")
 
@@ -195,7 +269,7 @@ def annotate(product: Product, *, title: str, history: str, provenance: Mapping[
     ----------
     product : Dataset or DataTree
     title : str
-        What the campaign is called.
+        Title of the campaign.
     history : str
         When and by which command the file was made.
     provenance : mapping
@@ -208,7 +282,7 @@ def annotate(product: Product, *, title: str, history: str, provenance: Mapping[
                 variable.attrs["long_name"] = name_in_words(str(name))
     described.attrs = {
         **product.attrs,
-        "Conventions": CONVENTIONS,
+        "Conventions": _CONVENTIONS,
         "title": title,
         "history": history,
         "provenance": json.dumps(provenance, sort_keys=True),
@@ -217,6 +291,12 @@ def annotate(product: Product, *, title: str, history: str, provenance: Mapping[
 
 
 def name_in_words(name: str) -> str:
-    """Return a variable's name as words: ``"drift_profile_u"`` -> ``"standard uncertainty of drift profile"``."""
+    """Return a variable's name as words: ``"drift_profile_u"`` -> ``"standard uncertainty of drift profile"``.
+
+    Parameters
+    ----------
+    name : str
+        Name of a variable; ``_u`` at its end stands for a standard uncertainty.
+    """
     words = name.removesuffix("_u").replace("_", " ")
     return f"standard uncertainty of {words}" if name.endswith("_u") else words

@@ -1,1 +1,1 @@
-"""What a reader sees (level 5): the report, its charts and words, the terminal summary, exports."""
+"""Presentation (level 5): the report with its charts and tables, the terminal summary, exports."""

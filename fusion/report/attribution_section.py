@@ -1,128 +1,168 @@
-"""What the report says of drift and field: the verdict and what it is worth, the tables, and what would tell."""
+"""Drift and field in the report: verdict, what it is worth, tables, and which further test would decide."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from fusion.attribution.family_wise import LEVEL
-from fusion.attribution.leading_source import LeadingSource, find_source, recommend_measurement
-from fusion.report.model_section import readable
+from fusion.products.results import CorrelationPart, DutyPart, PlacePart, TestedPart
+from fusion.report.findings import attribution_headline, randomised_causes
 from fusion.report.plots_attribution import CHANNELS, caption_of, rate_text
-from fusion.report.wording import duration, join, measured, number, p_value
+from fusion.report.tables import Row, Table, Words, table
+from fusion.report.wording import duration, join, measured, number, p_value, place, quantity
 
-Row = list[str]
 _SHORT = {"common": "common", "proportional": "growing", "reversal": "reversal", "joint": "common and growing"}
+_SENSITIVITY = "Sensitivity / (µm/K)"
+_DETECTION_LIMIT = "80 % power from / (µm/K)"
+
+
+@dataclass(frozen=True)
+class PlaceTables:
+    """Thermal modes or regions in the report.
+
+    Attributes
+    ----------
+    title : str
+        Heading.
+    strongest : Table
+        The part of the drift that follows each most closely.
+    every : Table
+        All parts of the drift.
+    """
+
+    title: str
+    strongest: Table
+    every: Table
 
 
 def describe_correlation(
-    fused: xr.DataTree, results: Mapping[str, Any], joint: Mapping[str, Any] | None
+    fused: xr.DataTree, correlation: CorrelationPart | None, joint: Mapping[str, Any] | None
 ) -> dict[str, Any] | None:
-    """Return everything the section on drift and field says; None where it was not tested."""
-    if "correlation" not in fused.children:
+    """Return everything the section on drift and field says, as the template reads it; None where it was not tested.
+
+    Parameters
+    ----------
+    fused : DataTree
+        fusion.nc of the run.
+    correlation : CorrelationPart or None
+        The part ``correlation`` of the results.
+    joint : mapping or None
+        What this campaign and another one of the machine agree on, see `fusion.report.html.render_report`.
+    """
+    if correlation is None or "correlation" not in fused.children:
         return None
     maps = fused.children["correlation"]
-    found = find_source(maps)
-    duty = maps.children["duty"].to_dataset() if "duty" in maps.children else None
-    captions = {"cells": caption_of(maps, found.channel)}
+    channel = correlation.source.part
+    captions = {"cells": caption_of(maps, channel)}
     if "modes" in maps.children:
-        captions["modes"] = caption_of(maps, found.channel, "modes")
+        captions["modes"] = caption_of(maps, channel, "modes")
+    sentences = [_leading(correlation), *_beside(correlation), _worth(correlation, joint)]
+    places = (
+        ("Mode", "Thermal modes", correlation.modes),
+        ("Region", "Regions and hotspots", correlation.regions),
+    )
     return {
-        "headline": _headline(found),
-        "sentences": [*_sentences(found), *_beside(maps, found), _worth(found, joint, duty)],
-        "tell": readable(recommend_measurement(maps, found)),
+        "headline": attribution_headline(correlation),
+        "sentences": [sentence for sentence in sentences if sentence],
+        "tell": correlation.would_tell,
         "captions": captions,
-        "channels": [_channel_row(maps, str(channel)) for channel in maps.coords["channel"].values],
-        "modes": _candidate_rows(maps, "modes", "mode"),
-        "regions": _candidate_rows(maps, "regions", "region"),
+        "cells": _cells_table(maps.to_dataset()),
+        "places": [_place_tables(heading, title, listed, maps) for heading, title, listed in places if listed],
         "region": leading_region(maps) if "target_regions" in maps.children else "",
         "region_targets": _region_targets(maps) if "target_regions" in maps.children else "",
         "session": _session(maps),
-        "duty": [] if duty is None else _duty_rows(duty),
-        "sensors": _sensors(maps.children["sensors"].to_dataset(), found.verdict),
+        "duty": _duty_table(correlation.randomised_duty) if correlation.randomised_duty else None,
+        "sensors": _sensors_text(maps.children["sensors"].to_dataset(), correlation.verdict),
+        "sensors_table": _sensors_table(correlation),
     }
 
 
-def _headline(found: LeadingSource) -> str:
-    if found.verdict == "not separable":
-        return "These data cannot tell: the whole session is one warm-up, in which every temperature rises like every drift."
-    if found.verdict == "not attributable":
-        return f"No part of the field goes with the drift more closely than chance allows (smallest p {p_value(found.p_value)})."
-    return (
-        f"The drift goes with the temperature around x {found.x_mm:.0f} mm, y {found.y_mm:.0f} mm more closely than chance and common "
-        f"warm-up allow (p = {p_value(found.p_value)})."
-    )
-
-
-def _sentences(found: LeadingSource) -> list[str]:
+def _leading(correlation: CorrelationPart) -> str:
     """Size, lag and place of the leading candidate, and what cannot be told from it."""
-    what = (
-        "a cell"
-        if found.kind == "cell"
-        else f"{found.kind} {found.name}".replace("mode", "thermal mode").replace("region ", "")
+    source = correlation.source
+    attributable = correlation.verdict == "attributable"
+    what = {"cell": "a cell", "mode": f"thermal mode {source.name}", "region": source.name}[source.kind]
+    behind = f"{duration(source.lag_s)} behind it" if source.lag_s else "without lag"
+    size = quantity(source.sensitivity_um_per_K, "µm/K")
+    text = (
+        f"{'Found in' if attributable else 'Closest was'} {what}, by {CHANNELS.get(source.part, source.part)}: {size} of its rise, "
+        f"{behind}."
     )
-    behind = f"{duration(found.lag_s)} behind it" if found.lag_s > 0 else "without lag"
-    size = measured(found.sensitivity_um_per_K, found.sensitivity_u_um_per_K, "µm/K")
-    led = "Found in" if found.verdict == "attributable" else "Closest was"
-    sentences = [f"{led} {what}, by {CHANNELS.get(found.channel, found.channel)}: {size} of its rise, {behind}."]
-    if found.verdict == "attributable" and found.others_mm:
-        places = [f"x {x:.0f} mm, y {y:.0f} mm" for x, y in found.others_mm[:4]]
-        more = f" and {len(found.others_mm) - 4} more" if len(found.others_mm) > 4 else ""
-        sentences.append(f"These data cannot tell it from {join(places)}{more}, which explain the drift as well.")
-    return sentences
+    if not attributable or not source.equal_places_mm:
+        return text
+    others = [place(x, y) for x, y in source.equal_places_mm[:4]]
+    more = f" and {len(source.equal_places_mm) - 4} more" if len(source.equal_places_mm) > 4 else ""
+    return f"{text} These data cannot tell it from {join(others)}{more}, which explain the drift as well."
 
 
-def _beside(maps: xr.DataTree, found: LeadingSource) -> list[str]:
+def _passes(p: float | None) -> bool:
+    return p is not None and p <= LEVEL
+
+
+def _beside(correlation: CorrelationPart) -> list[str]:
     """Which other modes add to the leading one, and which pass but may only warm with it."""
-    if found.verdict != "attributable" or found.kind != "mode":
+    source = correlation.source
+    if correlation.verdict != "attributable" or source.kind != "mode":
         return []
-    modes = maps.children["modes"].to_dataset()
-    beside = modes["p_beside"].min("channel").fillna(1.0).values
-    alone = modes["p_value"].min("channel").values
-    named = [
-        f"mode {mode} (x {float(x):.0f} mm, y {float(y):.0f} mm)"
-        for mode, x, y in zip(modes["mode"].values, modes["at_x"].values, modes["at_y"].values, strict=True)
-    ]
-    others = modes["mode"].values.astype(str) != found.name
-    adds, alike = others & (beside <= LEVEL), others & (beside > LEVEL) & (alone <= LEVEL)
+    adds, alike = [], []
+    for mode in correlation.modes:
+        if mode.name == f"mode {source.name}":
+            continue
+        named = f"{mode.name} ({place(mode.x_mm, mode.y_mm)})"
+        if any(_passes(tested.p_beside_leader) for tested in mode.parts.values()):
+            adds.append(named)
+        elif any(_passes(tested.p_value) for tested in mode.parts.values()):
+            alike.append(named)
     sentences = []
-    if adds.any():
+    if adds:
         sentences.append(
-            f"With it taken as given, {join([named[k] for k in np.flatnonzero(adds)])} goes with what is left."
+            f"With it taken as given, {join(adds)} {'goes' if len(adds) == 1 else 'go'} with what is left."
         )
-    if alike.any():
-        verb, adding = ("passes", "adds") if alike.sum() == 1 else ("pass", "add")
+    if alike:
         sentences.append(
-            f"By themselves {join([named[k] for k in np.flatnonzero(alike)])} {verb} too, but {adding} nothing to it: these places may "
-            "only warm with it."
+            f"By itself {alike[0]} passes too, but adds nothing to it: this place may only warm with it."
+            if len(alike) == 1
+            else f"By themselves {join(alike)} pass too, but add nothing to it: these places may only warm with it."
         )
     return sentences
 
 
-def _worth(found: LeadingSource, joint: Mapping[str, Any] | None, duty: xr.Dataset | None) -> str:
+def _worth(correlation: CorrelationPart, joint: Mapping[str, Any] | None) -> str:
     """Whether this is a cause: where two sessions agree, or where the duty was randomised."""
-    causes = [] if duty is None else [str(name) for name in duty["source"].values[(duty["p_value"] <= LEVEL).values]]
+    causes = randomised_causes(correlation)
     if causes:
         verb = "is a cause" if len(causes) == 1 else "are causes"
         return f"Loads were switched at random, which shows that {join(causes)} {verb} of drift (below)."
     if joint is not None and joint["causes"]:
         return f"It is a cause where {joint['other']} agrees: {join(joint['causes'])} (below)."
-    if found.verdict != "attributable":
+    if correlation.verdict != "attributable":
         return ""
     if joint is not None:
-        return f"It is not a cause yet: {joint['other']} does not show the same."
-    return (
-        "It is not a cause yet: one session may wander alike by chance, and what warms together cannot be told apart."
-    )
+        return f"Causation is not shown yet: {joint['other']} does not show the same."
+    return "Causation is not shown yet: in one session two courses may agree by chance, and places that warm together cannot be told apart."
 
 
-def _channel_row(maps: xr.DataTree, channel: str) -> Row:
-    """Strongest cell of one channel, what would have been found, and the drift that nothing explains."""
-    session = maps.to_dataset()
-    chosen = session[["p_value", "sensitivity", "sensitivity_u", "lag", "detectable_sensitivity"]].sel(channel=channel)
+def _cells_table(maps: xr.Dataset) -> Table:
+    """Return the strongest cell of every part of the drift, its detection limit, and the drift that nothing explains."""
+    columns = [
+        Words("Part of the drift"),
+        "p",
+        "x, y / mm",
+        _SENSITIVITY,
+        "Lag",
+        _DETECTION_LIMIT,
+        "Unexplained drift / µm in one hour",
+    ]
+    return table(columns, [_cell_row(maps, str(channel)) for channel in maps["channel"].values])
+
+
+def _cell_row(maps: xr.Dataset, channel: str) -> list[str]:
+    chosen = maps[["p_value", "sensitivity", "sensitivity_u", "lag", "detectable_sensitivity"]].sel(channel=channel)
     flat = chosen.stack(cell=("y", "x"))
     best = flat.isel(cell=int(np.argmin(flat["p_value"].fillna(np.inf).values)))
     return [
@@ -132,41 +172,52 @@ def _channel_row(maps: xr.DataTree, channel: str) -> Row:
         measured(float(best["sensitivity"]), float(best["sensitivity_u"])),
         duration(float(best["lag"])),
         number(float(best["detectable_sensitivity"]), 2),
-        number(float(session["unexplained_drift"].sel(channel=channel)), 2),
+        number(float(maps["unexplained_drift"].sel(channel=channel)), 2),
     ]
 
 
-def _candidate_rows(maps: xr.DataTree, name: str, kind: str) -> dict[str, list[dict[str, Any]]]:
-    """Modes or regions: the strongest part of the drift for each, and all parts, with p, sensitivity, lag, and what would be found."""
-    if name not in maps.children:
-        return {"strongest": [], "all": []}
-    few = maps.children[name].to_dataset()
-    ratio = (few["statistic"] / few["threshold"]).fillna(0.0)
-    strongest, everything = [], []
-    for at in range(few.sizes[kind]):
-        one = few.isel({kind: at})
-        rows = []
-        for channel in map(str, few["channel"].values):
-            part = one.sel(channel=channel)
-            cells = [
-                f"{kind} {one[kind].item()}" if kind == "mode" else str(one[kind].item()),
-                f"{float(one['at_x']):.0f}, {float(one['at_y']):.0f}",
-                _SHORT.get(channel, channel),
-                p_value(float(part["p_value"])),
-                measured(float(part["sensitivity"]), float(part["sensitivity_u"])),
-                duration(float(part["lag"])),
-                number(float(part["detectable_sensitivity"]), 2),
-            ]
-            if kind == "mode":
-                cells.append(p_value(float(part["p_beside"])))
-            rows.append({"cells": cells, "passed": bool(part["p_value"] <= LEVEL)})
-        strongest.append(rows[int(ratio.isel({kind: at}).values.argmax())])
-        everything += rows
-    return {"strongest": strongest, "all": everything}
+def _place_tables(heading: str, title: str, listed: Iterable[PlacePart], maps: xr.DataTree) -> PlaceTables:
+    """Return modes or regions: the strongest part of the drift for each, and all parts."""
+    modes = heading == "Mode"
+    columns = [Words(heading), "x, y / mm", Words("Part of the drift"), "p", _SENSITIVITY, "Lag", _DETECTION_LIMIT]
+    if modes:
+        columns.append("p beside the leading one")
+    tested = maps.children["modes" if modes else "regions"].to_dataset()
+    ratio = (tested["statistic"] / tested["threshold"]).fillna(0.0)
+    strongest: list[Row] = []
+    every: list[Row] = []
+    for k, candidate in enumerate(listed):
+        rows = {part: _place_row(candidate, part, found, modes) for part, found in candidate.parts.items()}
+        leading = ratio.isel({heading.lower(): k})
+        strongest.append(rows[str(leading["channel"].values[int(leading.values.argmax())])])
+        every += rows.values()
+    return PlaceTables(title, table(columns, strongest), table(columns, every))
+
+
+def _place_row(candidate: PlacePart, part: str, tested: TestedPart, modes: bool) -> Row:
+    x, y = ("–" if value is None else f"{value:.0f}" for value in (candidate.x_mm, candidate.y_mm))
+    cells = [
+        candidate.name,
+        f"{x}, {y}",
+        _SHORT.get(part, part),
+        p_value(tested.p_value),
+        quantity(tested.sensitivity_um_per_K),
+        duration(tested.lag_s),
+        number(tested.detectable_um_per_K, 2),
+    ]
+    if modes:
+        cells.append(p_value(tested.p_beside_leader))
+    return Row(cells, marked=_passes(tested.p_value))
 
 
 def leading_region(maps: xr.DataTree) -> str:
-    """Return the region that explains the drift best."""
+    """Return the region that explains the drift best.
+
+    Parameters
+    ----------
+    maps : DataTree
+        Result of `fusion.attribution.attribute.correlate` with regions.
+    """
     regions = maps.children["regions"].to_dataset()
     ratio = (regions["statistic"] / regions["threshold"]).fillna(0.0).max("channel")
     return str(regions["region"].values[int(ratio.values.argmax())])
@@ -179,9 +230,8 @@ def _region_targets(maps: xr.DataTree) -> str:
     for region in map(str, p["region"].values):
         passed = [str(name) for name in p["series"].values[(p.sel(region=region) <= LEVEL).values]]
         if passed:
-            named.append(
-                f"{region}: {len(passed)} of {p.sizes['series']} ({join(passed[:6])}{', …' if len(passed) > 6 else ''})"
-            )
+            more = ", …" if len(passed) > 6 else ""
+            named.append(f"{region}: {len(passed)} of {p.sizes['series']} ({join(passed[:6])}{more})")
     return "; ".join(named) or "none"
 
 
@@ -190,8 +240,8 @@ def _session(maps: xr.DataTree) -> list[tuple[str, str]]:
     session, clusters = maps.to_dataset(), maps.children["clusters"].to_dataset()
     return [
         (
-            "Chance of any false find",
-            f"{rate_text(float(session['false_alarm_rate']))} over cells, modes and regions together",
+            "Rate of false alarms",
+            f"{rate_text(float(session['false_alarm_rate']))} over cells, modes and regions together, in simulations without a source",
         ),
         (
             "Excitation",
@@ -205,29 +255,29 @@ def _session(maps: xr.DataTree) -> list[tuple[str, str]]:
     ]
 
 
-def _duty_rows(duty: xr.Dataset) -> list[Row]:
+def _duty_table(loads: Iterable[DutyPart]) -> Table:
+    """Return what randomisation shows of every load."""
+    columns = [Words("Load"), "p", "Drift at full duty, far end / µm", "Time constants", Words("Verdict")]
     rows = []
-    for name in map(str, duty["source"].values):
-        one = duty.sel(source=name)
-        first, second = float(one["time_constant"]), float(one["second_time_constant"])
+    for load in loads:
+        first, second = load.time_constants_s
         rows.append(
             [
-                name,
-                p_value(float(one["p_value"])),
-                measured(float(one["sensitivity"]), float(one["sensitivity_u"])),
-                duration(first) + (f" behind {duration(second)}" if second > 0 else ""),
-                "a cause" if float(one["p_value"]) <= LEVEL else "not shown",
+                load.name,
+                p_value(load.p_value),
+                quantity(load.drift_at_full_duty_um),
+                duration(first) + (f" behind {duration(second)}" if second else ""),
+                "a cause" if load.cause else "not shown",
             ]
         )
-    return rows
+    return table(columns, rows)
 
 
-def _sensors(sensors: xr.Dataset, session: str) -> dict[str, Any]:
-    """Contact sensors in place of the camera: how far the camera itself goes, and one row per number of sensors."""
+def _sensors_text(sensors: xr.Dataset, verdict: str) -> str:
+    """How much of the drift the camera itself predicts, and what that says of contact sensors in its place."""
     if "sensor" not in sensors.sizes or sensors.sizes["sensor"] == 0:
-        return {"text": "The field did not change enough to place sensors.", "rows": []}
+        return "The field did not change enough to place sensors."
     gain, most = float(sensors["camera_gain"]), float(sensors["camera_gain_at_most"])
-    within = duration(float(sensors["run_length"]))
     if bool(sensors["camera_decided"]):
         text = (
             f"Predicting cycles that it was not fitted to, the camera takes {number(gain, 2)} µm out of the drift "
@@ -235,29 +285,29 @@ def _sensors(sensors: xr.Dataset, session: str) -> dict[str, Any]:
         )
     else:
         text = (
-            f"Undecided: on cycles that it was not fitted to, the camera itself is not shown to take anything out of the drift "
+            "Undecided: on cycles that it was not fitted to, the camera itself is not shown to take anything out of the drift "
             f"(at most {number(most, 2)} µm), so a table of what sensors lose beside it says little."
         )
-    if session == "not separable":
+    if verdict == "not separable":
         text += " In a single warm-up many places do alike; which of them would do in another session these data cannot tell."
-    rows: list[Row] = []
+    within = duration(float(sensors["run_length"]))
+    return f"{text} Losses are root mean squares over all positions, within runs of {within} of left-out cycles."
+
+
+def _sensors_table(correlation: CorrelationPart) -> Table | None:
+    """Return what each number of contact sensors loses beside the camera; None where none could be placed."""
+    if not correlation.sensors.sets:
+        return None
+    rows = []
     least = np.inf
-    for at in range(sensors.sizes["sensor"]):
-        one = sensors.isel(sensor=at)
-        verdict = "loses" if bool(one["decided"]) else "as good as the camera, as far as these data show"
-        if float(one["loss"]) > least:
+    for count, added in enumerate(correlation.sensors.sets, start=1):
+        loss = np.inf if added.loss_um is None else added.loss_um
+        verdict = "loses" if added.decided else "as good as the camera, as far as these data show"
+        if loss > least:
             verdict += "; no better than fewer"
-        least = min(least, float(one["loss"]))
-        rows.append(
-            [
-                str(at + 1),
-                f"x {float(one['at_x']):.0f} mm, y {float(one['at_y']):.0f} mm",
-                number(float(one["loss"]), 2),
-                number(float(one["loss_at_most"]), 2),
-                verdict,
-            ]
-        )
-    return {
-        "text": f"{text} Losses are root mean squares over all positions, within runs of {within} of left-out cycles.",
-        "rows": rows,
-    }
+        least = min(least, loss)
+        where = place(added.x_mm, added.y_mm)
+        rows.append([str(count), where, number(added.loss_um, 2), number(added.loss_at_most_um, 2), verdict])
+    return table(
+        ["Sensors", Words("Added place"), "Lost beside the camera / µm", "at most / µm", Words("Verdict")], rows
+    )

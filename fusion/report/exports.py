@@ -18,8 +18,8 @@ from fusion.errors import FusionError
 from fusion.products.grouped import group
 from fusion.products.store import read_dataset, write_atomically, write_text
 
-#: LinuxCNC reads at most so many points per joint.
-LINUXCNC_POINTS = 256
+#: Maximum number of points per joint that LinuxCNC reads.
+_LINUXCNC_POINTS = 256
 _SPACING_TOLERANCE_MM = 1e-3
 
 
@@ -28,20 +28,36 @@ class ExportError(FusionError):
 
 
 def export_results(results: Path, format: str, out: Path) -> list[Path]:
-    """Write an export of a results folder and return the files.
+    """Write drift, profile and fields as CSV, or the drift-free profile as the compensation table of a control.
 
     Parameters
     ----------
     results : Path
         Folder of a finished run.
     format : {"csv", "linuxcnc", "siemens840d", "heidenhain", "renishaw"}
+        Tables, or a control.
     out : Path
-        Folder for the files.
+        Folder for the files; created where it is absent.
+
+    Returns
+    -------
+    list of Path
+        Written files: ``drift.csv``, ``profile.csv`` and, with thermograms, ``fields.csv``; or one compensation table.
 
     Raises
     ------
     ExportError
-        If the folder holds no results, or the positions do not suit the format.
+        If the folder holds no results, or the positions do not suit the control.
+
+    Notes
+    -----
+    Positions are in mm, the profile in um (CSV) or mm (controls), relative to the first position and positive approach. Formats and
+    signs: LinuxCNC ``COMP_FILE_TYPE 0``; Siemens 840D ``$AA_ENC_COMP``, added to the actual value; Heidenhain ``.COM``.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> export_results(Path("results"), "csv", Path("results/export"))  # doctest: +SKIP
     """
     source = results / "deviations.nc"
     if not source.is_file():
@@ -50,10 +66,10 @@ def export_results(results: Path, format: str, out: Path) -> list[Path]:
     if format == "csv":
         return _write_tables(results, deviations, out)
     write, suffix = _CONTROLS[format]
-    return [write_text(out / f"compensation.{suffix}", write(profile_table(deviations)))]
+    return [write_text(out / f"compensation.{suffix}", write(_profile_table(deviations)))]
 
 
-def profile_table(deviations: xr.Dataset) -> pd.DataFrame:
+def _profile_table(deviations: xr.Dataset) -> pd.DataFrame:
     """Return position (mm) and profile per approach (mm), relative to the first position, sorted by position.
 
     Raises
@@ -80,9 +96,15 @@ def profile_table(deviations: xr.Dataset) -> pd.DataFrame:
 
 
 def linuxcnc(table: pd.DataFrame) -> str:
-    """Return a COMP_FILE of type 0: triplets of nominal, and true position by the forward and by the reverse approach, in mm."""
-    if len(table) > LINUXCNC_POINTS:
-        raise ExportError(f"{len(table)} positions; LinuxCNC reads at most {LINUXCNC_POINTS} per joint, measure fewer")
+    """Return a COMP_FILE of type 0: triplets of nominal, and true position by the forward and by the reverse approach, in mm.
+
+    Parameters
+    ----------
+    table : DataFrame
+        ``position``, ``positive`` and ``negative`` (profile by approach), mm.
+    """
+    if len(table) > _LINUXCNC_POINTS:
+        raise ExportError(f"{len(table)} positions; LinuxCNC reads at most {_LINUXCNC_POINTS} per joint, measure fewer")
     rows = [f"{place:.4f} {place + forward:.6f} {place + reverse:.6f}" for place, forward, reverse in _rows(table)]
     return "\n".join(rows) + "\n"
 
@@ -91,6 +113,13 @@ def siemens840d(table: pd.DataFrame, axis: str = "AX1") -> str:
     """Return an $AA_ENC_COMP archive in mm; the value is added to the actual position, so that a positive one moves the axis back.
 
     The control knows one table per encoder: the mean of both approaches goes in, half the difference is left to backlash.
+
+    Parameters
+    ----------
+    table : DataFrame
+        ``position``, ``positive`` and ``negative`` (profile by approach), mm.
+    axis : str
+        Axis identifier of the control.
     """
     step = _spacing(table, "Siemens 840D")
     mean = (table["positive"] + table["negative"]) / 2
@@ -103,23 +132,37 @@ def siemens840d(table: pd.DataFrame, axis: str = "AX1") -> str:
         f"$AA_ENC_COMP_MIN[0,{axis}]={table['position'].iloc[0]:.4f}",
         f"$AA_ENC_COMP_MAX[0,{axis}]={table['position'].iloc[-1]:.4f}",
         f"$AA_ENC_COMP_IS_MODULO[0,{axis}]=0",
-        *(f"$AA_ENC_COMP[0,{at},{axis}]={value:.6f}" for at, value in enumerate(mean)),
+        *(f"$AA_ENC_COMP[0,{number},{axis}]={value:.6f}" for number, value in enumerate(mean)),
         "M17",
     ]
     return "\n".join(lines) + "\n"
 
 
 def heidenhain(table: pd.DataFrame) -> str:
-    """Return a compensation table AXIS-X.COM: measured deviation (mm) of the forward approach and reversal at equal distances."""
+    """Return a compensation table AXIS-X.COM: measured deviation (mm) of the forward approach and reversal at equal distances.
+
+    Parameters
+    ----------
+    table : DataFrame
+        ``position``, ``positive`` and ``negative`` (profile by approach), mm.
+    """
     step = _spacing(table, "Heidenhain")
     start = table["position"].iloc[0]
     head = f"BEGIN AXIS-X.COM DATUM:{start:+.4f} DISTANCE:{step:+.4f}"
-    rows = [f"{at} {forward:+.6f} {forward - reverse:+.6f}" for at, (_, forward, reverse) in enumerate(_rows(table))]
+    rows = [
+        f"{number} {forward:+.6f} {forward - reverse:+.6f}" for number, (_, forward, reverse) in enumerate(_rows(table))
+    ]
     return "\n".join([head, "NR X BACKLASH", *rows, "[END]"]) + "\n"
 
 
 def renishaw(table: pd.DataFrame) -> str:
-    """Return a table of error values (um) with its spacing, start and end (mm), forward and reverse."""
+    """Return a table of error values (um) with its spacing, start and end (mm), forward and reverse.
+
+    Parameters
+    ----------
+    table : DataFrame
+        ``position``, ``positive`` and ``negative`` (profile by approach), mm.
+    """
     step = _spacing(table, "Renishaw")
     lines = [
         f"Compensation start {table['position'].iloc[0]:.4f}",

@@ -1,4 +1,4 @@
-"""report.html: one self-contained file, written for a metrologist, made from the products alone."""
+"""report.html: one self-contained file, made from the products alone."""
 
 from __future__ import annotations
 
@@ -14,74 +14,88 @@ import jinja2
 import numpy as np
 import xarray as xr
 
-from fusion.attribution.leading_source import find_source
 from fusion.products.grouped import group, has
-from fusion.report import plots_attribution, plots_model, plots_plan, record_section, summary_section, wording
+from fusion.products.results import Results
+from fusion.report import plots_attribution, plots_model, plots_plan, record_section, summary_section
 from fusion.report.attribution_section import leading_region
+from fusion.report.wording import number
 from interferometry import figures
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Largest number of map values that go into the file; above it cycles are thinned and cells are binned, and the report says so.
-MAP_BUDGET = 2_000_000
+#: Largest number of map values in the file; above it cycles are thinned and cells are averaged, and the report says so.
+_MAP_BUDGET = 2_000_000
 _MISSING = -32768
 _LAYERS = (("rise", "temperature_rise", "K"), ("temperature", "temperature", "°C"))
 
 
 def render_report(
-    results: Mapping[str, Any],
+    results: Results,
     provenance: Mapping[str, Any],
     datasets: Mapping[str, Any],
     *,
     joint: Mapping[str, Any] | None = None,
 ) -> str:
-    """Return the report as HTML text.
+    """Return the report of a run as HTML text.
 
     Parameters
     ----------
-    results, provenance : mapping
-        Content of results.json and provenance.json.
+    results : Results
+        Results of the run, see `fusion.products.results.read_results`.
+    provenance : mapping
+        Content of provenance.json.
     datasets : mapping
-        ``fields`` and ``deviations`` (Dataset) and ``fusion`` (DataTree) as they were written; those that a campaign does not have may be
-        missing. A ``record`` stands alone.
+        ``fields`` and ``deviations`` (Dataset) and ``fusion`` (DataTree) as they were written; those that a campaign does not
+        have may be absent. A ``record`` (Dataset) stands alone.
     joint : mapping, optional
-        What this campaign and another one of the machine agree on: ``other``, its title, and ``rows`` of name and text.
+        What this campaign and another one of the machine agree on: ``other`` (its title), ``causes`` (places in words),
+        ``sources`` (rows of cells: place, part of the drift, first and second session, verdict), ``rows`` (name and text).
+
+    Returns
+    -------
+    str
+        One HTML page that needs no other file and no network.
+
+    Raises
+    ------
+    KeyError
+        If the products lack what the results refer to, because they belong to different runs.
+
+    Notes
+    -----
+    Charts are SVG, fields are 16-bit maps. Recordings whose maps exceed two million values are thinned in cycles and averaged in cells,
+    and the page says so. Terms of ISO 230-2:2014; expanded uncertainties with k = 2 (GUM 6.2).
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> page = render_report(read_results(Path("results")), provenance, datasets)  # doctest: +SKIP
     """
     loader = jinja2.FileSystemLoader(str(resources.files("fusion.report") / "templates"))
     environment = jinja2.Environment(
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    environment.filters.update(
-        number=wording.number,
-        p=wording.p_value,
-        effect=wording.effect_name,
-        cause=lambda name: wording.CAUSES[name][0],
-        joined=wording.join,
-    )
-    environment.globals.update(measured=wording.measured, duration=wording.duration)
+    environment.filters["number"] = number
     if "record" in datasets:
         return environment.get_template("record.html.j2").render(
             results=results,
             provenance=provenance,
             summary=record_section.describe_record(results, provenance, datasets["record"]),
             figures={
-                name: svg_text(draw, name) for name, draw in record_section.draw_record(datasets["record"]).items()
+                name: _svg_text(draw, name) for name, draw in record_section.draw_record(datasets["record"]).items()
             },
         )
     return environment.get_template("report.html.j2").render(
-        results={name: results.get(name) for name in (*results, *_OPTIONAL)},
+        results=results,
         provenance=provenance,
-        summary=summary_section.describe(results, provenance, datasets, joint),
-        figures=draw_figures(results, datasets),
-        maps=embed_maps(datasets["fields"], datasets["fusion"], results) if "fields" in datasets else None,
+        summary=summary_section.describe_campaign(results, provenance, datasets, joint),
+        figures=_draw_figures(results, datasets),
+        maps=_embed_maps(datasets["fields"], results) if "fields" in datasets else None,
     )
 
 
-_OPTIONAL = ("registration", "iso230", "neighbours", "drift", "anomalies", "hotspots", "loop")
-
-
-def draw_figures(results: Mapping[str, Any], datasets: Mapping[str, Any]) -> dict[str, str]:
+def _draw_figures(results: Results, datasets: Mapping[str, Any]) -> dict[str, str]:
     """Return every figure that the data allow, by name, as SVG text."""
     charts: dict[str, Callable[[], Axes]] = {}
     if "fields" in datasets:
@@ -91,8 +105,8 @@ def draw_figures(results: Mapping[str, Any], datasets: Mapping[str, Any]) -> dic
     if "deviations" in datasets:
         charts |= _drift_charts(results, datasets["deviations"])
     fused = datasets.get("fusion")
-    if fused is not None and "correlation" in fused.children:
-        charts |= _correlation_charts(fused)
+    if fused is not None and results.correlation is not None and "correlation" in fused.children:
+        charts |= _correlation_charts(fused, results.correlation.source.part)
     if fused is not None and has(fused.to_dataset(), "loop") and "deviations" in datasets:
         loop, deviations = group(fused.to_dataset(), "loop"), datasets["deviations"]
         charts["residual_time"] = lambda: plots_model.plot_residual_time(loop, deviations)
@@ -101,13 +115,13 @@ def draw_figures(results: Mapping[str, Any], datasets: Mapping[str, Any]) -> dic
         charts["residual_spectrum"] = lambda: plots_model.plot_residual_spectrum(loop)
         charts["residual_events"] = lambda: plots_model.plot_residual_events(loop, deviations)
         charts["contributions"] = lambda: plots_model.plot_contributions(loop, deviations)
-    return {name: svg_text(draw, name) for name, draw in charts.items()}
+    return {name: _svg_text(draw, name) for name, draw in charts.items()}
 
 
-def _drift_charts(results: Mapping[str, Any], deviations: xr.Dataset) -> dict[str, Callable[[], Axes]]:
+def _drift_charts(results: Results, deviations: xr.Dataset) -> dict[str, Callable[[], Axes]]:
     """The charts that need the readings alone."""
     drift, chart, position = group(deviations, "drift"), group(deviations, "chart"), deviations["position"]
-    flagged = {item["target"] for item in results.get("anomalies", [])}
+    flagged = {anomaly.target for anomaly in results.anomalies or ()}
     shown = min(flagged, default=int(deviations["target"][min(3, deviations.sizes["target"] - 1)]))
     return {
         "deviations_positive": lambda: figures.plot_deviation_chart(deviations, direction="positive"),
@@ -127,11 +141,10 @@ def _drift_charts(results: Mapping[str, Any], deviations: xr.Dataset) -> dict[st
     }
 
 
-def _correlation_charts(fused: xr.DataTree) -> dict[str, Callable[[], Axes]]:
-    """The maps of the channel that leads, the modes, the clusters, and the leading region by target."""
+def _correlation_charts(fused: xr.DataTree, channel: str) -> dict[str, Callable[[], Axes]]:
+    """The maps of the leading part of the drift, the modes, the clusters, and the leading region by target."""
     maps = fused.children["correlation"]
     cells, position = maps.to_dataset(), fused.to_dataset()["position"]
-    channel = find_source(maps).channel
     charts: dict[str, Callable[[], Axes]] = {
         "sensitivity": lambda: plots_attribution.plot_cells(
             cells, "sensitivity", channel, label="sensitivity / (µm/K)"
@@ -147,12 +160,12 @@ def _correlation_charts(fused: xr.DataTree) -> dict[str, Callable[[], Axes]]:
     return charts
 
 
-def svg_text(draw: Callable[[], Axes], name: str) -> str:
+def _svg_text(draw: Callable[[], Axes], name: str) -> str:
     """Return a chart as an SVG element whose identifiers start with `name`, so that several fit into one page."""
     import matplotlib as mpl
     from matplotlib import pyplot as plt
 
-    with mpl.rc_context({**plots_model.STYLE, "backend": "Agg"}):
+    with mpl.rc_context({**figures.STYLE, "backend": "Agg"}):
         figure = draw().get_figure(root=True)
         assert figure is not None
         buffer = io.StringIO()
@@ -165,7 +178,7 @@ def svg_text(draw: Callable[[], Axes], name: str) -> str:
     return text.replace("<svg ", f'<svg role="img" aria-label="{name.replace("_", " ")}" ', 1)
 
 
-def embed_maps(fields: xr.Dataset, fused: xr.DataTree, results: Mapping[str, Any]) -> dict[str, Any]:
+def _embed_maps(fields: xr.Dataset, results: Results) -> dict[str, Any]:
     """Return the interactive map of the table: per-cycle fields as 16-bit numbers with offset and step, in JSON."""
     kept, note = _thin(fields[[variable for _, variable, _ in _LAYERS]])
     x, y = kept["x"].values, kept["y"].values
@@ -177,7 +190,7 @@ def embed_maps(fields: xr.Dataset, fused: xr.DataTree, results: Mapping[str, Any
         "cycles": [f"cycle {cycle}" for cycle in kept["cycle"].values],
         "layers": layers,
         "line": _line(fields),
-        "hotspots": [{"x_mm": spot["x_mm"], "y_mm": spot["y_mm"]} for spot in results.get("hotspots", [])],
+        "hotspots": [{"x_mm": spot.x_mm, "y_mm": spot.y_mm} for spot in results.hotspots or ()],
     }  # fmt: skip
     text = json.dumps(content, default=float).replace("</", "<\\/")
     return {"entries": [{"json": text, "layers": list(layers), "count": kept.sizes["cycle"]}], "note": note}
@@ -187,11 +200,11 @@ def _thin(fields: xr.Dataset) -> tuple[xr.Dataset, str]:
     """Return the fields within the budget: every n-th cycle, then averages of blocks of cells; and the sentence that says so."""
     cells, cycles = fields.sizes["x"] * fields.sizes["y"], fields.sizes["cycle"]
     note = []
-    block = int(np.ceil(np.sqrt(max(1.0, cells * len(_LAYERS) * min(cycles, 25) / MAP_BUDGET))))
+    block = int(np.ceil(np.sqrt(max(1.0, cells * len(_LAYERS) * min(cycles, 25) / _MAP_BUDGET))))
     if block > 1:
         fields = fields.coarsen(x=block, y=block, boundary="trim").mean()
         note.append(f"The map shows means of {block} × {block} cells")
-    every = int(np.ceil(fields.sizes["x"] * fields.sizes["y"] * len(_LAYERS) * cycles / MAP_BUDGET))
+    every = int(np.ceil(fields.sizes["x"] * fields.sizes["y"] * len(_LAYERS) * cycles / _MAP_BUDGET))
     if every > 1:
         chosen = sorted({*range(0, cycles, every), cycles - 1})
         fields = fields.isel(cycle=chosen)

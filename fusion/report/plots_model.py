@@ -1,7 +1,4 @@
-"""Charts of the joint estimate and the closed loop.
-
-ISO 230-2 windows along the test; the house style of every chart, which the paper's figures share.
-"""
+"""Charts of the joint estimate, of the ISO 230-2 windows along the test, and of the closed loop."""
 
 from __future__ import annotations
 
@@ -14,25 +11,32 @@ from interferometry.figures import (
     ACCENT,
     ARROWS,
     COLOURS,
-    GRID,
     INK,
     MARKERS,
     MUTED,
-    STYLE,
     TIME_MAP,
     hours_since_start,
     new_axes,
-    time_span,
 )
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-BEFORE = "#9aa7ad"
+_BEFORE = "#9aa7ad"
 
 
 def plot_profile(drift: xr.Dataset, position: xr.DataArray, *, ax: Axes | None = None) -> Axes:
-    """Plot the drift-free profile of both approaches with its 95 % band."""
+    """Plot the drift-free profile of both approaches with its 95 % band.
+
+    Parameters
+    ----------
+    drift : Dataset
+        Group ``drift`` of deviations.nc.
+    position : (target,) DataArray
+        Target positions, mm.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     ax = new_axes(ax)
     for direction in drift["direction"].values:
         row = drift.sel(direction=direction)
@@ -45,7 +49,17 @@ def plot_profile(drift: xr.Dataset, position: xr.DataArray, *, ax: Axes | None =
 
 
 def plot_drift(drift: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot the drift of every position over time, mean of both approaches, coloured by position."""
+    """Plot the drift of every position over time, mean of both approaches, coloured by position.
+
+    Parameters
+    ----------
+    drift : Dataset
+        Group ``drift`` of deviations.nc.
+    deviations : Dataset
+        Content of deviations.nc.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     import matplotlib as mpl
 
     ax = new_axes(ax)
@@ -68,7 +82,17 @@ def plot_drift(drift: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = N
 
 
 def plot_reversal(drift: xr.Dataset, position: xr.DataArray, *, ax: Axes | None = None) -> Axes:
-    """Plot the reversal (positive minus negative approach) of every position with its 95 % interval."""
+    """Plot the reversal (positive minus negative approach) of every position with its 95 % interval.
+
+    Parameters
+    ----------
+    drift : Dataset
+        Group ``drift`` of deviations.nc.
+    position : (target,) DataArray
+        Target positions, mm.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     ax = new_axes(ax)
     ax.errorbar(position, drift["reversal"], 2 * drift["reversal_u"], fmt="o", color=INK, capsize=2, linewidth=1.0)
     ax.axhline(0.0, color=MUTED, linewidth=0.8)
@@ -77,7 +101,17 @@ def plot_reversal(drift: xr.Dataset, position: xr.DataArray, *, ax: Axes | None 
 
 
 def plot_position_scatter(drift: xr.Dataset, flagged: set[int], *, ax: Axes | None = None) -> Axes:
-    """Plot the random scatter of every position and approach with its 95 % interval; flagged positions are shaded."""
+    """Plot the random scatter of every position and approach with its 95 % interval; flagged positions are shaded.
+
+    Parameters
+    ----------
+    drift : Dataset
+        Group ``drift`` of deviations.nc.
+    flagged : set of int
+        Targets that stand out.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     ax = new_axes(ax)
     for target in sorted(flagged):
         ax.axvspan(target - 0.4, target + 0.4, color=ACCENT, alpha=0.12, linewidth=0)
@@ -97,11 +131,21 @@ def _stages(loop: xr.Dataset) -> list[tuple[str, str, str]]:
     before, after = loop["residual_declared"], loop["residual_final"]
     if np.allclose(before, after, atol=1e-9, equal_nan=True):
         return [("residual_final", COLOURS["positive"], "declared model, nothing added")]
-    return [("residual_declared", BEFORE, "declared model"), ("residual_final", COLOURS["positive"], "after the loop")]
+    return [("residual_declared", _BEFORE, "declared model"), ("residual_final", COLOURS["positive"], "after the loop")]
 
 
 def plot_residual_time(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot the residual over time before and after the loop: every reading as a dot, the mean per cycle as a line."""
+    """Plot the residual over time before and after the loop: every reading as a dot, the mean per cycle as a line.
+
+    Parameters
+    ----------
+    loop : Dataset
+        Group ``loop`` of fusion.nc.
+    deviations : Dataset
+        Content of deviations.nc.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     ax = new_axes(ax)
     hours = hours_since_start(deviations)
     for name, colour, text in _stages(loop):
@@ -119,6 +163,15 @@ def plot_residual_position(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes
     """Plot the change of the residual from the first to the second half of the test, per position and approach, before and after.
 
     The mean of a residual over all cycles is zero by construction, so the change shows what a mean would hide.
+
+    Parameters
+    ----------
+    loop : Dataset
+        Group ``loop`` of fusion.nc.
+    deviations : Dataset
+        Content of deviations.nc.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
     """
     ax = new_axes(ax)
     half = loop.sizes["cycle"] // 2
@@ -128,7 +181,7 @@ def plot_residual_position(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes
         for direction in loop["direction"].values:
             ax.plot(
                 deviations["position"], change.sel(direction=direction), MARKERS[direction], linestyle="-" if after else ":",
-                color=COLOURS[direction] if after else BEFORE, label=f"{ARROWS[direction]}, {text}",
+                color=COLOURS[direction] if after else _BEFORE, label=f"{ARROWS[direction]}, {text}",
             )  # fmt: skip
     ax.axhline(0.0, color=MUTED, linewidth=0.8)
     ax.set(xlabel="position / mm", ylabel="residual, second minus first half / µm")
@@ -137,7 +190,17 @@ def plot_residual_position(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes
 
 
 def plot_residual_direction(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot half the difference of the residuals of both approaches over time, before and after the loop."""
+    """Plot half the difference of the residuals of both approaches over time, before and after the loop.
+
+    Parameters
+    ----------
+    loop : Dataset
+        Group ``loop`` of fusion.nc.
+    deviations : Dataset
+        Content of deviations.nc.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     ax = new_axes(ax)
     hours = hours_since_start(deviations).mean(["direction", "target"])
     for name, colour, text in _stages(loop):
@@ -150,7 +213,15 @@ def plot_residual_direction(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axe
 
 
 def plot_residual_spectrum(loop: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot the power of the innovations over period, before and after the loop, with the limit that noise alone hardly exceeds."""
+    """Plot the power of the innovations over period, before and after the loop, with the limit that noise alone hardly exceeds.
+
+    Parameters
+    ----------
+    loop : Dataset
+        Group ``loop`` of fusion.nc.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     ax = new_axes(ax)
     for name, colour, text in _stages(loop):
         power = loop[name.replace("residual", "periodogram")]
@@ -162,13 +233,23 @@ def plot_residual_spectrum(loop: xr.Dataset, *, ax: Axes | None = None) -> Axes:
 
 
 def plot_residual_events(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot the sum of all innovations up to every reading: a walk without preference where nothing happens, a kink at an event."""
+    """Plot the cumulative sum of the innovations: without trend where nothing happens, with a kink at an event.
+
+    Parameters
+    ----------
+    loop : Dataset
+        Group ``loop`` of fusion.nc.
+    deviations : Dataset
+        Content of deviations.nc.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     ax = new_axes(ax)
     hours = hours_since_start(deviations).values.ravel()
     for name, colour, text in _stages(loop):
         values = loop[name.replace("residual", "innovation")].transpose("cycle", "direction", "target").values.ravel()
-        known = np.flatnonzero(np.isfinite(values) & np.isfinite(hours))
-        order = known[np.argsort(hours[known], kind="stable")]
+        valid = np.flatnonzero(np.isfinite(values) & np.isfinite(hours))
+        order = valid[np.argsort(hours[valid], kind="stable")]
         ax.plot(hours[order], np.cumsum(values[order]) / np.sqrt(order.size), color=colour, label=text)
     ax.axhline(0.0, color=MUTED, linewidth=0.8)
     ax.set(xlabel="time since first reading / h", ylabel="sum of innovations / √n")
@@ -177,48 +258,50 @@ def plot_residual_events(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes |
 
 
 def plot_contributions(loop: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot what each effect of the final model contributes over time at the far end of the axis, positive approach."""
+    """Plot what each effect of the final model contributes over time at the far end of the axis, positive approach.
+
+    Parameters
+    ----------
+    loop : Dataset
+        Group ``loop`` of fusion.nc.
+    deviations : Dataset
+        Content of deviations.nc.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     ax = new_axes(ax)
     far = int(deviations["target"][int(np.argmax(np.abs(deviations["position"].values)))])
-    at: dict[str, Any] = {"target": far, "direction": "positive"}
-    hours = hours_since_start(deviations).sel(at)
+    selected: dict[str, Any] = {"target": far, "direction": "positive"}
+    hours = hours_since_start(deviations).sel(selected)
     colours = (INK, ACCENT, COLOURS["positive"], COLOURS["negative"])
     measured = np.isfinite(hours.values)
     for place, effect in enumerate(loop["effect"].values):
         style: dict[str, Any] = {"linestyle": ("-", "--", "-.", ":")[place % 4], "color": colours[place % 4]}
-        line = loop["contribution"].sel(effect=effect, **at).values
-        seen = measured & np.isfinite(line)
-        ax.plot(hours.values[seen], line[seen], label=str(effect).replace("_", " "), **style)
+        line = loop["contribution"].sel(effect=effect, **selected).values
+        valid = measured & np.isfinite(line)
+        ax.plot(hours.values[valid], line[valid], label=str(effect).replace("_", " "), **style)
     ax.set(xlabel="time since first reading / h", ylabel=f"contribution at position {far} / µm")
     ax.legend()
     return ax
 
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-__all__ = [
-    "ACCENT",
-    "ARROWS",
-    "COLOURS",
-    "GRID",
-    "INK",
-    "MARKERS",
-    "MUTED",
-    "STYLE",
-    "TIME_MAP",
-    "hours_since_start",
-    "new_axes",
-    "plot_windows",
-    "time_span",
-]
-
-
 def plot_windows(windows: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot accuracy A and repeatability R of five-cycle windows along the test; the last entry is the whole test."""
+    """Plot accuracy A and repeatability R of five-cycle windows along the test; the last entry is the whole test.
+
+    Parameters
+    ----------
+    windows : Dataset
+        Group ``iso`` of deviations.nc: one entry per window, the last one the whole test.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     ax = new_axes(ax)
     short, whole = windows.isel(window=slice(None, -1)), windows.isel(window=-1)
-    for name, colour, text in (("A", INK, "accuracy A"), ("R", ACCENT, "repeatability R"), ("B", MUTED, "reversal B")):
+    for name, colour, text in (
+        ("A", INK, "accuracy A"),
+        ("R", ACCENT, "repeatability R"),
+        ("B", MUTED, "reversal error B"),
+    ):
         ax.errorbar(
             short["middle_cycle"], short[name], 2 * short[f"{name}_u"], fmt="o-", color=colour, markersize=3, capsize=1.5,
             linewidth=1.0, label=f"{text}, windows",

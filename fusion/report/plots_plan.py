@@ -1,4 +1,4 @@
-"""Pictures of the table: the registered frame, the rise on the plan, the rise over time."""
+"""Charts of the table: the registered frame with its fiducials, and the rise over time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HEAT_MAP = "inferno"
 
 
 def _on_plan(fields: xr.Dataset, shape: tuple[int, int]) -> np.ndarray:
-    """Return which pixels of a frame show the plan, by the homography (the lens distortion does not matter for a colour scale)."""
+    """Return which pixels of a frame show the plan, (row, column) bool; without lens distortion, as it only sets a colour scale."""
     row, column = np.indices(shape)
     x, y, scale = np.einsum("ij,jrc->irc", fields["homography"].values, np.stack([column, row, np.ones(shape)]))
     half = float(np.median(np.diff(fields["x"]))) / 2
@@ -27,11 +27,18 @@ def _on_plan(fields: xr.Dataset, shape: tuple[int, int]) -> np.ndarray:
 
 
 def plot_registration(fields: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Draw the reference frame, in sensor pixels, with every located fiducial."""
+    """Draw the reference frame, in sensor pixels, with every located fiducial.
+
+    Parameters
+    ----------
+    fields : Dataset
+        Content of fields.nc.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     ax = new_axes(ax)
     frame = fields["reference_frame"].values
-    seen = _on_plan(fields, frame.shape)
-    low, high = np.nanpercentile(frame[seen], [1, 99])
+    low, high = np.nanpercentile(frame[_on_plan(fields, frame.shape)], [1, 99])
     picture = ax.imshow(frame, cmap=HEAT_MAP, vmin=low, vmax=high, interpolation="nearest")
     ax.figure.colorbar(picture, ax=ax, label="temperature / °C", shrink=0.8, aspect=30).outline.set_visible(False)
     column, row = fields["fiducial_column"].values, fields["fiducial_row"].values
@@ -44,22 +51,16 @@ def plot_registration(fields: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def plot_rise(fields: xr.Dataset, cycle: int, *, ax: Axes | None = None) -> Axes:
-    """Draw the temperature rise of one cycle on the plan, in mm."""
-    ax = new_axes(ax, height=2.2)
-    rise = fields["temperature_rise"].sel(cycle=cycle)
-    half = float(np.median(np.diff(fields["x"]))) / 2
-    x, y = fields["x"].values, fields["y"].values
-    extent = (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half)
-    picture = ax.imshow(rise, cmap=HEAT_MAP, origin="lower", extent=extent, interpolation="nearest")
-    ax.figure.colorbar(picture, ax=ax, label="rise / K", orientation="horizontal", aspect=40).outline.set_visible(False)
-    ax.set(xlabel="x / mm", ylabel="y / mm", title=f"cycle {cycle}")
-    ax.grid(visible=False)
-    return ax
-
-
 def plot_rise_history(fields: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot the rise of the table over the test: mean over the plan, with its coolest and hottest tenth."""
+    """Plot the rise of the table over the test: mean over the plan, with its coolest and hottest tenth.
+
+    Parameters
+    ----------
+    fields : Dataset
+        Content of fields.nc.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     ax = new_axes(ax)
     rise = fields["temperature_rise"]
     hours = (fields["cycle_time"] - fields["cycle_time"][0]) / np.timedelta64(1, "h")

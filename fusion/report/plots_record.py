@@ -1,4 +1,4 @@
-"""Charts of a record: what was measured, what the model predicts of the part it has not seen, what is left."""
+"""Charts of a record: measured and predicted displacements, residuals, contributions, temperatures and drivers."""
 
 from __future__ import annotations
 
@@ -12,41 +12,74 @@ from interferometry.figures import ACCENT, INK, MUTED, new_axes
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-BEFORE, AFTER = "#9aa7ad", "#0f5c6e"
+_BEFORE, _AFTER = "#9aa7ad", "#0f5c6e"
 
 
 def plot_prediction(record: xr.Dataset, channel: str, *, ax: Axes | None = None) -> Axes:
-    """Plot one channel as measured and as predicted by the declared and by the final model; the sealed part is shaded."""
+    """Plot one channel as measured and as predicted by the declared and by the final model; the hold-out is shaded.
+
+    Parameters
+    ----------
+    record : Dataset
+        fusion.nc of a record.
+    channel : str
+        Name of the channel.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     ax = new_axes(ax)
-    hours, one = _hours(record), record.sel(channel=channel)
-    shade_sealed(record, ax)
-    ax.plot(hours, one["predicted_declared"], color=BEFORE, label="declared model")
-    band = 2 * float(one["predicted_u"])
+    hours, selected = _hours(record), record.sel(channel=channel)
+    _shade_hold_out(record, ax)
+    ax.plot(hours, selected["predicted_declared"], color=_BEFORE, label="declared model")
+    band = 2 * float(selected["predicted_u"])
     ax.fill_between(
-        hours, one["predicted_final"] - band, one["predicted_final"] + band, color=AFTER, alpha=0.15, linewidth=0
+        hours,
+        selected["predicted_final"] - band,
+        selected["predicted_final"] + band,
+        color=_AFTER,
+        alpha=0.15,
+        linewidth=0,
     )
-    ax.plot(hours, one["predicted_final"], color=AFTER, label="final model, 95 % band")
-    ax.plot(hours, one["displacement"], color=INK, linewidth=0.9, label="measured")
+    ax.plot(hours, selected["predicted_final"], color=_AFTER, label="final model, 95 % band")
+    ax.plot(hours, selected["displacement"], color=INK, linewidth=0.9, label="measured")
     ax.set(xlabel="time since start / h", ylabel="displacement / µm", title=channel)
     ax.legend()
     return ax
 
 
 def plot_residuals(record: xr.Dataset, channel: str, *, ax: Axes | None = None) -> Axes:
-    """Plot what both models leave of one channel over time."""
+    """Plot the residuals of both models in one channel over time.
+
+    Parameters
+    ----------
+    record : Dataset
+        fusion.nc of a record.
+    channel : str
+        Name of the channel.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     ax = new_axes(ax)
-    hours, one = _hours(record), record.sel(channel=channel)
-    shade_sealed(record, ax)
+    hours, selected = _hours(record), record.sel(channel=channel)
+    _shade_hold_out(record, ax)
     ax.axhline(0.0, color=MUTED, linewidth=0.8)
-    ax.plot(hours, one["displacement"] - one["predicted_declared"], color=BEFORE, label="declared model")
-    ax.plot(hours, one["displacement"] - one["predicted_final"], color=AFTER, label="final model")
+    ax.plot(hours, selected["displacement"] - selected["predicted_declared"], color=_BEFORE, label="declared model")
+    ax.plot(hours, selected["displacement"] - selected["predicted_final"], color=_AFTER, label="final model")
     ax.set(xlabel="time since start / h", ylabel="measured − predicted / µm", title=channel)
     ax.legend()
     return ax
 
 
 def plot_temperatures(record: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot the rise of every sensor since the first block."""
+    """Plot the rise of every sensor since the first block.
+
+    Parameters
+    ----------
+    record : Dataset
+        fusion.nc of a record.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     import matplotlib as mpl
 
     ax = new_axes(ax)
@@ -64,9 +97,17 @@ def plot_temperatures(record: xr.Dataset, *, ax: Axes | None = None) -> Axes:
 
 
 def plot_drivers(record: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot every driver as a share of its largest size."""
+    """Plot every driver as a share of its largest size.
+
+    Parameters
+    ----------
+    record : Dataset
+        fusion.nc of a record.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     ax = new_axes(ax)
-    for k, name in enumerate(str(one) for one in record["driver_name"].values):
+    for k, name in enumerate(str(driver) for driver in record["driver_name"].values):
         ax.plot(_hours(record), record["driver"].values[:, k], linewidth=1.0, label=name)
     ax.set(xlabel="time since start / h", ylabel="share of the largest value")
     ax.legend()
@@ -74,10 +115,20 @@ def plot_drivers(record: xr.Dataset, *, ax: Axes | None = None) -> Axes:
 
 
 def plot_contributions(record: xr.Dataset, channel: str, *, ax: Axes | None = None) -> Axes:
-    """Plot what each term of the final model contributes to one channel, about its mean."""
+    """Plot what each term of the final model contributes to one channel, about its mean.
+
+    Parameters
+    ----------
+    record : Dataset
+        fusion.nc of a record.
+    channel : str
+        Name of the channel.
+    ax : Axes, optional
+        Axes to draw into; left out: those of a new figure.
+    """
     ax = new_axes(ax)
-    shade_sealed(record, ax)
-    for k, name in enumerate(str(one) for one in record["effect"].values):
+    _shade_hold_out(record, ax)
+    for k, name in enumerate(str(effect) for effect in record["effect"].values):
         values = record["contribution"].sel(channel=channel).isel(effect=k)
         ax.plot(_hours(record), values, linewidth=1.1, label=name.replace("_", " "))
     ax.set(xlabel="time since start / h", ylabel="contribution / µm", title=channel)
@@ -86,11 +137,11 @@ def plot_contributions(record: xr.Dataset, channel: str, *, ax: Axes | None = No
     return ax
 
 
-def shade_sealed(record: xr.Dataset, ax: Axes) -> None:
-    """Shade the part of the time that the model has not seen."""
-    sealed = _hours(record)[record["sealed"].values]
-    if sealed.size:
-        ax.axvspan(float(sealed[0]), float(sealed[-1]), color=ACCENT, alpha=0.07, linewidth=0)
+def _shade_hold_out(record: xr.Dataset, ax: Axes) -> None:
+    """Shade the hold-out."""
+    hours = _hours(record)[record["sealed"].values]
+    if hours.size:
+        ax.axvspan(float(hours[0]), float(hours[-1]), color=ACCENT, alpha=0.07, linewidth=0)
 
 
 def _hours(record: xr.Dataset) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The report of a record: the same page, with what sensors and channels have to tell."""
+"""The report of a record: sensors and channels, prediction and residual, part after part."""
 
 from __future__ import annotations
 
@@ -8,71 +8,101 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from fusion.report import plots_record, wording
-from fusion.report.model_section import in_words, runner_up, step_parameters
-from fusion.report.wording import duration, join, moment, number
+from fusion.products.results import RecordLoop, Results
+from fusion.record.problem import ENTRY_LEVEL, EVENT_LEVEL
+from fusion.report import plots_record
+from fusion.report.model_section import parameters, refused_effects, steps_table
+from fusion.report.tables import Row, Table, Words, table
+from fusion.report.wording import (
+    duration,
+    effect_words,
+    join,
+    moment,
+    next_steps,
+    number,
+    p_value,
+    verdict_headline,
+    verdict_numbers,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Channels and figures beyond these are in fusion.nc; the page stays readable.
+#: Largest number of channels with charts; all of them are in fusion.nc.
 _MOST_CHANNELS = 6
+_ERRORS = ("Last value repeated / µm", "Declared model / µm", "Final model / µm")
+_ERROR_KEYS = ("rmse_persistence_um", "rmse_declared_um", "rmse_final_um")
 
-GLOSSARY = (
-    ("Displacement", "What a probe shows of the machine's motion in one channel, in µm."),
-    ("Block", "The samples of a short stretch of time, averaged; the model sees blocks."),
+_GLOSSARY = (
+    ("Displacement", "Motion of the machine that a probe measures in one channel, in µm."),
+    ("Block", "Average of the samples of a short stretch of time; the model is fitted to blocks."),
     ("Quasi-static model", "Every displacement is a linear function of the temperatures at the same time."),
-    ("Driver", "What makes heat and was logged: speed, load, duty."),
+    ("Driver", "A logged quantity that generates heat: speed, load, duty."),
     ("Held-out error", "Root mean square error on a part that took no part in any choice, mean over the channels."),
     (
         "Part after part",
-        "Every part from the third on is predicted by the whole procedure, applied to the time before it alone.",
+        "Forward chaining: every part from the third on is predicted by the whole procedure, applied to the time before it alone.",
     ),
     (
         "Family-wise p",
-        "Chance that a record without any effect shows something as strong anywhere among all that was tried.",
+        "Probability that a record without any effect shows something as strong anywhere among all that was tested.",
     ),
     ("Noise", "Standard deviation of one block mean after model and drift."),
 )
 
 
 def draw_record(record: xr.Dataset) -> dict[str, Callable[[], Axes]]:
-    """Return the charts of a record by name."""
+    """Return the charts of a record by name, each drawn when it is called.
+
+    Parameters
+    ----------
+    record : Dataset
+        fusion.nc of a record.
+    """
     charts: dict[str, Callable[[], Axes]] = {"temperatures": lambda: plots_record.plot_temperatures(record)}
     if record.sizes["driver_name"]:
         charts["drivers"] = lambda: plots_record.plot_drivers(record)
-    for k, name in enumerate(shown_channels(record)):
+    for k, name in enumerate(_shown_channels(record)):
         charts[f"prediction_{k}"] = lambda name=name: plots_record.plot_prediction(record, name)  # type: ignore[misc]
         charts[f"residual_{k}"] = lambda name=name: plots_record.plot_residuals(record, name)  # type: ignore[misc]
         charts[f"contribution_{k}"] = lambda name=name: plots_record.plot_contributions(record, name)  # type: ignore[misc]
     return charts
 
 
-def shown_channels(record: xr.Dataset) -> list[str]:
+def _shown_channels(record: xr.Dataset) -> list[str]:
     """Return the channels that get charts."""
     return [str(name) for name in record["channel"].values[:_MOST_CHANNELS]]
 
 
-def describe_record(results: Mapping[str, Any], provenance: Mapping[str, Any], record: xr.Dataset) -> dict[str, Any]:
-    """Return everything the page says of a record in words and tables."""
-    loop = results["loop"]
+def describe_record(results: Results, provenance: Mapping[str, Any], record: xr.Dataset) -> dict[str, Any]:
+    """Return everything the report of a record says in words and tables, as the template reads it.
+
+    Parameters
+    ----------
+    results : Results
+        Results of the run.
+    provenance : mapping
+        Content of provenance.json.
+    record : Dataset
+        fusion.nc of the run.
+    """
+    loop = results.loop
+    assert isinstance(loop, RecordLoop)
     time = record["time"].values
     span_s = float((time[-1] - time[0]) / np.timedelta64(1, "s")) + float(record.attrs["block_s"])
     channels = [str(name) for name in record["channel"].values]
+    drivers = join([str(name) for name in record["driver_name"].values])
     return {
         "subtitle": _start(time[0]),
-        "headline": wording.verdict_headline(loop),
+        "verdict": loop.verdict,
+        "headline": verdict_headline(loop),
         "sentences": [
             f"Measured: {len(channels)} displacements and {record.sizes['sensor']} temperatures over {duration(span_s)}"
-            + (
-                f", with {join([str(one) for one in record['driver_name'].values])} as driver."
-                if record.sizes["driver_name"]
-                else "."
-            ),
-            wording.verdict_numbers(loop),
+            + (f", with {drivers} as driver." if drivers else "."),
+            verdict_numbers(loop),
         ],
         "numbers": _numbers(loop),
-        "next": wording.next_steps(results)[:6],
+        "next": next_steps(results)[:6],
         "contents": [
             ("data", "Data"),
             ("record", "Record"),
@@ -90,110 +120,154 @@ def describe_record(results: Mapping[str, Any], provenance: Mapping[str, Any], r
                 f"{_start(time[0]) or 'start not stated'}, {duration(span_s)}; averaged over {record.sizes['time']} blocks of "
                 f"{duration(float(record.attrs['block_s']))}",
             ),
-            ("Sealed", loop["held_out"]),
+            ("Held out", loop.held_out),
             ("Input files", f"{len(provenance['inputs'])}, listed with their SHA-256 under Provenance"),
         ],
-        "shown": list(enumerate(shown_channels(record))),
-        "parameters": step_parameters(loop),
-        "runners_up": [runner_up(step["runner_up"]) for step in loop["steps"]],
-        "rejected": [
-            (wording.effect_name(row["effect"]), readable_reason(row["rejected"]))
-            for turn in loop["search"]
-            for row in turn
-            if row["rejected"]
-        ],
-        "reasons": [
-            (f"{title}: {wording.effect_name(name)}", readable_reason(reason))
-            for title, reasons in (("blocked", loop["blocked"]), ("not tried", loop["not_tried"]))
-            for name, reason in reasons.items()
-        ],
-        "candidates": _candidates(loop),
-        "uncertainty": _uncertainty(loop),
-        "glossary": GLOSSARY,
-        "mean_declared": _mean(loop, "rmse_declared_um"),
-        "mean_final": _mean(loop, "rmse_final_um"),
-        "mean_persistence": _mean(loop, "rmse_persistence_um"),
+        "shown": list(enumerate(_shown_channels(record))),
         "omitted": max(0, len(channels) - _MOST_CHANNELS),
+        "steps": steps_table(loop),
+        "unexplained": loop.unexplained,
+        "channels": _channels_table(loop),
+        "rejected": _rejected_table(loop),
+        "refused": refused_effects(loop),
+        "candidates": _candidates_table(loop),
+        "chained": _chained_table(loop),
+        "uncertainty": _uncertainty(loop),
+        "glossary": _GLOSSARY,
     }
 
 
 def _start(first: np.datetime64) -> str:
-    """Return when the record began, empty where the campaign file does not say so and its times count from zero."""
+    """Return when the record began, empty where the campaign file does not state it and the times count from zero."""
     return moment(first) if first >= np.datetime64("1971-01-01") else ""
 
 
-def readable_reason(text: str) -> str:
-    """Return a reason with the signs of print."""
-    return text.replace(" um", " µm")
-
-
-def _mean(loop: Mapping[str, Any], name: str) -> float | None:
-    values = [one[name] for one in loop["chained"] if one[name] is not None]
+def _mean_chained(loop: RecordLoop, name: str) -> float | None:
+    """Return an error, mean over the forward-chained parts, um."""
+    values = [getattr(part, name) for part in loop.chained if getattr(part, name) is not None]
     return float(np.mean(values)) if values else None
 
 
-def _numbers(loop: Mapping[str, Any]) -> list[dict[str, str]]:
-    """The figures that a reader looks for first."""
-    left = loop["unexplained"]
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share
+
+
+def _numbers(loop: RecordLoop) -> list[dict[str, str]]:
+    """Return the key figures."""
     numbers = [
         {
             "name": "Held-out error",
-            "value": f"{number(loop['rmse_final_um'], 3)} µm",
-            "note": f"declared model {number(loop['rmse_declared_um'], 3)} µm",
+            "value": f"{number(loop.rmse_final_um, 3)} µm",
+            "note": f"declared model {number(loop.rmse_declared_um, 3)} µm",
         },
         {
             "name": "Repeating the last value",
-            "value": f"{number(loop['rmse_persistence_um'], 3)} µm",
+            "value": f"{number(loop.rmse_persistence_um, 3)} µm",
             "note": "error of the simplest prediction on the same part",
         },
         {
-            "name": "Left of the variance",
-            "value": f"{100 * left['variance_share']:.1f} %",
+            "name": "Variance left",
+            "value": f"{number(_percent(loop.unexplained.variance_share), 2)} %",
             "note": "share of the displacements' variance, on the held-out part",
         },
     ]
-    mean = _mean(loop, "rmse_final_um")
+    mean = _mean_chained(loop, "rmse_final_um")
     if mean is not None:
         numbers.append(
             {
                 "name": "Part after part",
                 "value": f"{number(mean, 3)} µm",
-                "note": f"declared model {number(_mean(loop, 'rmse_declared_um'), 3)} µm",
+                "note": f"declared model {number(_mean_chained(loop, 'rmse_declared_um'), 3)} µm",
             }
         )
     return numbers
 
 
-def _candidates(loop: Mapping[str, Any]) -> list[list[str]]:
+def _channels_table(loop: RecordLoop) -> Table:
+    """Return the errors on the hold-out and the size of every step, channel by channel."""
+    steps = [f"Step {turn}, rms / µm" for turn in range(1, len(loop.steps) + 1)]
+    rows = [
+        [
+            name,
+            *(number(getattr(channel, key), 3) for key in _ERROR_KEYS),
+            number(_percent(channel.variance_share), 2),
+            number(channel.noise_um, 2),
+            *(number(step.rms_by_channel_um[name], 3) for step in loop.steps),
+        ]
+        for name, channel in loop.channels.items()
+    ]
+    return table([Words("Channel"), *_ERRORS, "Variance left / %", "Noise of a block / µm", *steps], rows)
+
+
+def _rejected_table(loop: RecordLoop) -> Table:
+    """Return the candidates that passed the search and were rejected, with the reason."""
+    rows = [
+        [effect_words(score.effect).name, score.rejected] for turn in loop.search for score in turn if score.rejected
+    ]
+    return table([Words("Effect"), Words("Why it did not enter")], rows, stacked=True)
+
+
+def _candidates_table(loop: RecordLoop) -> Table:
+    """Return the best candidate of every effect in every round of the search."""
+    columns = [
+        "Round",
+        Words("Effect"),
+        Words("Best parameters"),
+        "Gain",
+        "Gain beyond chance",
+        "p (search)",
+        "Forward-chained error / µm",
+        Words("Outcome"),
+    ]
     rows = []
-    for turn, scores in enumerate(loop["search"], start=1):
-        for row in scores:
-            after = row["chained_rmse_after_um"]
-            outcome = "chosen" if row["chosen"] else ("predicts no better" if row["rejected"] else "")
+    for turn, scores in enumerate(loop.search, start=1):
+        for score in scores:
+            before, after = (number(value, 3) for value in (score.chained_rmse_before_um, score.chained_rmse_after_um))
             rows.append(
                 [
                     str(turn),
-                    wording.effect_name(row["effect"]),
-                    in_words(row["parameters"]),
-                    number(row["gain"], 3),
-                    number(row["excess_gain"], 3),
-                    wording.p_value(row["family_wise_p"]),
-                    "–" if after is None else f"{number(row['chained_rmse_before_um'], 3)} to {number(after, 3)}",
-                    outcome,
+                    effect_words(score.effect).name,
+                    parameters(score.parameters),
+                    number(score.gain, 3),
+                    number(score.excess_gain, 3),
+                    p_value(score.family_wise_p),
+                    "–" if score.chained_rmse_after_um is None else f"{before} to {after}",
+                    "chosen" if score.chosen else "predicts no better" if score.rejected else "",
                 ]
             )
-    return rows
+    return table(columns, rows)
 
 
-def _uncertainty(loop: Mapping[str, Any]) -> list[str]:
+def _chained_table(loop: RecordLoop) -> Table:
+    """Return the errors of the forward-chained parts and their means."""
+    rows = [
+        Row(
+            [
+                f"{number(part.first_h, 3)} to {number(part.last_h, 3)}",
+                join([effect_words(name).name for name in part.effects]) or "none",
+                *(number(getattr(part, key), 3) for key in _ERROR_KEYS),
+            ]
+        )
+        for part in loop.chained
+    ]
+    means = [number(_mean_chained(loop, key), 3) for key in _ERROR_KEYS]
+    return table(
+        [Words("Part / h"), Words("Effects found before it"), *_ERRORS], [*rows, Row(["mean", "", *means], marked=True)]
+    )
+
+
+def _uncertainty(loop: RecordLoop) -> list[str]:
+    """Return what the numbers are worth, sentence by sentence."""
     sentences = [
-        "Whether an effect is there is tested against a drift that wanders by itself in every channel; channels that watch the same "
-        "part are not counted twice, because the simulated records behind p have the correlation of the measured ones.",
+        "Whether an effect is present is tested against a drift that wanders at random in every channel. Channels that measure the same "
+        "part are not counted twice: the simulated records behind p have the correlation of the measured ones.",
+        f"p is family-wise over the search of one round. An effect enters at p up to {100 * ENTRY_LEVEL:g} %, an event at p up to "
+        f"{100 * EVENT_LEVEL:g} %.",
         "The bands of a prediction (two standard uncertainties) come from parts of the record that the model had not seen. They do not "
         "hold for a machine that is used in a way this record does not contain.",
-        "The coefficients of single sensors are not printed: alike sensors share what they explain, and only their sum means something.",
+        "The coefficients of single sensors are not printed: collinear sensors share what they explain, and only their sum is meaningful.",
         "The verdict says what these data can show: a source that was not logged and that no sensor sees looks like drift without a cause.",
     ]
-    if loop["steps"]:
-        sentences.append(f"An effect was confirmed thus: {loop['steps'][0]['confirmed']}.")
+    if loop.steps:
+        sentences.append(f"How the added effects were confirmed: {loop.steps[0].confirmed}.")
     return sentences

@@ -1,4 +1,4 @@
-"""What the report says beside its figures: summary, tables, uncertainty notes, glossary."""
+"""The report of a campaign with both instruments: summary, data, tables per position, uncertainty, glossary."""
 
 from __future__ import annotations
 
@@ -8,33 +8,48 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from fusion.loop.axis import ENTRY_LEVEL
+from fusion.attribution.family_wise import LEVEL as ATTRIBUTION_LEVEL
+from fusion.diagnosis.remainder import LEVEL as REMAINDER_LEVEL
+from fusion.loop.axis import ASKED_LEVEL, ENTRY_LEVEL, SEARCH_LEVEL, SECOND_LEVEL
 from fusion.products.grouped import group, has
-from fusion.report import wording
+from fusion.products.results import AxisLoop, Loop, NeighboursPart, Quantity, Results
 from fusion.report.attribution_section import describe_correlation
+from fusion.report.findings import ISO230_TERMS, anomaly_cause, anomaly_place, iso230_values, standing_out
 from fusion.report.model_section import (
     describe_candidates,
+    describe_evidence,
     describe_identifiability,
     describe_model,
     describe_residual,
-    evidence,
-    runner_up,
-    step_parameters,
+    steps_table,
 )
-from fusion.report.wording import duration, join, measured, moment, number
+from fusion.report.tables import Table, Words, table
+from fusion.report.wording import (
+    decimals_of,
+    duration,
+    effect_words,
+    measured,
+    moment,
+    next_steps,
+    number,
+    p_value,
+    quantity,
+    verdict_headline,
+    verdict_numbers,
+)
 from interferometry.figures import time_span
 
-GLOSSARY = (
-    ("Deviation", "Measured minus programmed position of one reading, in µm."),
+_GLOSSARY = (
+    ("Positioning deviation", "Measured minus target position of one reading, in µm."),
     ("Drift", "The part of the deviation that changes slowly in time, estimated at every reading from all readings."),
     ("Profile", "The deviation along the axis without drift, at the mean thermal state of the test."),
-    ("Scatter s", "Standard deviation of single readings after profile and drift were taken out."),
-    ("Conventional s", "Standard deviation of all cycles at a position, drift included (n − 1)."),
+    ("Scatter s", "Standard deviation of single readings after profile and drift were subtracted."),
+    ("Conventional s", "Standard deviation over all cycles at a position, drift included (n − 1)."),
     (
         "Neighbour difference",
-        "Difference of readings at adjacent positions of one pass; its scatter hardly contains drift.",
+        "Difference of readings at adjacent positions of one pass; its scatter contains hardly any drift.",
     ),
-    ("Reversal B", "Positive minus negative approach at a position."),
+    ("Reversal error B", "Difference of the mean deviations of both approaches, positive minus negative."),
     (
         "Held-out error",
         "Root mean square error on cycles that took no part in fitting: only this says whether a model predicts.",
@@ -42,13 +57,15 @@ GLOSSARY = (
     ("Noise floor", "What a perfect model would leave: the scatter of single readings."),
     (
         "Family-wise p",
-        "Chance that data without any effect show something as strong anywhere among all that was tried.",
+        "Probability that data without any effect show something as strong anywhere among all that was tested.",
     ),
-    ("Rise", "Temperature minus that of the first cycle, in K; errors that stay the same cancel in it."),
+    (
+        "Rise",
+        "Temperature minus that of the first cycle, in K; errors that do not change during the test cancel in it.",
+    ),
     ("Expanded uncertainty", "Twice the standard uncertainty (k = 2), about 95 % coverage."),
 )
-
-SECTIONS = (
+_SECTIONS = (
     ("registration", "registration", "Registration"),
     ("fields", "hotspots", "Temperature"),
     ("drift", "drift", "Drift"),
@@ -58,52 +75,59 @@ SECTIONS = (
     ("correlation", "correlation", "Correlation"),
     ("loop", "loop", "Model"),
 )
+#: Axis values among the key figures.
+_KEY_VALUES = ("A", "R", "B")
+_SIGNS = {"positive": "+", "negative": "−"}
 
 
-def describe(
-    results: Mapping[str, Any],
+def describe_campaign(
+    results: Results,
     provenance: Mapping[str, Any],
     datasets: Mapping[str, Any],
     joint: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
-    """Return everything the template says in words and tables."""
+    """Return everything the report says in words and tables, as the template reads it.
+
+    Parameters
+    ----------
+    results : Results
+        Results of the run.
+    provenance, datasets, joint
+        See `fusion.report.html.render_report`.
+    """
     deviations, fields, fused = (datasets.get(name) for name in ("deviations", "fields", "fusion"))
-    loop = results.get("loop")
-    anomalies = results.get("anomalies", [])
-    correlation = describe_correlation(fused, results, joint) if fused is not None else None
-    present = {*results, *(["correlation"] if correlation else [])}
+    correlation = None if fused is None else describe_correlation(fused, results.correlation, joint)
+    sentences = _sentences(results, deviations)
+    if correlation is not None:
+        sentences.append(correlation["headline"])
     return {
         "subtitle": _subtitle(provenance, deviations),
-        "headline": wording.verdict_headline(loop) if loop else "Evaluated without a model of the drift.",
-        "sentences": [*_sentences(results, deviations), *([correlation["headline"]] if correlation else [])],
+        "verdict": results.loop.verdict if results.loop else "",
+        "headline": verdict_headline(results.loop) if results.loop else "Evaluated without a model of the drift.",
+        "sentences": sentences,
         "numbers": _numbers(results, deviations, fields),
-        "next": wording.next_steps(results)[:6],
+        "next": next_steps(results)[:6],
         "contents": [
             ("data", "Data"),
-            *((anchor, title) for anchor, part, title in SECTIONS if part in present),
+            *((anchor, title) for anchor, part, title in _SECTIONS if getattr(results, part) is not None),
             ("uncertainty", "Uncertainty"),
             ("glossary", "Glossary"),
             ("provenance", "Provenance"),
         ],
         "data": _data_rows(results, provenance, deviations, fields),
-        "fiducials": _fiducial_rows(fields),
-        "field_uncertainty": _field_uncertainty(fields),
-        "positions": _position_rows(deviations),
-        "neighbours_text": _neighbours_text(results),
-        "comparison": _comparison_rows(deviations),
-        "anomaly_advice": [wording.CAUSES[item["cause"]][1] for item in anomalies],
-        "evidence": [evidence(item["evidence"]) for item in anomalies],
+        "fiducials": None if fields is None else _fiducials_table(fields),
+        "field_uncertainty": "" if fields is None else _field_uncertainty(fields),
+        "hotspots": _hotspots_table(results) if results.hotspots else None,
+        "positions": None if deviations is None else _positions_table(deviations),
+        "neighbours": "" if results.neighbours is None else _neighbours_text(results.neighbours),
+        "comparison": None if deviations is None else _comparison_table(deviations),
+        "iso230": None if results.iso230 is None else _iso230_table(results),
+        "anomalies": _anomalies(results),
         "correlation": correlation,
-        "joint": joint,
-        "model": describe_model(loop) if loop else [],
-        "loop_numbers": wording.verdict_numbers(loop) if loop else "",
-        "parameters": step_parameters(loop) if loop else [],
-        "runners_up": [runner_up(step["runner_up"]) for step in loop["steps"]] if loop else [],
-        "candidates": describe_candidates(loop) if loop else None,
-        "residual": describe_residual(loop) if loop else [],
-        "identifiability": describe_identifiability(loop) if loop else [],
+        "joint": None if joint is None else {**joint, "table": _joint_table(joint)},
+        "loop": None if results.loop is None else _describe_loop(results.loop),
         "uncertainty": _uncertainty(results, fields),
-        "glossary": GLOSSARY,
+        "glossary": _GLOSSARY,
     }
 
 
@@ -113,7 +137,7 @@ def _subtitle(provenance: Mapping[str, Any], deviations: xr.Dataset | None) -> s
     return ", ".join(part for part in parts if part)
 
 
-def _sentences(results: Mapping[str, Any], deviations: xr.Dataset | None) -> list[str]:
+def _sentences(results: Results, deviations: xr.Dataset | None) -> list[str]:
     """What was measured, what the model says, what stands out: one sentence each."""
     sentences = []
     if deviations is not None:
@@ -124,18 +148,15 @@ def _sentences(results: Mapping[str, Any], deviations: xr.Dataset | None) -> lis
             f"Measured: {sizes['target']} positions over {np.ptp(position):g} mm, approached from both sides in {sizes['cycle']} cycles, "
             f"{duration(float((last - first) / np.timedelta64(1, 's')))} in all."
         )
-    if results.get("loop"):
-        sentences.append(wording.verdict_numbers(results["loop"]))
-    if "anomalies" in results:
-        named = [f"position {item['target']} ({wording.CAUSES[item['cause']][0]})" for item in results["anomalies"]]
-        sentences.append(f"Standing out: {join(named)}." if named else "No position stands out from the others.")
+    if results.loop is not None:
+        sentences.append(verdict_numbers(results.loop))
+    if results.anomalies is not None:
+        sentences.append(standing_out(results.anomalies))
     return sentences
 
 
-def _numbers(
-    results: Mapping[str, Any], deviations: xr.Dataset | None, fields: xr.Dataset | None
-) -> list[dict[str, str]]:
-    """The figures that a reader looks for first."""
+def _numbers(results: Results, deviations: xr.Dataset | None, fields: xr.Dataset | None) -> list[dict[str, str]]:
+    """Return the key figures: name, value, and a note."""
     numbers: list[dict[str, str]] = []
 
     def add(name: str, value: str, note: str) -> None:
@@ -147,12 +168,11 @@ def _numbers(
         span = float(mean.max() - mean.min())
         add("Drift during the test", f"{number(span)} µm", "largest difference between any two times and positions")
         sigma = float(drift["sigma"])
-        add("Scatter of single readings", f"{number(sigma, 2)} µm", "standard deviation, drift taken out")
-    if "iso230" in results:
-        iso = results["iso230"]
-        add("Accuracy A", measured(**iso["A_um"], unit="µm"), iso["window"])
-        add("Repeatability R", measured(**iso["R_um"], unit="µm"), iso["window"])
-        add("Reversal B", measured(**iso["B_um"], unit="µm"), iso["window"])
+        add("Scatter of single readings", f"{number(sigma, 2)} µm", "standard deviation, drift subtracted")
+    if results.iso230 is not None:
+        values = iso230_values(results.iso230)
+        for symbol in _KEY_VALUES:
+            add(ISO230_TERMS[symbol], values[symbol], results.iso230.window)
     if fields is not None:
         rise = fields["temperature_rise"].isel(cycle=-1)
         u = float(fields["temperature_rise_u"].isel(cycle=-1).mean())
@@ -161,25 +181,25 @@ def _numbers(
             measured(float(rise.mean()), u, "K"),
             f"mean of the last cycle; warmest cell {number(float(rise.max()))} K",
         )
-    if results.get("loop"):
-        loop = results["loop"]
-        note = f"declared model {number(loop['rmse_declared_um'], 2)} µm, noise {number(loop['noise_floor_um'], 2)} µm"
-        add("Held-out error", f"{number(loop['rmse_final_um'], 2)} µm", note)
+    if results.loop is not None:
+        declared, floor = number(results.loop.rmse_declared_um, 2), number(results.loop.noise_floor_um, 2)
+        add(
+            "Held-out error",
+            f"{number(results.loop.rmse_final_um, 2)} µm",
+            f"declared model {declared} µm, noise {floor} µm",
+        )
     return numbers
 
 
 def _data_rows(
-    results: Mapping[str, Any], provenance: Mapping[str, Any], deviations: xr.Dataset | None, fields: xr.Dataset | None
+    results: Results, provenance: Mapping[str, Any], deviations: xr.Dataset | None, fields: xr.Dataset | None
 ) -> list[tuple[str, str]]:
+    """Return what was recorded, by name."""
     rows = []
     if deviations is not None:
         readings = int(np.isfinite(deviations["deviation"]).sum())
-        rows.append(
-            (
-                "Readings",
-                f"{readings} of {deviations['deviation'].size} possible; times {deviations['time'].attrs.get('origin', 'recorded')}",
-            )
-        )
+        origin = deviations["time"].attrs.get("origin", "recorded")
+        rows.append(("Readings", f"{readings} of {deviations['deviation'].size} possible; times {origin}"))
         first, last = time_span(deviations)
         rows.append(("Time", f"{moment(first)} to {moment(last)}"))
     if fields is not None:
@@ -187,94 +207,156 @@ def _data_rows(
         rows.append(("Frames", f"{fields.sizes['time']}, from {moment(first)} to {moment(last)} on the laser's clock"))
         cell = float(np.median(np.diff(fields["x"])))
         rows.append(("Plan", f"{fields.sizes['x']} × {fields.sizes['y']} cells of {cell:g} mm"))
-        seen = float(np.isfinite(fields["temperature_rise"].isel(cycle=-1)).mean())
-        rows.append(("Seen", f"{seen:.0%} of the plan; the rest is masked (fiducials, edges) or out of the picture"))
-    offset = results.get("alignment", {}).get("clock_offset_s")
-    if offset is not None:
-        source = "assumed" if offset["u"] is None else "as given" if offset["u"] == 0 else "from the table's motion"
-        rows.append(("Clock offset", f"{measured(offset['value'], offset['u'], 's')}, camera minus laser, {source}"))
+        visible = float(np.isfinite(fields["temperature_rise"].isel(cycle=-1)).mean())
+        rows.append(
+            ("Visible", f"{visible:.0%} of the plan; the rest is masked (fiducials, edges) or outside the frame")
+        )
+    if results.alignment is not None:
+        rows.append(("Clock offset", _clock_offset(results.alignment.clock_offset_s)))
     rows.append(("Input files", f"{len(provenance['inputs'])}, listed with their SHA-256 under Provenance"))
     return rows
 
 
-def _fiducial_rows(fields: xr.Dataset | None) -> list[dict[str, Any]]:
-    if fields is None:
-        return []
-    values = zip(
-        fields["fiducial_name"].values,
-        fields["fiducial_residual"].values,
-        fields["fiducial_leave_one_out"].values,
-        strict=True,
-    )
-    return [
-        {"name": str(name), "residual": float(residual), "leave_one_out": float(loo)} for name, residual, loo in values
+def _clock_offset(offset: Quantity) -> str:
+    source = "assumed" if offset.u is None else "as given" if offset.u == 0 else "from the table's motion"
+    return f"{quantity(offset, 's')}, camera minus laser, {source}"
+
+
+def _fiducials_table(fields: xr.Dataset) -> Table:
+    """Return the registration residual and the leave-one-out error of every fiducial."""
+    rows = [
+        [str(fields["fiducial_name"].values[k])]
+        + [number(float(fields[name].values[k]), 2) for name in ("fiducial_residual", "fiducial_leave_one_out")]
+        for k in range(fields.sizes["fiducial"])
     ]
+    return table([Words("Fiducial"), "Residual / mm", "Leave-one-out / mm"], rows)
 
 
-def _field_uncertainty(fields: xr.Dataset | None) -> str:
-    if fields is None:
-        return ""
+def _field_uncertainty(fields: xr.Dataset) -> str:
     absolute, rise = (float(fields[name].isel(cycle=-1).mean()) for name in ("temperature_u", "temperature_rise_u"))
     return (
-        f"Standard uncertainty of a cell, mean over the plan: {number(absolute, 2)} K of the temperature, {number(rise, 2)} K of the rise, "
-        "in which errors that stay the same cancel."
+        f"Standard uncertainty of a cell, mean over the plan: {number(absolute, 2)} K of the temperature, {number(rise, 2)} K of the "
+        "rise, in which errors that do not change during the test cancel."
     )
 
 
-def _position_rows(deviations: xr.Dataset | None) -> list[list[str]]:
-    if deviations is None:
-        return []
+def _hotspots_table(results: Results) -> Table:
+    """Return place, rise, driven targets, p and lag of every hotspot."""
+    columns = ["x / mm", "y / mm", "Peak rise / K", Words("Positions it drives"), "p (family-wise)", "Lag"]
+    rows = [
+        [
+            number(spot.x_mm),
+            number(spot.y_mm),
+            number(spot.peak_rise_K),
+            ", ".join(map(str, spot.targets)) or "none shown by these data",
+            p_value(spot.p_value),
+            duration(spot.lag_s),
+        ]
+        for spot in results.hotspots or ()
+    ]
+    return table(columns, rows)
+
+
+def _positions_table(deviations: xr.Dataset) -> Table:
+    """Return profile, scatter and conventional standard deviation of every position and approach."""
     drift, conventional = group(deviations, "drift"), group(deviations, "conventional")
-    places = {name: wording.decimals_of(float(drift[f"{name}_u"].median())) for name in ("profile", "scatter")}
+    decimals = {name: decimals_of(float(drift[f"{name}_u"].median())) for name in ("profile", "scatter")}
     rows = []
     for target in deviations["target"].values:
         row = [str(target), f"{float(deviations['position'].sel(target=target)):g}"]
-        at = [{"target": target, "direction": direction} for direction in ("positive", "negative")]
-        for name, decimals in places.items():
-            row += [
-                measured(float(drift[name].sel(one)), float(drift[f"{name}_u"].sel(one)), decimals=decimals)
-                for one in at
-            ]
-        row += [f"{float(conventional['standard_deviation'].sel(one)):.2f}" for one in at]
-        rows.append(row)
-    return rows
+        for name, places in decimals.items():
+            for direction in _SIGNS:
+                value, u = (drift[key].sel(target=target, direction=direction) for key in (name, f"{name}_u"))
+                row.append(measured(float(value), float(u), decimals=places))
+        s = conventional["standard_deviation"].sel(target=target)
+        rows.append([*row, *(f"{float(s.sel(direction=direction)):.2f}" for direction in _SIGNS)])
+    quantities = ("Profile", "Scatter s", "Conventional s")
+    return table(["Position", "mm", *(f"{name} {sign} / µm" for name in quantities for sign in _SIGNS.values())], rows)
 
 
-def _comparison_rows(deviations: xr.Dataset | None) -> list[list[str]]:
-    """Conventional, differenced, their ratio and the joint estimate's own standard deviation, per position and direction."""
-    if deviations is None:
-        return []
-    table = group(deviations, "comparison")
-    return [
+def _comparison_table(deviations: xr.Dataset) -> Table:
+    """Return conventional, differenced, their ratio and the joint estimate's own standard deviation, per position and approach."""
+    comparison = group(deviations, "comparison")
+    rows = [
         [
             str(link),
             *(
-                f"{float(table[name].sel(link=link, direction=direction)):.2f}"
-                for direction in ("positive", "negative")
+                f"{float(comparison[name].sel(link=link, direction=direction)):.2f}"
+                for direction in _SIGNS
                 for name in ("conventional", "differenced", "ratio", "joint")
             ),
         ]
-        for link in table["link"].values
+        for link in comparison["link"].values
     ]
+    headings = ("Conventional s {} / µm", "Of differences s {} / µm", "Ratio {}", "Joint estimate s {} / µm")
+    return table(["Position", *(text.format(sign) for sign in _SIGNS.values() for text in headings)], rows)
 
 
-def _neighbours_text(results: Mapping[str, Any]) -> str:
-    if "neighbours" not in results:
-        return ""
-    part = results["neighbours"]
-    ratio = [value for values in part["ratio"].values() for value in values if value is not None]
+def _neighbours_text(part: NeighboursPart) -> str:
+    ratio = part.ratio.values()
     return (
         f"The conventional standard deviation is {number(min(ratio), 3)} to {number(max(ratio), 3)} times that of the "
         "differences. This ratio measures the drift, not the quality of an evaluation: it is 0.71 without drift. The chain of "
-        "mean differences gives exactly the conventional mean profile; differencing cleans the standard deviation, not the "
-        "mean. What the paper's equations (5) and (6) divide by n (n − 1) is the standard uncertainty of a mean; the charts "
+        "mean differences gives exactly the conventional mean profile: differencing removes the drift from the standard deviation, not "
+        "from the mean. What the paper's equations (5) and (6) divide by n (n − 1) is the standard uncertainty of a mean; the charts "
         "here show sample standard deviations."
     )
 
 
-def _uncertainty(results: Mapping[str, Any], fields: xr.Dataset | None) -> list[str]:
+def _iso230_table(results: Results) -> Table:
+    """Return the axis values in the terms of the standard."""
+    assert results.iso230 is not None
+    values = iso230_values(results.iso230)
+    rows = [[term, values[symbol]] for symbol, term in ISO230_TERMS.items()]
+    return table([Words(results.iso230.window), "Value (k = 2)"], rows)
+
+
+def _anomalies(results: Results) -> list[dict[str, Any]]:
+    """Return every position that stands out, with its evidence."""
+    described = []
+    for anomaly in results.anomalies or ():
+        where = anomaly_place(anomaly)
+        described.append(
+            {
+                "title": f"{where[0].upper()}{where[1:]}: {anomaly_cause(anomaly)}",
+                "p": p_value(anomaly.p_value),
+                "scatter": f"{number(anomaly.scatter_um, 2)} µm",
+                **describe_evidence(anomaly.evidence),
+            }
+        )
+    return described
+
+
+def _joint_table(joint: Mapping[str, Any]) -> Table | None:
+    """Return the sources that either of two sessions shows; None where neither shows one."""
+    columns = [
+        "x, y / mm",
+        *(Words(title) for title in ("Part of the drift", "First session", "Second session", "Verdict")),
+    ]
+    return table(columns, joint["sources"]) if joint["sources"] else None
+
+
+def _describe_loop(loop: Loop) -> dict[str, Any]:
+    """Return the section on the model."""
+    assert isinstance(loop, AxisLoop)
+    return {
+        "numbers": verdict_numbers(loop),
+        "steps": steps_table(loop),
+        "held_out": loop.held_out,
+        "noise": f"{number(loop.noise_floor_um, 2)} µm",
+        "shape": loop.unexplained.shape,
+        "shape_rms": f"{number(loop.unexplained.rms_um, 2)} µm",
+        "residual": describe_residual(loop.residual_tests.declared, loop.residual_tests.final),
+        "model": describe_model(loop),
+        "identifiability": describe_identifiability(loop),
+        "candidates": describe_candidates(loop),
+    }
+
+
+def _uncertainty(results: Results, fields: xr.Dataset | None) -> list[str]:
+    """Return what the numbers are worth, sentence by sentence."""
     sentences = []
-    if "drift" in results:
+    if results.drift is not None:
         sentences.append(
             "Profile and drift come from one estimate over all readings at their own times (generalised least squares under a "
             "random drift); their uncertainty contains the noise of the readings and what the drift could have done between "
@@ -283,23 +365,47 @@ def _uncertainty(results: Mapping[str, Any], fields: xr.Dataset | None) -> list[
         )
     if fields is not None:
         sentences.append(
-            "Temperatures hold for the emissivity that the campaign states. An error of the emissivity or of the reflected "
+            "Temperatures hold for the emissivity that the campaign states. An error of the emissivity or of the reflected apparent "
             "temperature shifts all cells alike and cancels in the rise; a surface with another emissivity (bare metal, oil) "
             "does not follow this."
         )
-    if results.get("loop"):
+    if results.loop is not None:
         sentences.append(
             "The verdict says what these data can show, not what is true of the machine: an effect that moves all positions "
             "alike, slowly and unlogged, looks like drift without a cause. The errors before and after come from coefficients "
             "fitted without the held-out cycles."
         )
-        sentences.extend(
-            f"{wording.effect_name(step['effect']).capitalize()}: {step['confirmed']}."
-            for step in results["loop"]["steps"]
-            if "confirmed" in step
+        for step in results.loop.steps:
+            name = effect_words(step.effect).name
+            sentences.append(f"{name[0].upper()}{name[1:]}: {step.confirmed}.")
+    return [*sentences, *_levels(results)]
+
+
+def _levels(results: Results) -> list[str]:
+    """Return at which level each p-value is judged, and what it is corrected for."""
+    sentences = []
+    if results.loop is not None:
+        sentences.append(
+            f"Closed loop: p is family-wise over all candidates of a round. An effect enters at p up to {_percent(SEARCH_LEVEL)} in the "
+            f"search, at p up to {_percent(ASKED_LEVEL)} in the one question to the held-out cycles, and at p up to "
+            f"{_percent(SECOND_LEVEL)} in the search over all cycles that follows: {_percent(ENTRY_LEVEL)} together where nothing is "
+            f"missing. A pattern of positions is reported as left at p up to {_percent(REMAINDER_LEVEL)}, family-wise over its shapes."
         )
         sentences.append(
-            f"Where nothing is missing, the closed loop is set to add an effect with a chance of {100 * ENTRY_LEVEL:g} %."
+            "Table of the residual: every shape is tested by itself, its p-value is not corrected for the number of shapes."
         )
-    sentences.append("p-values are corrected for everything that was tried (family-wise), at a level of 5 %.")
+    if results.anomalies is not None:
+        # The level of `interferometry.anomalies.detect_anomalies`, and the stricter one of a cause.
+        sentences.append(
+            "Anomalies: p is family-wise over all positions and approaches, at a level of 5 %; a cause is named at p up to 2 % only."
+        )
+    if results.correlation is not None:
+        sentences.append(
+            "Drift and field: p is family-wise over cells, modes and regions together, at a level of "
+            f"{_percent(ATTRIBUTION_LEVEL)}; the p-values of single positions and of switched loads have a family of their own."
+        )
     return sentences
+
+
+def _percent(level: float) -> str:
+    return f"{100 * level:g} %"

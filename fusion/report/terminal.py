@@ -1,105 +1,107 @@
-"""What the terminal shows at the end: the findings of a run, or of one ISO 230-2 evaluation, as a table.
-
-What a file holds, in lines for the terminal: FLIR frames, deviations, or an environment log.
-"""
+"""What the command prints: findings of a run, an ISO 230-2 evaluation, a duty schedule, and what a file holds."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import rich.table
 import xarray as xr
-from rich.table import Table
 
 from fusion.attribution.duty_plan import DutyPlanError, Machine, plan_duty, switchings
 from fusion.campaign.config import CampaignError
 from fusion.campaign.inputs import counted, left_out_notices
 from fusion.campaign.quantities import read_quantity
+from fusion.products.results import Loop, Results
 from fusion.products.store import write_atomically
-from fusion.report import wording
-from fusion.report.wording import moment
+from fusion.report.findings import (
+    anomaly_cause,
+    anomaly_place,
+    attribution_headline,
+    hold_out_errors,
+    iso230_values,
+    randomised_causes,
+    scatter_range,
+)
+from fusion.report.tables import Words, print_table, table
+from fusion.report.wording import duration, join, moment, number, p_value, print_unit, verdict_headline
 from interferometry import iso230
 from interferometry.inspection import describe_test
 from interferometry.io.readers import read_deviations, read_environment
 from thermography.inspection import inspect_file, is_flir_file, thumbnail
 
 
-def summary_table(results: Mapping[str, Any]) -> Table:
-    """Return the findings of a run in some ten lines."""
-    table = Table(title=f"{results['campaign']}", title_justify="left", show_header=False, pad_edge=False)
-    table.add_column(no_wrap=True)
-    table.add_column(overflow="fold")
+def summary_table(results: Results) -> rich.table.Table:
+    """Return the findings of a run as a table for the terminal.
+
+    Parameters
+    ----------
+    results : Results
+        Results of a run.
+    """
+    printed = rich.table.Table(title=results.campaign, title_justify="left", show_header=False, pad_edge=False)
+    printed.add_column(no_wrap=True)
+    printed.add_column(overflow="fold")
     for name, text in summary_rows(results):
-        table.add_row(name, text)
-    return table
+        printed.add_row(name, text)
+    return printed
 
 
-def summary_rows(results: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return names and values of the summary."""
+def summary_rows(results: Results) -> list[tuple[str, str]]:
+    """Return names and texts of the findings of a run, in the order of the report.
+
+    Parameters
+    ----------
+    results : Results
+        Results of a run.
+    """
     rows: list[tuple[str, str]] = []
-    if "registration" in results:
-        rows.append(("registration", f"{wording.number(results['registration']['rms_mm'], 2)} mm rms"))
-    if "iso230" in results:
-        iso = results["iso230"]
-        rows += [
-            (f"{name} ({iso['window']})", wording.measured(**iso[f"{name}_um"], unit="µm")) for name in ("A", "R", "B")
-        ]
-    if "drift" in results:
-        scatter = [value for values in results["drift"]["scatter_um"].values() for value in values if value is not None]
-        rows.append(
-            ("scatter per position", f"{min(scatter):.2f} to {max(scatter):.2f} µm, median {np.median(scatter):.2f} µm")
-        )
-    if "anomalies" in results:
+    if results.registration is not None:
+        rows.append(("registration", f"{number(results.registration.rms_mm, 2)} mm rms"))
+    if results.iso230 is not None:
+        values = iso230_values(results.iso230)
+        rows += [(f"{symbol} ({results.iso230.window})", values[symbol]) for symbol in ("A", "R", "B")]
+    if results.drift is not None:
+        rows.append(("scatter per position", scatter_range(results.drift)))
+    if results.anomalies is not None:
         named = [
-            f"position {item['target']} {item['direction']}: {wording.CAUSES[item['cause']][0]} (p {wording.p_value(item['p_value'])})"
-            for item in results["anomalies"]
+            f"{anomaly_place(anomaly)}: {anomaly_cause(anomaly)} (p {p_value(anomaly.p_value)})"
+            for anomaly in results.anomalies
         ]
         rows.append(("anomalies", "\n".join(named) or "none"))
-    if "correlation" in results:
-        rows.append(("drift and field", _field_text(results["correlation"])))
-    if "loop" in results:
-        rows += _loop_rows(results["loop"])
-    for warning in results["warnings"]:
-        rows.append(("warning", warning["message"]))
-    return rows
+    if results.correlation is not None:
+        causes = randomised_causes(results.correlation)
+        shown = [f"cause by randomised duty: {join(causes)}"] if causes else []
+        rows.append(("drift and field", "\n".join([attribution_headline(results.correlation), *shown])))
+    if results.loop is not None:
+        rows += _loop_rows(results.loop)
+    return rows + [("warning", warning.message) for warning in results.warnings]
 
 
-def _field_text(found: Mapping[str, Any]) -> str:
-    """Return what the correlation says in one sentence, and which switched load is a cause."""
-    source = found["source"]
-    place = f"x {source['x_mm']:.0f} mm, y {source['y_mm']:.0f} mm (p {wording.p_value(source['p_value'])})"
-    text = {
-        "attributable": f"the drift goes with the temperature around {place}",
-        "not attributable": f"no part of the field goes with the drift; closest is {place}",
-        "not separable": "these data cannot tell: the session is one warm-up",
-    }[found["verdict"]]
-    causes = [one["name"] for one in found["randomised_duty"] or [] if one["cause"]]
-    return f"{text}\ncause by randomised duty: {wording.join(causes)}" if causes else text
+def _loop_rows(loop: Loop) -> list[tuple[str, str]]:
+    rows = [("declared", ", ".join(loop.declared) or "nothing")]
+    for step in loop.steps:
+        errors = f"{number(step.rmse_before_um, 3)} -> {number(step.rmse_after_um, 3)} µm"
+        rows.append(("added", f"{step.effect} (p {p_value(step.p_value)}), held-out error {errors}"))
+    return [
+        *rows,
+        ("held-out error", hold_out_errors(loop)),
+        ("noise floor", f"{number(loop.noise_floor_um, 3)} µm"),
+        ("verdict", f"{loop.verdict}: {verdict_headline(loop)}"),
+    ]
 
 
-def _loop_rows(loop: Mapping[str, Any]) -> list[tuple[str, str]]:
-    rows = [("declared", ", ".join(loop["declared"]) or "nothing")]
-    for step in loop["steps"]:
-        before, after = (wording.number(step[name], 3) for name in ("rmse_before_um", "rmse_after_um"))
-        rows.append(
-            ("added", f"{step['effect']} (p {wording.p_value(step['p_value'])}), held-out error {before} -> {after} µm")
-        )
-    rows.append(
-        (
-            "held-out error",
-            f"{wording.number(loop['rmse_declared_um'], 3)} -> {wording.number(loop['rmse_final_um'], 3)} µm",
-        )
-    )
-    rows.append(("noise floor", f"{wording.number(loop['noise_floor_um'], 3)} µm"))
-    rows.append(("verdict", f"{loop['verdict']}: {wording.verdict_headline(loop)}"))
-    return rows
+def iso230_tables(path: Path, cycles: str | None) -> list[rich.table.Table]:
+    """Evaluate a file of deviations by ISO 230-2:2014 and return the axis values and the values per target.
 
-
-def iso230_tables(path: Path, cycles: str | None) -> list[Table]:
-    """Evaluate a file by ISO 230-2 and return the axis values and the values per position.
+    Parameters
+    ----------
+    path : Path
+        Deviations: .rtl, CSV, or a log of a positioning test.
+    cycles : str or None
+        Window such as ``"1-5"``; None for all cycles.
 
     Raises
     ------
@@ -112,25 +114,21 @@ def iso230_tables(path: Path, cycles: str | None) -> list[Table]:
         result = iso230.evaluate_iso230(deviations, cycles=window)
     except ValueError as error:
         raise CampaignError(f"{path}: {error}") from None
-    axis = Table(title=f"{path.name}, {result.attrs['window']}", title_justify="left")
-    axis.add_column("quantity")
-    axis.add_column("value / µm", justify="right")
-    axis.add_column("U (k = 2) / µm", justify="right")
-    rows: list[tuple[str, str, dict[str, str]]]
-    rows = [(name.replace("_", " "), name, {}) for name in (*iso230.QUANTITIES, "mean_reversal")]
+    named: list[tuple[str, str, dict[str, str]]]
+    named = [(name.replace("_", " "), name, {}) for name in (*iso230.QUANTITIES, "mean_reversal")]
     for direction, sign in (("positive", "+"), ("negative", "-")):
-        rows += [(f"{name}{sign}", f"{name}_unidirectional", {"direction": direction}) for name in ("E", "R", "A")]
-    for label, name, at in rows:
-        axis.add_row(
-            label, *(f"{float(value):.2f}" for value in (result[name].sel(at), 2 * result[f"{name}_u"].sel(at)))
-        )
-    return [axis, _position_table(deviations, result)]
+        named += [(f"{name}{sign}", f"{name}_unidirectional", {"direction": direction}) for name in ("E", "R", "A")]
+    rows = [
+        [label, f"{float(result[name].sel(where)):.2f}", f"{2 * float(result[f'{name}_u'].sel(where)):.2f}"]
+        for label, name, where in named
+    ]
+    axis = table([Words("quantity"), "value / µm", "U (k = 2) / µm"], rows)
+    return [print_table(axis, f"{path.name}, {result.attrs['window']}"), _position_table(deviations, result)]
 
 
-def _position_table(deviations: xr.Dataset, result: xr.Dataset) -> Table:
-    table = Table(title="per position / µm", title_justify="left")
-    for name in ("i", "mm", "mean +", "mean -", "s +", "s -", "B_i", "R_i"):
-        table.add_column(name, justify="right")
+def _position_table(deviations: xr.Dataset, result: xr.Dataset) -> rich.table.Table:
+    """Return mean, standard deviation, reversal error and repeatability of every target as a table for the terminal."""
+    rows = []
     for target in result["target"].values:
         row = result.sel(target=target)
         values = [
@@ -140,14 +138,33 @@ def _position_table(deviations: xr.Dataset, result: xr.Dataset) -> Table:
             row["repeatability_bidirectional"],
         ]
         position = float(deviations["position"].sel(target=target))
-        table.add_row(str(target), f"{position:g}", *(f"{float(value):.2f}" for value in values))
-    return table
+        rows.append([str(target), f"{position:g}", *(f"{float(value):.2f}" for value in values)])
+    return print_table(
+        table(["i", "mm", "mean +", "mean -", "s +", "s -", "B_i", "R_i"], rows), "per target position / µm"
+    )
 
 
 def duty_lines(
     sources: Sequence[str], *, effect: str, drift: str, noise: str, cycle: str, power: float, seed: int
 ) -> list[str]:
-    """Propose a duty schedule and return it as lines: how long, with what power, and when to switch what.
+    """Propose a duty schedule: how long, with what power, and when to switch what.
+
+    Parameters
+    ----------
+    sources : sequence of str
+        Heat sources with their time constants, ``"spindle=40 min"``.
+    effect, drift, noise, cycle : str
+        Smallest drift to be detected, random walk of the axis in one hour, noise of a cycle's mean, and length of a cycle, each
+        with its unit.
+    power : float
+        Wanted chance of detecting the weakest source, 0 to 1.
+    seed : int
+        Of the random schedule.
+
+    Returns
+    -------
+    list of str
+        Lines for the terminal.
 
     Raises
     ------
@@ -165,30 +182,34 @@ def duty_lines(
     )
     proposed = plan_duty(machine, power=power, seed=seed)
     reached = float(proposed["power"].sel(hours=float(proposed["test_hours"])).max())
-    enough = (
-        ""
-        if proposed.attrs["enough"]
-        else f"; no test of up to {float(proposed['hours'].max()):g} h reaches {power:.0%}"
-    )
+    longest = f"; no test of up to {float(proposed['hours'].max()):g} h reaches {power:.0%}"
     lines = [
-        f"test of {float(proposed['test_hours']):g} h, mean dwell {wording.duration(float(proposed['mean_dwell']))}: "
-        f"chance to name the weakest source {reached:.0%}{enough}",
+        f"test of {float(proposed['test_hours']):g} h, mean dwell {duration(float(proposed['mean_dwell']))}: "
+        f"chance to name the weakest source {reached:.0%}{'' if proposed.attrs['enough'] else longest}",
         "minute  source  state",
     ]
     return lines + [f"{minute:6.0f}  {name}  {state}" for minute, name, state in switchings(proposed)]
 
 
 def _source(text: str) -> tuple[str, float]:
-    name, found, seconds = text.partition("=")
-    if not found or not name.strip():
+    """Return name and time constant (s) of a heat source such as ``"spindle=40 min"``."""
+    name, equals, time_constant = text.partition("=")
+    if not equals or not name.strip():
         raise DutyPlanError(
             f'--source "{text}" is no source; write its name and time constant, for example "spindle=40 min"'
         )
-    return name.strip(), read_quantity(seconds, "s")
+    return name.strip(), read_quantity(time_constant, "s")
 
 
 def read_window(text: str, deviations: xr.Dataset) -> list[int]:
-    """Return the cycle numbers of a window such as ``"1-5"`` or ``"3"``.
+    """Return the cycle numbers of a window of cycles.
+
+    Parameters
+    ----------
+    text : str
+        Window such as ``"1-5"`` or ``"3"``.
+    deviations : Dataset
+        Keeps ``interferometry.contract.DEVIATIONS``.
 
     Raises
     ------
@@ -199,22 +220,32 @@ def read_window(text: str, deviations: xr.Dataset) -> list[int]:
     if match is None:
         raise CampaignError(f'--cycles "{text}" is not a window of cycles; write for example 1-5')
     first, last = int(match.group(1)), int(match.group(2) or match.group(1))
-    measured = deviations["cycle"].values.tolist()
-    window = [cycle for cycle in range(first, last + 1) if cycle in measured]
+    cycles = deviations["cycle"].values.tolist()
+    window = [cycle for cycle in range(first, last + 1) if cycle in cycles]
     if len(window) != last - first + 1 or not window:
         raise CampaignError(
-            f'--cycles "{text}" asks for cycles that were not measured; there are {measured[0]} to {measured[-1]}'
+            f'--cycles "{text}" asks for cycles that were not measured; there are {cycles[0]} to {cycles[-1]}'
         )
     return window
 
 
 def describe_file(path: Path) -> list[str]:
-    """Return what a file holds, with warnings for what looks wrong.
+    """Return what a file holds, with warnings about implausible content.
+
+    Parameters
+    ----------
+    path : Path
+        FLIR file, deviations, or environment log.
+
+    Returns
+    -------
+    list of str
+        Lines for the terminal.
 
     Raises
     ------
     FlirFormatError, LaserFormatError
-        If the file is of no kind that is known, or cannot be used.
+        If the file is of no known kind, or cannot be used.
     """
     if is_flir_file(path):
         return inspect_file(path).lines()
@@ -226,7 +257,15 @@ def describe_file(path: Path) -> list[str]:
 
 
 def write_thumbnail(path: Path, folder: Path) -> Path | None:
-    """Write a small picture of a thermal file's first frame as ``<file>.png`` into a folder; None for a file without frames."""
+    """Write a small picture of the first frame of a thermal file as ``<file>.png`` and return its path.
+
+    Parameters
+    ----------
+    path : Path
+        FLIR file; any other file has no picture and gives None.
+    folder : Path
+        Where the picture goes; created where it is absent.
+    """
     if not is_flir_file(path):
         return None
     folder.mkdir(parents=True, exist_ok=True)
@@ -236,27 +275,30 @@ def write_thumbnail(path: Path, folder: Path) -> Path | None:
 
 
 def _describe_deviations(path: Path, deviations: xr.Dataset) -> list[str]:
+    """Return size, range and times of a file of deviations as lines."""
     time, position = deviations["time"].values, deviations["position"].values
-    known = time[~np.isnat(time)]
-    found = int(np.isfinite(deviations["deviation"]).sum())
+    timed = time[~np.isnat(time)]
+    readings = int(np.isfinite(deviations["deviation"]).sum())
     lines = [
         f"{path}: deviations, {counted(deviations.sizes['cycle'], 'cycle')}, {counted(deviations.sizes['target'], 'target')} "
-        f"from {position.min():g} to {position.max():g} mm, {found} of {deviations['deviation'].size} readings",
-        f"  deviation {float(deviations['deviation'].min()):.3f} to {float(deviations['deviation'].max()):.3f} um",
+        f"from {position.min():g} to {position.max():g} mm, {readings} of {deviations['deviation'].size} readings",
+        f"  deviation {float(deviations['deviation'].min()):.3f} to {float(deviations['deviation'].max()):.3f} µm",
     ]
-    if known.size:
-        lines.append(f"  {moment(known.min())} to {moment(known.max())}, times {deviations['time'].attrs['origin']}")
+    if timed.size:
+        lines.append(f"  {moment(timed.min())} to {moment(timed.max())}, times {deviations['time'].attrs['origin']}")
     else:
         lines.append("  no times: thermofuse run needs one per reading")
     return [*lines, *(f"  {line}" for line in describe_test(deviations)), *_warnings(deviations)]
 
 
 def _describe_log(path: Path, log: xr.Dataset) -> list[str]:
+    """Return times and range of every series of an environment log as lines."""
     lines = [
         f"{path}: environment, {log.sizes['time']} rows, {moment(log['time'].values[0])} to {moment(log['time'].values[-1])}"
     ]
     for name, values in log.data_vars.items():
-        lines.append(f"  {name} {float(values.min()):.2f} to {float(values.max()):.2f} {values.attrs['units']}")
+        unit = print_unit(values.attrs["units"])
+        lines.append(f"  {name} {float(values.min()):.2f} to {float(values.max()):.2f} {unit}")
     return lines + _warnings(log)
 
 

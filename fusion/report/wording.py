@@ -1,113 +1,57 @@
-"""Numbers and verdicts in plain words: sensible digits, units, uncertainty, and what to do next."""
+"""Numbers and verdicts as a reader meets them: significant digits, unit, uncertainty, and what to do next."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
-#: Effect -> its name in plain words, and what to look at on the machine or the measurement when it was found missing.
-EFFECTS: dict[str, tuple[str, str]] = {
-    "quasi_static": (
-        "quasi-static response to the temperatures",
-        "Check that the sensors sit on the parts that move the tool and the work.",
-    ),
-    "axis_expansion": (
-        "expansion of the axis",
-        "Check the expansion coefficient and the probe place that the laser's compensation uses.",
-    ),
-    "table_offset": (
-        "shift with the table's mean temperature",
-        "Look at the thermal path from table to scale and at the table's clamping.",
-    ),
-    "thermal_lag": (
-        "thermal lag of a remote structure",
-        "Wait longer before measuring, or log the temperature of the column and the bed.",
-    ),
-    "unseen_heat_source": (
-        "unseen heat source",
-        "Look for it where neither camera nor sensors reach: spindle, motor, drive, screw bearing, hydraulics; log its duty.",
-    ),
-    "dead_path": (
-        "dead path of the laser",
-        "Shorten the dead path or enter it, and zero the laser where the optics are closest.",
-    ),
-    "air_index": (
-        "refractive index of the air",
-        "Check that the weather station was on, and that its air sensor is in the beam's air.",
-    ),
-    "material_compensation": (
-        "material compensation",
-        "Check the coefficient that was entered and where the material probe sat.",
-    ),
-    "angular_growth": (
-        "growing pitch or yaw of the axis",
-        "Measure pitch and yaw while the machine warms up; keep the Abbe offset short.",
-    ),
-    "reversal_drift": (
-        "reversal that changes with time",
-        "Check screw preload, gibs and the scale's coupling; measure the reversal warm and cold.",
-    ),
-    "step_event": (
-        "sudden step",
-        "Look at the clamping of optics and laser head, and at what happened at that time.",
-    ),
-    "periodic_disturbance": (
-        "periodic disturbance",
-        "Compare its period with coolant, hydraulics and air conditioning.",
-    ),
-    "pitch_error": (
-        "pitch error of the screw",
-        "Repeat with a target spacing that is no multiple of the screw's lead.",
-    ),
-    "camera_offset": (
-        "jump of the camera's zero",
-        "Let the camera warm up and watch its flat-field corrections; the fields before and after the jump differ.",
-    ),
-    "reflected_source": (
-        "reflection in the picture",
-        "Shield the reflecting source, or paint the reflecting part.",
-    ),
-    "laser_warm_up": (
-        "warm-up of the laser",
-        "Let the laser warm up longer before the first cycle.",
-    ),
-    "sensor_fault": (
-        "faulty sensor",
-        "Check the sensor named, and its cable and time stamps.",
-    ),
-}
-
-#: Cause of an anomaly -> plain words and what to check.
-CAUSES: dict[str, tuple[str, str]] = {
-    "structural": (
-        "scatter of the structure",
-        "Check guideway, scale and screw at this position for wear, dirt or play.",
-    ),
-    "local_temperature": (
-        "local temperature",
-        "Check what heats the table near this position, and whether the fixture bends with it.",
-    ),
-    "stick_slip": (
-        "stick-slip",
-        "Check lubrication and guideway friction around this position; repeat with another feed rate.",
-    ),
-    "step": ("sudden step", "Check clamping and scale coupling; look at what happened at that time."),
-    "undetermined": (
-        "undetermined",
-        "These data do not decide. Repeat with more cycles around this position, in both directions.",
-    ),
-}
+from fusion.diagnosis.causes import CAUSES
+from fusion.effects.library import describe_effect
+from fusion.products.results import Loop, Quantity, RecordLoop, Results
 
 
-#: How the remedy of a warning starts that asks for no action.
-NOTHING_TO_DO = "Nothing has to be done"
+class EffectWords(NamedTuple):
+    """An effect as a reader meets it.
+
+    Attributes
+    ----------
+    name : str
+        Its name in words.
+    remedy : str
+        What to check on the machine or the measurement where the effect was missing; empty where the effect states none.
+    """
+
+    name: str
+    remedy: str
+
+
+@cache
+def effect_words(name: str) -> EffectWords:
+    """Return the words of an effect.
+
+    Parameters
+    ----------
+    name : str
+        Name as in results.json; that of a user's effect that is not installed here has spaces for underscores and no remedy.
+    """
+    effect = describe_effect(name)
+    return EffectWords(name.replace("_", " "), "") if effect is None else EffectWords(effect.words, effect.remedy)
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Return a number with significant digits and a true minus sign, or a dash where there is none."""
+    """Return a number with significant digits and a true minus sign.
+
+    Parameters
+    ----------
+    value : float or None
+        None and values that are not finite are shown as a dash.
+    digits : int
+        Significant digits.
+    """
     if value is None or not math.isfinite(value):
         return "–"
     if value == 0:
@@ -117,12 +61,30 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def decimals_of(u: float) -> int:
-    """Return how many decimals show an expanded uncertainty 2 u with two significant digits."""
+    """Return how many decimals show an expanded uncertainty with two significant digits (GUM 7.2.6).
+
+    Parameters
+    ----------
+    u : float
+        Standard uncertainty; 2 decimals where it is not positive or not finite.
+    """
     return max(0, 1 - math.floor(math.log10(2 * u))) if u > 0 and math.isfinite(u) else 2
 
 
 def measured(value: float | None, u: float | None, unit: str = "", *, decimals: int | None = None) -> str:
-    """Return ``value ± U unit`` with U = 2 u to two significant digits, or to `decimals`, and the value to the same place."""
+    """Return ``value ± U unit`` with the expanded uncertainty U = 2 u, both to the same decimal place.
+
+    Parameters
+    ----------
+    value : float or None
+        Estimate; None and values that are not finite are shown as a dash.
+    u : float or None
+        Standard uncertainty, same unit; None or 0 where there is none, then the value has three significant digits.
+    unit : str
+        Unit as it is printed; `print_unit` makes it from the unit of a variable.
+    decimals : int, optional
+        Decimal places; left out: U has two significant digits.
+    """
     tail = f" {unit}" if unit else ""
     if value is None or not math.isfinite(value):
         return "–"
@@ -132,15 +94,53 @@ def measured(value: float | None, u: float | None, unit: str = "", *, decimals: 
     return f"{value:.{places}f} ± {2 * u:.{places}f}{tail}".replace("-", "−")
 
 
+def quantity(found: Quantity, unit: str = "") -> str:
+    """Return a quantity of the results as ``value ± U unit``, see `measured`.
+
+    Parameters
+    ----------
+    found : Quantity
+        Estimate and standard uncertainty.
+    unit : str
+        Unit as it is printed.
+    """
+    return measured(found.value, found.u, unit)
+
+
+def print_unit(unit: str) -> str:
+    """Return a unit as it is printed.
+
+    Parameters
+    ----------
+    unit : str
+        Unit of a variable, for example ``um/K``.
+    """
+    return unit.replace("um", "µm")
+
+
 def p_value(p: float | None) -> str:
-    """Return a p-value to two digits, or as a bound where it is tiny."""
+    """Return a p-value to two digits, or as a bound below 0.001.
+
+    Parameters
+    ----------
+    p : float or None
+        None and NaN are shown as a dash.
+    """
     if p is None or not math.isfinite(p):
         return "–"
     return "< 0.001" if p < 0.001 else f"{p:.2g}"
 
 
-def duration(seconds: float) -> str:
-    """Return a time span in the unit that reads best."""
+def duration(seconds: float | None) -> str:
+    """Return a time span in seconds below 2 min, in minutes below 2 h, in hours above.
+
+    Parameters
+    ----------
+    seconds : float or None
+        Time span, s; None and NaN are shown as a dash.
+    """
+    if seconds is None or not math.isfinite(seconds):
+        return "–"
     if seconds < 120:
         return f"{seconds:.0f} s"
     if seconds < 7200:
@@ -149,54 +149,94 @@ def duration(seconds: float) -> str:
 
 
 def moment(time: np.datetime64) -> str:
-    """Return a UTC time to the minute."""
+    """Return a time to the minute.
+
+    Parameters
+    ----------
+    time : datetime64
+        UTC; NaT is shown as a dash.
+    """
     return "–" if np.isnat(time) else f"{np.datetime_as_string(time, unit='m').replace('T', ' ')} UTC"
 
 
+def place(x_mm: float | None, y_mm: float | None) -> str:
+    """Return a place on the plan to the millimetre.
+
+    Parameters
+    ----------
+    x_mm, y_mm : float or None
+        Plan coordinates, mm.
+    """
+    x, y = ("–" if value is None else f"{value:.0f}" for value in (x_mm, y_mm))
+    return f"x {x} mm, y {y} mm"
+
+
 def join(items: Sequence[str]) -> str:
-    """Return ``a, b and c``."""
+    """Return ``a, b and c``.
+
+    Parameters
+    ----------
+    items : sequence of str
+        An empty one gives an empty text.
+    """
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}" if items else ""
 
 
-def effect_name(name: str) -> str:
-    """Return an effect's name in plain words."""
-    return EFFECTS[name][0] if name in EFFECTS else name.replace("_", " ")
+def verdict_headline(loop: Loop) -> str:
+    """Return one sentence that states what the closed loop found.
 
-
-def verdict_headline(loop: Mapping[str, Any]) -> str:
-    """Return one sentence that states what the closed loop found."""
-    added = join([effect_name(step["effect"]) for step in loop["steps"]])
-    left = loop["unexplained"]["shape"] or "without a clear shape"
-    noun, pronoun = ("an effect", "it") if len(loop["steps"]) == 1 else (f"{len(loop['steps'])} effects", "them")
+    Parameters
+    ----------
+    loop : Loop
+        The part ``loop`` of the results.
+    """
+    added = join([effect_words(step.effect).name for step in loop.steps])
+    shape = loop.unexplained.shape or "without a clear shape"
+    noun, pronoun = ("an effect", "it") if len(loop.steps) == 1 else (f"{len(loop.steps)} effects", "them")
     return {
         "complete": "The declared model explains the drift; nothing in these data shows that an effect is missing.",
         "explained": f"The declared model lacked {noun}: {added}. With {pronoun}, nothing is left that these data can show.",
-        "partial": f"The declared model lacked {noun}: {added}. With {pronoun}, something without a name is left ({left}).",
-        "unexplained": f"Something is left that no effect of the library explains ({left}).",
-    }[loop["verdict"]]
+        "partial": f"The declared model lacked {noun}: {added}. With {pronoun}, something without a name is left ({shape}).",
+        "unexplained": f"Something is left that no effect of the library explains ({shape}).",
+    }[loop.verdict]
 
 
-def verdict_numbers(loop: Mapping[str, Any]) -> str:
-    """Return the sentence with the held-out errors and the noise beside them."""
-    floor = number(loop["noise_floor_um"], 2)
-    if not loop["steps"]:
-        return f"Error on held-out cycles: {number(loop['rmse_declared_um'], 2)} µm; the noise of single readings is {floor} µm."
-    return (
-        f"Error on held-out cycles: {number(loop['rmse_declared_um'], 2)} µm with the declared model, "
-        f"{number(loop['rmse_final_um'], 2)} µm after; the noise of single readings is {floor} µm."
-    )
+def verdict_numbers(loop: Loop) -> str:
+    """Return the sentence with the errors on the hold-out and the noise beside them.
+
+    Parameters
+    ----------
+    loop : Loop
+        The part ``loop`` of the results.
+    """
+    record = isinstance(loop, RecordLoop)
+    where, noise = ("the held-out part", "a block mean") if record else ("held-out cycles", "single readings")
+    declared, final = number(loop.rmse_declared_um, 2), number(loop.rmse_final_um, 2)
+    errors = f"{declared} µm with the declared model, {final} µm after" if loop.steps else f"{declared} µm"
+    return f"Error on {where}: {errors}; the noise of {noise} is {number(loop.noise_floor_um, 2)} µm."
 
 
-def next_steps(results: Mapping[str, Any]) -> list[str]:
-    """Return what to do next: first what the loop found, then the anomalies, then the warnings' remedies."""
-    loop = results.get("loop") or {"steps": [], "verdict": "complete"}
-    steps = [EFFECTS[step["effect"]][1] for step in loop["steps"] if step["effect"] in EFFECTS]
-    if loop["verdict"] in {"partial", "unexplained"}:
-        steps.append(
-            "Log more of what happens at the machine (duty, coolant, doors, air) in the next test: what is left has no name."
-        )
-    for anomaly in results.get("anomalies") or []:
-        steps.append(f"Position {anomaly['target']}: {CAUSES[anomaly['cause']][1]}")
-    steps += [warning["remedy"] for warning in results["warnings"] if not warning["remedy"].startswith(NOTHING_TO_DO)]
+def next_steps(results: Results) -> list[str]:
+    """Return what to do next: first what the loop found, then the anomalies, then the remedies of the warnings.
+
+    Parameters
+    ----------
+    results : Results
+        Results of a run.
+
+    Returns
+    -------
+    list of str
+        Sentences, each once; one that says so where nothing has to be done.
+    """
+    steps = []
+    if results.loop is not None:
+        steps = [effect_words(step.effect).remedy for step in results.loop.steps]
+        if results.loop.verdict in {"partial", "unexplained"}:
+            steps.append(
+                "Log more of what happens at the machine (duty, coolant, doors, air) in the next test: what is left has no name."
+            )
+    steps += [f"Position {anomaly.target}: {CAUSES[anomaly.cause].check}" for anomaly in results.anomalies or ()]
+    steps += [warning.remedy for warning in results.warnings]
     unique = list(dict.fromkeys(step for step in steps if step))
-    return unique or [f"{NOTHING_TO_DO}: use the profile and its uncertainty as they are."]
+    return unique or ["Nothing has to be done: use the profile and its uncertainty as they are."]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -51,3 +52,9 @@ def results_folder(campaign_folder: Path, tmp_path_factory: pytest.TempPathFacto
     out = tmp_path_factory.mktemp("run") / "results"
     run_campaign(campaign_folder / "campaign.toml", out)
     return out
+
+
+@pytest.fixture
+def copied(campaign_folder: Path, tmp_path: Path) -> Path:
+    """A copy of the campaign that a test may damage."""
+    return shutil.copytree(campaign_folder, tmp_path / "campaign")

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import jsonschema
@@ -42,8 +43,8 @@ def test_run_ends_with_a_summary_and_the_report(results_folder: Path, campaign_f
 def test_bad_input_is_one_paragraph_without_a_traceback(
     campaign_folder: Path, results_folder: Path, tmp_path: Path
 ) -> None:
-    broken = tmp_path / "campaign.toml"
-    broken.write_text((campaign_folder / "campaign.toml").read_text().replace('"20 mm"', "20"))
+    broken = shutil.copytree(campaign_folder, tmp_path / "campaign") / "campaign.toml"
+    broken.write_text(broken.read_text().replace('"20 mm"', "20"))
     result = invoke("run", broken, "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert result.stderr.startswith(f"thermofuse: {broken}, line 17: ")
@@ -195,3 +196,8 @@ def test_a_thumbnail_is_written_where_it_is_asked_for(campaign_folder: Path, tmp
     # 4 : 3 as the sensor, and not one colour.
     assert image.shape[1] * 3 == image.shape[0] * 4
     assert image.std() > 5
+
+
+def test_the_version_is_printed_alone() -> None:
+    result = invoke("--version")
+    assert (result.exit_code, result.output) == (0, f"thermofuse {metadata.version('thermofuse')}\n")

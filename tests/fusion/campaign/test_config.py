@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from fusion.alignment.readings import Readings
 from fusion.campaign.config import Campaign, CampaignError, load_campaign
 from fusion.campaign.logged_tables import match_columns
+from fusion.effects.effect import Candidate, Effect
+from fusion.effects.library import library
 
 TEXT = """\
 [campaign]
@@ -119,12 +125,13 @@ BAD = [
     ('["thermal/*.jpg"]', '"thermal/*.jpg"',
      ', line 6: thermography.frames = "thermal/*.jpg": this is a list; write for example ["a", "b"]'),
     ("*.jpg", "*.seq",
-     ', line 6: thermography.frames = "thermal/*.seq" matches no file in {folder}; paths are relative to the campaign file'),
+     ', line 6: thermography.frames = "thermal/*.seq": matches no file in {folder}; paths are relative to the campaign file'),
     ('"laser.csv"', '"lazer.csv"',
      ', line 23: interferometry.deviations = "lazer.csv": no such file {folder}/lazer.csv; did you mean laser.csv? '
      "paths are relative to the campaign file"),
     ('fiducials = "fiducials.csv"\n', "", ", line 13: [plan] lacks fiducials; add it, see the campaign file in the README"),
-    ('"table_offset"', '"axis_expansion"', ', line 29: model.declared names "axis_expansion" more than once; name each effect once'),
+    ('"table_offset"', '"axis_expansion"', ', line 29: model.declared = ["axis_expansion", "axis_expansion"]: '
+     "axis_expansion named more than once; name each effect once"),
     ('"X axis"', "X axis", ": this is not TOML: Invalid value (at line 2, column 9); see the campaign file in the README"),
     ('title = "X axis"', 'title = ""', ', line 2: campaign.title = "": this text is empty; fill it in'),
     ('title = "X axis"', "title = 5", ", line 2: campaign.title = 5: this is text; write it in quotes"),
@@ -142,7 +149,7 @@ def test_bad_input_is_named_with_place_value_and_remedy(folder: Path, old: str, 
 def test_an_unknown_effect_is_answered_with_the_nearest(folder: Path) -> None:
     with pytest.raises(
         CampaignError,
-        match=r'line 29: model.declared holds the unknown effect "table_ofset"; did you mean table_offset[?]',
+        match=r'line 29: model.declared = "table_ofset": unknown effect; did you mean table_offset[?]',
     ):
         load(folder, TEXT.replace("table_offset", "table_ofset"))
 
@@ -153,6 +160,46 @@ def test_all_faults_come_in_one_message(folder: Path) -> None:
     lines = str(error.value).splitlines()
     assert ["campaign.axes" in lines[0], "emissivity = 97" in lines[1], "cell_size = 5" in lines[2]] == [True] * 3
     assert len(lines) == 3
+
+
+def test_files_and_effects_are_checked_together_with_the_values(folder: Path) -> None:
+    (folder / "laser.csv").unlink()
+    with pytest.raises(CampaignError) as error:
+        load(folder, TEXT.replace("0.97", "97").replace("table_offset", "thermal_lag"))
+    first, second, third = str(error.value).splitlines()
+    assert "thermography.emissivity = 97" in first
+    assert 'interferometry.deviations = "laser.csv": no such file' in second
+    assert third == (
+        f'{folder}/campaign.toml, line 29: model.declared = "thermal_lag": the parameters of this effect are not known beforehand; '
+        "remove it, the closed loop tries it anyway; can be declared here: axis_expansion, table_offset, dead_path, air_index, "
+        "material_compensation"
+    )
+
+
+def test_a_record_is_declared_with_what_has_a_meaning_for_it(folder: Path) -> None:
+    assert load(folder, RECORD + '[model]\ndeclared = ["quasi_static"]\n').model.declared == ("quasi_static",)
+    with pytest.raises(
+        CampaignError,
+        match=r'line 10: model.declared = "dead_path": this effect has no meaning for a record; can be declared here: quasi_static',
+    ):
+        load(folder, RECORD + '[model]\ndeclared = ["dead_path"]\n')
+    with pytest.raises(CampaignError, match='"quasi_static": this effect has no meaning for a campaign with positions'):
+        load(folder, TEXT.replace("table_offset", "quasi_static"))
+
+
+def test_an_effect_of_a_users_own_is_declared_where_it_says_so(folder: Path) -> None:
+    def candidates(
+        readings: Readings, coefficients: Mapping[str, float], near: Candidate | None
+    ) -> Iterator[Candidate]:
+        yield Candidate(np.ones((1, 1)), {}, ("um",))
+
+    own = Effect("bed_bending", "The bed bends.", "own", candidates, declarable=True)
+    text = TEXT.replace("table_offset", "bed_bending")
+    (folder / "campaign.toml").write_text(text)
+    loaded = load_campaign(folder / "campaign.toml", effects={**library(), own.name: own})
+    assert loaded.model.declared == ("axis_expansion", "bed_bending")
+    with pytest.raises(CampaignError, match="the parameters of this effect are not known beforehand"):
+        load_campaign(folder / "campaign.toml", effects={**library(), own.name: replace(own, declarable=False)})
 
 
 def test_missing_tables_and_mixed_instruments_are_refused(folder: Path) -> None:

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from fusion.diagnosis.diagnose import CHECKS, THRESHOLDS, diagnose
+from fusion.diagnosis import causes
+from fusion.diagnosis.diagnose import THRESHOLDS, diagnose
 from fusion.diagnosis.explanations import DiagnosisError
 from tests.fusion import field_simulator as simulator
 from tests.fusion.residual_simulator import CAUSES, odd_position
@@ -39,7 +40,7 @@ def test_the_step_is_dated_and_measured(rng):
     assert abs(diagnosis.evidence["step_cycle"] - 61) <= 1
     assert diagnosis.evidence["step_um"] == pytest.approx(1.0, abs=4 * diagnosis.evidence["step_u_um"])
     assert any("step of +" in sentence for sentence in diagnosis.for_it)
-    assert diagnosis.check == CHECKS["step"]
+    assert diagnosis.check == causes.CAUSES["step"].check
 
 
 def test_sensitivity_and_lag_of_a_local_temperature(rng):

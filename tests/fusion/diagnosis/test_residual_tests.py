@@ -8,6 +8,7 @@ import pytest
 from fusion.diagnosis.residual_tests import examine_residual
 from fusion.effects.library import library
 from fusion.model.fit import Term, fit_model
+from fusion.products.results import ResidualPart
 from fusion.report.model_section import describe_residual
 from fusion.twin.machine.recipe import EffectRecipe
 from tests.fusion.loop_bench import DECLARED, readings_of
@@ -49,8 +50,8 @@ def test_a_changing_reversal_error_shows_at_the_period_of_the_cycles():
     _, tests = residual_of(EffectRecipe("reversal_drift", amplitude_um=0.6))
     assert tests.p_values["direction"] < 0.005
     assert tests.period_is_cycle
-    rows = describe_residual({"residual_tests": {"declared": tests.as_json(), "final": tests.as_json()}})
-    table = {shape: declared for shape, declared, _ in rows}
+    part = ResidualPart.model_validate(tests.as_json())
+    table = {row.cells[0]: row.cells[1] for row in describe_residual(part, part).rows}
     assert table["a rhythm"].endswith("min (that of the cycles)")
 
 

@@ -17,7 +17,7 @@ from fusion.pipeline.attribution import correlate_field
 from fusion.pipeline.drift_model import join_fusion
 from fusion.pipeline.interferometry import align_recordings
 from fusion.products.progress import silent
-from fusion.products.results import results_schema
+from fusion.products.results import assemble, results_schema
 from fusion.products.store import read_dataset
 from fusion.report.attribution_section import describe_correlation
 from fusion.twin.machine.recipe import Duty
@@ -86,12 +86,12 @@ def test_the_report_says_it_in_words(outcome) -> None:
     whole = join_fusion(fused, maps, xr.Dataset())
     xr.testing.assert_equal(whole["correlation/duty"].to_dataset(inherit=False), maps["duty"].to_dataset(inherit=False))
     assert whole["correlation"].attrs["verdict"] == maps.attrs["verdict"]
-    said = describe_correlation(whole, parts, None)
+    said = describe_correlation(whole, assemble("x", parts, []).correlation, None)
     assert said is not None
-    assert said["duty"][0][0] == "spindle" and said["duty"][0][-1] == "not shown"
+    assert said["duty"].rows[0].cells[0] == "spindle" and said["duty"].rows[0].cells[-1] == "not shown"
     assert "False alarms of this map" in said["captions"]["cells"]
     assert said["tell"] and said["headline"]
-    assert said["sensors"]["text"].endswith("of left-out cycles.")
+    assert said["sensors"].endswith("of left-out cycles.")
 
 
 @pytest.mark.parametrize(

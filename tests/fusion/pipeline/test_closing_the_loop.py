@@ -91,4 +91,4 @@ def test_nothing_is_added_where_nothing_is_missing(tmp_path: Path) -> None:
     assert 0.0 < expansion["u"] < 2.0
     found = {one["effect"]: one for one in loop["identifiability"]}
     assert 0.0 < found["reversal_drift"]["detectable_um"] < found["thermal_lag"]["detectable_um"]
-    assert "What this campaign could tell at all" in (folder / "report.html").read_text()
+    assert "What this campaign can detect" in (folder / "report.html").read_text()

@@ -1,8 +1,20 @@
-"""What the thermal stage tells of the camera before it reduces a frame."""
+"""The thermal stage: notices about the camera, the clock offset of a moving table, and fields that keep the CF conventions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
 
 import numpy as np
+import pytest
+from compliance_checker.runner import CheckSuite
 
-from fusion.pipeline.thermal import pixel_notices
+from fusion.campaign.config import load_campaign
+from fusion.campaign.inputs import read_source
+from fusion.pipeline.thermal import pixel_notices, reduce_thermography
+from fusion.products.progress import silent
+from fusion.products.store import read_dataset
+from fusion.twin.instruments import simulate_campaign
 
 
 def test_bad_pixels_are_counted_by_kind(rng: np.random.Generator) -> None:
@@ -15,4 +27,37 @@ def test_bad_pixels_are_counted_by_kind(rng: np.random.Generator) -> None:
     assert notice.code == "bad_pixels"
     assert notice.message.startswith("3 pixels do not follow their neighbours (1 dead, ")
     assert "off its neighbours" in notice.message
-    assert notice.message.endswith("1 noisy); they count in their cells like others.")
+    assert notice.message.endswith("1 noisy); they are included in the cell averages.")
+
+
+def test_fields_pass_the_cf_checker(results_folder: Path) -> None:
+    """CF-1.11 without an error or a warning; deviations and fusion carry the same global attributes."""
+    CheckSuite.load_all_available_checkers()
+    suite = CheckSuite()
+    dataset = suite.load_dataset(str(results_folder / "fields.nc"))
+    groups, errors = suite.run_all(dataset, ["cf:1.11"])["cf:1.11"]
+    assert errors == {}
+    assert [message for group in groups if group.value[0] < group.value[1] for message in group.msgs] == []
+    for name in ("fields", "deviations", "fusion"):
+        product = read_dataset(results_folder / f"{name}.nc")
+        assert product.attrs["Conventions"] == "CF-1.11" and product.attrs["title"] == "Small campaign"
+        assert set(json.loads(product.attrs["provenance"])) == {"software", "versions", "inputs"}
+        assert all({"long_name", "standard_name"} & set(variable.attrs) for variable in product.variables.values())
+
+
+def test_the_clock_of_a_camera_that_sees_the_table_move_is_found(tmp_path: Path) -> None:
+    """The clock is 37 s ahead and nobody says so; 13 s between frames do not divide the cycle, 0.2 s is a tenth of the dwell."""
+    (tmp_path / "recipe.toml").write_text(
+        "[campaign]\nseed = 3\n[test]\ncycles = 12\ntargets = 7\nspacing_mm = 40\nperiod_s = 200\n"
+        '[camera]\ntable = "moving"\nfile = "seq"\ncolumns = 320\nrows = 240\nfocal_px = 600.0\ndistance_mm = 1900.0\n'
+        "frame_interval_s = 13.0\nclock_offset_s = 37.0\nstate_clock_offset = false\n"
+    )
+    campaign = simulate_campaign(tmp_path / "recipe.toml", tmp_path / "campaign")
+    campaign.write_text(campaign.read_text().replace('cell_size = "5 mm"', 'cell_size = "20 mm"'))
+    outcome = reduce_thermography(
+        read_source(load_campaign(campaign)), checkpoint=tmp_path / "cycles", scheduler=None, report=silent
+    )
+    assert outcome.parts["alignment"]["clock_offset_s"]["value"] == pytest.approx(37.0, abs=0.2)
+    place = outcome.dataset["table_position"]
+    assert float(place.max() - place.min()) == pytest.approx(240.0, abs=0.5)
+    assert {"time", "frame_time"} <= set(outcome.dataset.coords)

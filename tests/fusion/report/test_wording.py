@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
+from fusion.products.results import AnomalyPart, Loop, Notice, RecordLoop, Results, StepPart, Unexplained, Verdict
 from fusion.report import wording
 
 
@@ -34,15 +33,16 @@ def test_small_things_read_well() -> None:
     assert wording.moment(np.datetime64("2026-03-09T06:30:05")) == "2026-03-09 06:30 UTC"
 
 
-def loop(verdict: str, *effects: str, shape: str = "") -> dict[str, Any]:
-    return {
-        "verdict": verdict,
-        "steps": [{"effect": name} for name in effects],
-        "unexplained": {"shape": shape, "rms_um": 0.2},
-        "rmse_declared_um": 1.94,
-        "rmse_final_um": 0.66,
-        "noise_floor_um": 0.42,
-    }
+def loop(verdict: Verdict, *effects: str, shape: str = "") -> Loop:
+    """The part of a loop that sentences are made of."""
+    return Loop.model_construct(
+        verdict=verdict,
+        steps=tuple(StepPart.model_construct(effect=name) for name in effects),
+        unexplained=Unexplained.model_construct(shape=shape, rms_um=0.2),
+        rmse_declared_um=1.94,
+        rmse_final_um=0.66,
+        noise_floor_um=0.42,
+    )
 
 
 @pytest.mark.parametrize(
@@ -61,19 +61,38 @@ def loop(verdict: str, *effects: str, shape: str = "") -> dict[str, Any]:
         (loop("unexplained"), "Something is left that no effect of the library explains (without a clear shape)."),
     ],
 )  # fmt: skip
-def test_every_verdict_has_its_sentence(found: dict[str, Any], sentence: str) -> None:
+def test_every_verdict_has_its_sentence(found: Loop, sentence: str) -> None:
     assert wording.verdict_headline(found) == sentence
 
 
 def test_next_steps_start_with_the_model_and_leave_out_what_asks_for_nothing() -> None:
-    results = {
-        "loop": loop("partial", "dead_path"),
-        "anomalies": [{"target": 3, "cause": "structural"}],
-        "warnings": [{"remedy": "Nothing has to be done: it is fine."}, {"remedy": "Start the camera earlier."}],
-    }
+    results = Results.model_construct(
+        loop=loop("partial", "dead_path"),
+        anomalies=(AnomalyPart.model_construct(target=3, cause="structural"),),
+        warnings=(Notice("gaps", "Gaps are allowed for.", ""), Notice("camera", "Late.", "Start the camera earlier.")),
+    )
     first, second, third, last = wording.next_steps(results)
-    assert first == wording.EFFECTS["dead_path"][1]
+    assert first == wording.effect_words("dead_path").remedy
     assert second.startswith("Log more of what happens at the machine")
     assert third.startswith("Position 3: ") and last == "Start the camera earlier."
-    quiet = {"loop": loop("complete"), "anomalies": [], "warnings": []}
+    quiet = Results.model_construct(loop=loop("complete"), anomalies=(), warnings=())
     assert wording.next_steps(quiet) == ["Nothing has to be done: use the profile and its uncertainty as they are."]
+
+
+def test_an_effect_of_a_users_own_has_a_name_and_no_remedy() -> None:
+    assert wording.effect_words("bed_bending") == ("bed bending", "")
+
+
+def test_places_and_units_are_printed() -> None:
+    assert wording.place(355.4, None) == "x 355 mm, y – mm"
+    assert wording.print_unit("um/K") == "µm/K"
+
+
+def test_errors_are_those_of_what_was_held_out() -> None:
+    assert wording.verdict_numbers(loop("explained", "step_event")) == (
+        "Error on held-out cycles: 1.9 µm with the declared model, 0.66 µm after; the noise of single readings is 0.42 µm."
+    )
+    record = RecordLoop.model_construct(steps=(), rmse_declared_um=1.94, rmse_final_um=1.94, noise_floor_um=0.42)
+    assert (
+        wording.verdict_numbers(record) == "Error on the held-out part: 1.9 µm; the noise of a block mean is 0.42 µm."
+    )

@@ -1,0 +1,117 @@
+"""Findings of a run as report and terminal state them: one text per quantity."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fusion.diagnosis.causes import CAUSES
+from fusion.products.results import AnomalyPart, CorrelationPart, DriftPart, Iso230Part, Loop
+from fusion.report.wording import join, number, p_value, place, quantity
+
+#: Axis values in the terms of ISO 230-2:2014, in the order of the report.
+ISO230_TERMS = {
+    "A": "Bidirectional positioning accuracy A",
+    "R": "Bidirectional positioning repeatability R",
+    "E": "Bidirectional systematic positioning error E",
+    "M": "Mean bidirectional positioning error M",
+    "B": "Reversal error B",
+}
+
+
+def iso230_values(iso: Iso230Part) -> dict[str, str]:
+    """Return the axis values with their expanded uncertainty (k = 2) by symbol, µm.
+
+    Parameters
+    ----------
+    iso : Iso230Part
+        The part ``iso230`` of the results.
+    """
+    return {symbol: quantity(getattr(iso, f"{symbol}_um"), "µm") for symbol in ISO230_TERMS}
+
+
+def scatter_range(drift: DriftPart) -> str:
+    """Return smallest, largest and median scatter over targets and directions, µm.
+
+    Parameters
+    ----------
+    drift : DriftPart
+        The part ``drift`` of the results.
+    """
+    scatter = drift.scatter_um.values()
+    return f"{min(scatter):.2f} to {max(scatter):.2f} µm, median {np.median(scatter):.2f} µm"
+
+
+def anomaly_place(anomaly: AnomalyPart) -> str:
+    """Return which target and direction of approach stand out.
+
+    Parameters
+    ----------
+    anomaly : AnomalyPart
+        An entry of ``anomalies`` in the results.
+    """
+    approach = "both approaches" if anomaly.direction == "both" else f"{anomaly.direction} approach"
+    return f"position {anomaly.target}, {approach}"
+
+
+def anomaly_cause(anomaly: AnomalyPart) -> str:
+    """Return the cause of an anomaly in words.
+
+    Parameters
+    ----------
+    anomaly : AnomalyPart
+        An entry of ``anomalies`` in the results.
+    """
+    return CAUSES[anomaly.cause].words
+
+
+def attribution_headline(correlation: CorrelationPart) -> str:
+    """Return one sentence that states whether a part of the field goes with the drift.
+
+    Parameters
+    ----------
+    correlation : CorrelationPart
+        The part ``correlation`` of the results.
+    """
+    source = correlation.source
+    where = place(source.x_mm, source.y_mm)
+    return {
+        "not separable": "These data cannot tell: the whole session is one warm-up, in which every temperature rises like every drift.",
+        "not attributable": "No part of the field goes with the drift more closely than chance allows; the closest is around "
+        f"{where} (p = {p_value(source.p_value)}).",
+        "attributable": f"The drift goes with the temperature around {where} more closely than chance and common warm-up allow "
+        f"(p = {p_value(source.p_value)}).",
+    }[correlation.verdict]
+
+
+def randomised_causes(correlation: CorrelationPart) -> list[str]:
+    """Return the loads that randomisation shows to cause drift.
+
+    Parameters
+    ----------
+    correlation : CorrelationPart
+        The part ``correlation`` of the results.
+    """
+    return [load.name for load in correlation.randomised_duty or () if load.cause]
+
+
+def hold_out_errors(loop: Loop) -> str:
+    """Return the errors on the hold-out of the declared and of the final model, µm.
+
+    Parameters
+    ----------
+    loop : Loop
+        The part ``loop`` of the results.
+    """
+    return f"{number(loop.rmse_declared_um, 3)} -> {number(loop.rmse_final_um, 3)} µm"
+
+
+def standing_out(anomalies: tuple[AnomalyPart, ...]) -> str:
+    """Return one sentence that names the positions that stand out with their causes.
+
+    Parameters
+    ----------
+    anomalies : tuple of AnomalyPart
+        The part ``anomalies`` of the results.
+    """
+    named = [f"position {anomaly.target} ({anomaly_cause(anomaly)})" for anomaly in anomalies]
+    return f"Standing out: {join(named)}." if named else "No position stands out from the others."

@@ -1,0 +1,96 @@
+"""Inputs of a campaign: omissions are noted by name, recordings that do not belong together are refused."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fusion.alignment.align import AlignmentError
+from fusion.campaign.config import load_campaign
+from fusion.campaign.inputs import SourceError, counted, listed, read_source
+from fusion.pipeline.interferometry import evaluate_interferometry
+
+
+def shift_frames(folder: Path, hours: float) -> None:
+    """Let the laser's clock run ahead of the camera's by rewriting the times of the readings."""
+    path = folder / "laser.csv"
+    lines = path.read_text().splitlines()
+    shifted = [lines[0]]
+    for line in lines[1:]:
+        fields = line.split(",")
+        time = np.datetime64(fields[4].split("+")[0]) + np.timedelta64(round(hours * 3600), "s")
+        fields[4] = f"{time}+00:00"
+        shifted.append(",".join(fields))
+    path.write_text("\n".join(shifted) + "\n")
+
+
+def test_damaged_frames_and_lines_are_left_out_by_name(copied: Path) -> None:
+    frames = sorted((copied / "thermal").glob("*.jpg"))
+    frames[3].write_bytes(frames[3].read_bytes()[:5000])
+    frames[5].write_bytes(b"\xff\xd8\xff\xe0no radiometric data\xff\xd9")
+    shutil.copy(frames[7], frames[7].with_name("copy_of_a_frame.jpg"))
+    lines = (copied / "laser.csv").read_text().splitlines()
+    lines[10] = lines[10].rsplit(",", 1)[0] + ",abc"
+    lines[20] = lines[20].replace("positive", "upward").replace("negative", "upward")
+    (copied / "laser.csv").write_text("\n".join(lines) + "\n")
+
+    source = read_source(load_campaign(copied / "campaign.toml"))
+    rejected = {item["file"]: item["reason"] for item in source.frames_rejected}
+    assert set(rejected) == {
+        f"thermal/{frames[3].name}", f"thermal/{frames[5].name}", f"thermal/{max(frames[7].name, 'copy_of_a_frame.jpg')}",
+    }  # fmt: skip
+    messages = {notice.code: notice.message for notice in source.notices}
+    assert messages["frames_rejected"].startswith("3 frames left out: ")
+    assert str(copied) not in messages["frames_rejected"]
+    assert "2 lines of laser.csv left out: line 11 ('abc' is not a number)" in messages["readings_left_out"]
+    assert "line 21 ('upward'" in messages["readings_left_out"]
+    outcome = evaluate_interferometry(source)
+    missing = {notice.code: notice for notice in outcome.notices}["readings_missing"]
+    assert missing.message.startswith("2 readings of 288 missing, in ")
+    # One reading of 24 at two cells: u grows by 1 - sqrt(23 / 24) = 2.1 %.
+    assert missing.effect_um == pytest.approx(0.021 * float(outcome.dataset["drift_profile_u"].max()), rel=0.2)
+
+
+def test_clocks_in_two_time_zones_are_refused_with_the_offset_to_write(copied: Path) -> None:
+    shift_frames(copied, 1.0)
+    with pytest.raises(
+        AlignmentError, match=r'look 1 h apart, as in two time zones .* write thermography.clock_offset = "-3600 s"'
+    ):
+        read_source(load_campaign(copied / "campaign.toml"))
+    text = (copied / "campaign.toml").read_text()
+    (copied / "campaign.toml").write_text(text.replace('clock_offset = "0 s"', 'clock_offset = "-1 h"'))
+    assert read_source(load_campaign(copied / "campaign.toml")).thermography.clock_offset_s == -3600
+
+
+def test_recordings_of_two_days_are_refused(copied: Path) -> None:
+    shift_frames(copied, 100.0)
+    with pytest.raises(AlignmentError, match="frames and readings never meet"):
+        read_source(load_campaign(copied / "campaign.toml"))
+
+
+def test_a_single_frame_is_not_enough(copied: Path) -> None:
+    for frame in sorted((copied / "thermal").glob("*.jpg"))[1:]:
+        frame.unlink()
+    message = r"1 usable frame, at least 12 are needed \(none rejected\); check thermography.frames"
+    with pytest.raises(SourceError, match=message):
+        read_source(load_campaign(copied / "campaign.toml"))
+
+
+def test_a_short_test_is_refused_before_the_long_work(copied: Path) -> None:
+    lines = (copied / "laser.csv").read_text().splitlines()
+    short = [line for line in lines if line.split(",")[0] in {"cycle", "1", "2", "3", "4", "5"}]
+    (copied / "laser.csv").write_text("\n".join(short) + "\n")
+    message = (
+        r"laser.csv: 5 cycles at 6 targets; a model of the drift needs at least 12 cycles \(better 50\) at 3 targets"
+    )
+    with pytest.raises(SourceError, match=message):
+        read_source(load_campaign(copied / "campaign.toml"))
+
+
+def test_numbers_and_lists_are_words() -> None:
+    assert (counted(1, "frame"), counted(0, "frame")) == ("1 frame", "0 frames")
+    assert listed("abc") == "a; b; c"
+    assert listed(str(k) for k in range(7)) == "0; 1; 2; 3; 4 and 2 more"

@@ -1,0 +1,44 @@
+"""The stage of the readings: parts of the results agree with the product, omissions are noted with their cost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fusion.campaign.config import load_campaign
+from fusion.campaign.inputs import read_source
+from fusion.pipeline.interferometry import align_recordings, by_direction, evaluate_interferometry
+from fusion.products.store import read_dataset
+
+
+def test_gaps_and_outliers_are_noted_with_what_they_cost(copied: Path) -> None:
+    lines = (copied / "laser.csv").read_text().splitlines()
+    head, value = lines[30].rsplit(",", 1)
+    lines[30] = f"{head},{float(value) + 40.0}"
+    lines[60] = f"{lines[60].rsplit(',', 1)[0]},"
+    (copied / "laser.csv").write_text("\n".join(lines) + "\n")
+    outcome = evaluate_interferometry(read_source(load_campaign(copied / "campaign.toml")))
+    notices = {notice.code: notice for notice in outcome.notices}
+    assert notices["outliers"].message.startswith("1 reading far from the joint estimate down-weighted: cycle ")
+    assert notices["readings_missing"].message.startswith("1 reading of 288 missing, in 1 cycle: ")
+    # Nothing has to be done about a gap.
+    assert notices["readings_missing"].remedy == ""
+    assert 0.0 < (notices["readings_missing"].effect_um or 0.0) < 0.1
+
+
+def test_parts_agree_with_the_product(campaign_folder: Path) -> None:
+    outcome = evaluate_interferometry(read_source(load_campaign(campaign_folder / "campaign.toml")))
+    assert outcome.parts["iso230"]["window"] == "cycles 1..5"
+    assert outcome.parts["iso230"]["A_um"]["value"] == pytest.approx(float(outcome.dataset["iso_A"][0]))
+    profile = outcome.dataset["drift_profile"]
+    assert by_direction(profile)["negative"] == profile.sel(direction="negative").values.tolist()
+
+
+def test_readings_outside_the_frames_are_counted(campaign_folder: Path, results_folder: Path) -> None:
+    source = read_source(load_campaign(campaign_folder / "campaign.toml"))
+    fields = read_dataset(results_folder / "fields.nc")
+    fused, (notice,) = align_recordings(source, fields, source.deviations)
+    outside = int(np.count_nonzero(~fused["inside_frames"].values))
+    assert notice.message.startswith(f"{outside} readings outside the frames' time, in 1 cycle (1)")

@@ -1,0 +1,97 @@
+"""Products on disk: files are whole or absent, a stage is done once, Datasets come back equal."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from fusion.products.store import (
+    OutputError,
+    StageStamps,
+    digest,
+    name_in_words,
+    open_folder,
+    plain,
+    read_dataset,
+    write_atomically,
+    write_dataset,
+    write_json,
+)
+
+
+def test_json_has_no_nan_and_times_are_utc(tmp_path: Path) -> None:
+    path = write_json(
+        tmp_path / "x.json",
+        {"a": np.float64("nan"), "b": np.array([1.5, np.inf]), "t": np.datetime64("2026-03-09T06:30")},
+    )
+    assert json.loads(path.read_text()) == {"a": None, "b": [1.5, None], "t": "2026-03-09T06:30:00.000Z"}
+    assert plain((np.int64(3), {"nat": np.datetime64("NaT")})) == [3, {"nat": None}]
+
+
+def test_a_killed_write_leaves_the_old_product_and_no_rubbish(tmp_path: Path) -> None:
+    path = tmp_path / "results.json"
+    write_json(path, {"run": 1})
+
+    def die_half_way(temporary: Path) -> None:
+        temporary.write_text('{"run": 2')
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(path, die_half_way)
+    assert json.loads(path.read_text()) == {"run": 1}
+    assert [item.name for item in tmp_path.iterdir()] == ["results.json"]
+
+
+def test_a_full_folder_is_refused_unless_resumed(tmp_path: Path) -> None:
+    (tmp_path / "results.json").touch()
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "maps" / "cycle_0001.partial.exr").touch()
+    with pytest.raises(OutputError) as error:
+        open_folder(tmp_path, resume=False)
+    assert str(error.value) == (
+        f"{tmp_path} is not empty; add --resume to continue the run that is in it, name another folder with --out, or remove it first"
+    )
+    open_folder(tmp_path, resume=True)
+    assert not list(tmp_path.rglob("*.partial*"))
+    with pytest.raises(OutputError, match=r"is a file; name a folder for the results with --out"):
+        open_folder(tmp_path / "results.json", resume=False)
+
+
+def test_datasets_come_back_equal(tmp_path: Path, rng: np.random.Generator) -> None:
+    dataset = xr.Dataset(
+        {
+            "rise": (("cycle", "y", "x"), rng.normal(size=(3, 60, 70)).astype("f4"), {"units": "K"}),
+            "time": ("cycle", np.array(["2026-03-09T06:30:05.250", "NaT", "2026-03-09T07:00"], "M8[ns]")),
+            "name": ("fiducial", ["F1", "F2"]),
+        },
+        coords={"cycle": [1, 2, 3]},
+        attrs={"title": "A"},
+    )
+    xr.testing.assert_identical(read_dataset(write_dataset(tmp_path / "x.nc", dataset)), dataset)
+
+
+def test_a_stage_is_done_only_for_the_same_input_and_untouched_files(tmp_path: Path) -> None:
+    product = tmp_path / "fields.nc"
+    product.write_bytes(b"product")
+    StageStamps(tmp_path).record("fields", "key", [product], {"rms_mm": 0.1})
+    stamps = StageStamps(tmp_path)
+    assert stamps.done("fields", "key")
+    assert stamps.note("fields") == {"rms_mm": 0.1}
+    assert not stamps.done("fields", "other key")
+    assert not stamps.done("loop", "key")
+    product.write_bytes(b"touched")
+    assert not stamps.done("fields", "key")
+
+
+def test_the_digest_depends_on_content_alone() -> None:
+    assert digest({"b": 1, "a": [1.5]}) == digest({"a": [np.float64(1.5)], "b": np.int64(1)})
+    assert digest({"a": 1}) != digest({"a": 2})
+
+
+def test_a_variable_is_named_in_words() -> None:
+    assert name_in_words("drift_profile_u") == "standard uncertainty of drift profile"
+    assert name_in_words("mean_rise") == "mean rise"

@@ -1,0 +1,70 @@
+"""Findings in words: one text per quantity, for report and terminal alike."""
+
+from __future__ import annotations
+
+import pytest
+
+from fusion.products.results import (
+    AnomalyPart,
+    ByDirection,
+    CorrelationPart,
+    DriftPart,
+    DutyPart,
+    Iso230Part,
+    Loop,
+    Quantity,
+    SourcePart,
+)
+from fusion.report import findings
+
+ISO = Iso230Part(window="cycles 1..5", **{f"{symbol}_um": Quantity(value=9.9017, u=1.378) for symbol in "BREMA"})
+
+
+def correlation(verdict: str, *loads: DutyPart) -> CorrelationPart:
+    """The part of an attribution that sentences are made of."""
+    return CorrelationPart.model_construct(
+        verdict=verdict, source=SourcePart.model_construct(x_mm=355.0, y_mm=95.4, p_value=0.002), randomised_duty=loads
+    )
+
+
+def test_axis_values_bear_the_terms_of_the_standard() -> None:
+    assert findings.iso230_values(ISO)["A"] == "9.9 \u00b1 2.8 \u00b5m"
+    assert findings.ISO230_TERMS["E"] == "Bidirectional systematic positioning error E"
+    assert findings.ISO230_TERMS["M"] == "Mean bidirectional positioning error M"
+    assert findings.ISO230_TERMS["B"] == "Reversal error B"
+
+
+def test_scatter_leaves_out_what_is_not_determined() -> None:
+    drift = DriftPart.model_construct(scatter_um=ByDirection(positive=(0.4, None), negative=(0.2, 0.3)))
+    assert findings.scatter_range(drift) == "0.20 to 0.40 \u00b5m, median 0.30 \u00b5m"
+
+
+def test_anomalies_are_named_with_their_cause() -> None:
+    both = AnomalyPart.model_construct(target=3, direction="both", cause="stick_slip")
+    one = AnomalyPart.model_construct(target=5, direction="negative", cause="undetermined")
+    assert findings.anomaly_place(both) == "position 3, both approaches"
+    assert findings.anomaly_place(one) == "position 5, negative approach"
+    assert findings.standing_out((both, one)) == "Standing out: position 3 (stick-slip) and position 5 (undetermined)."
+    assert findings.standing_out(()) == "No position stands out from the others."
+
+
+@pytest.mark.parametrize(
+    ("verdict", "part"),
+    [
+        ("attributable", "The drift goes with the temperature around x 355 mm, y 95 mm"),
+        ("not attributable", "the closest is around x 355 mm, y 95 mm (p = 0.002)."),
+        ("not separable", "These data cannot tell"),
+    ],
+)
+def test_every_attribution_has_its_sentence(verdict: str, part: str) -> None:
+    assert part in findings.attribution_headline(correlation(verdict))
+
+
+def test_randomised_loads_that_are_causes_are_named() -> None:
+    loads = [DutyPart.model_construct(name=name, cause=name == "spindle") for name in ("spindle", "coolant")]
+    assert findings.randomised_causes(correlation("attributable", *loads)) == ["spindle"]
+
+
+def test_errors_are_stated_before_and_after() -> None:
+    loop = Loop.model_construct(rmse_declared_um=1.94, rmse_final_um=0.464)
+    assert findings.hold_out_errors(loop) == "1.94 -> 0.464 \u00b5m"

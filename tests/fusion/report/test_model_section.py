@@ -1,0 +1,60 @@
+"""The section on the model: steps, refused effects, coefficients, detection limits, evidence."""
+
+from __future__ import annotations
+
+from fusion.products.results import AxisLoop, Coefficient, assemble
+from fusion.report import model_section
+from tests.fusion.results_sample import PARTS
+
+RESULTS = assemble("A", PARTS, [])
+LOOP = RESULTS.loop
+assert isinstance(LOOP, AxisLoop)
+
+
+def test_steps_start_with_the_declared_model() -> None:
+    declared, added = model_section.steps_table(LOOP).rows
+    assert declared.cells == ["0", "declared: expansion of the axis", "", "\u2013", "\u2013", "0.600", ""]
+    assert added.marked
+    assert added.cells[1:3] == ["sudden step", "time / s 1800 (at least 1700), shape flat (or linear)"]
+    assert added.cells[-1] == "dead path of the laser, 4.0 less in log-likelihood"
+
+
+def test_the_model_is_told_in_numbers() -> None:
+    rows = dict(model_section.describe_model(LOOP))
+    assert rows["expansion of the axis"] == "11.60 \u00b1 0.40 ppm/K (expected beforehand 11.7 \u00b1 4.0 ppm/K)"
+    assert rows["sudden step"] == "1.00 \u00b1 0.20 \u00b5m"
+    assert rows["unexplained drift"].startswith(
+        "random walk; rms 0.10 \u00b5m common to all positions, below 0.001 \u00b5m"
+    )
+    assert rows["not tried: dead path of the laser"] == "no air"
+    assert "the one question to the held-out cycles" not in rows
+
+
+def test_an_effect_that_cannot_be_detected_has_no_limit() -> None:
+    (row,) = model_section.describe_identifiability(LOOP).rows
+    assert list(row.cells[:5]) == [
+        "dead path of the laser",
+        "never",
+        "\u2013",
+        "10 %",
+        "refractive index of the air",
+    ]
+
+
+def test_candidates_are_listed_by_round() -> None:
+    (row,) = model_section.describe_candidates(LOOP).rows
+    assert row.cells == ["1", "sudden step", "", "9.0", "8.0", "0.01", "4.0", "0.01"]
+
+
+def test_evidence_is_told_with_all_its_numbers() -> None:
+    assert RESULTS.anomalies is not None
+    told = model_section.describe_evidence(RESULTS.anomalies[0].evidence)
+    assert told["stands_out"] == "extra scatter of 0.30 \u00b5m"
+    assert ("step held out / nats", "0") in told["numbers"] and ("step cycle", "12") in told["numbers"]
+    assert (told["support"], told["against"], told["check"]) == (("a",), ("b",), "c")
+
+
+def test_values_and_names_are_words() -> None:
+    assert model_section.spaced("jump_um_per_K") == "jump / (\u00b5m/K)"
+    assert model_section.in_words([1.0, True, None, "warm_up"]) == "1.00, yes, \u2013 and warm up"
+    assert Coefficient(value=1.0, u=0.1, unit="um").prior is None

@@ -1,0 +1,48 @@
+"""The section on a record: every channel with its errors, means over the parts, what was rejected."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from fusion.products.results import RecordLoop, assemble
+from fusion.report.record_section import describe_record, draw_record
+from tests.fusion.results_sample import RECORD_LOOP
+
+RESULTS = assemble("R", {"loop": RECORD_LOOP}, [])
+
+
+def record(channels: int = 1, drivers: int = 1) -> xr.Dataset:
+    """A record of four blocks of a minute, as fusion.nc holds it."""
+    time = np.datetime64("2026-01-05T06:00", "ns") + np.arange(4) * np.timedelta64(60, "s")
+    return xr.Dataset(
+        {
+            "displacement": (("time", "channel"), np.zeros((4, channels))),
+            "driver": (("time", "driver_name"), np.zeros((4, drivers))),
+        },
+        coords={
+            "time": time,
+            "channel": ["X", *(f"c{k}" for k in range(1, channels))],
+            "sensor": ["t1", "t2"],
+            "driver_name": ["speed"] * drivers,
+        },
+        attrs={"block_s": 60.0},
+    )
+
+
+def test_a_record_is_told_with_its_channels_and_its_driver() -> None:
+    assert isinstance(RESULTS.loop, RecordLoop)
+    told = describe_record(RESULTS, {"inputs": {"record.csv": {}}}, record())
+    assert told["sentences"][0] == "Measured: 1 displacements and 2 temperatures over 4 min, with speed as driver."
+    assert told["channels"].rows[0].cells == ["X", "0.900", "0.600", "0.400", "10", "0.10", "0.300"]
+    assert told["chained"].rows[-1].cells == ["mean", "", "0.900", "0.600", "0.400"]
+    assert told["rejected"].rows == ()
+    assert ("not tried: dead path of the laser", "no air") in told["refused"]
+    assert told["candidates"].rows[0].cells[-2:] == ["0.700 to 0.500", "chosen"]
+
+
+def test_the_page_stays_readable_with_many_channels() -> None:
+    told = describe_record(RESULTS, {"inputs": {}}, record(channels=9, drivers=0))
+    assert (len(told["shown"]), told["omitted"]) == (6, 3)
+    assert "driver" not in told["sentences"][0]
+    assert "drivers" not in draw_record(record(channels=9, drivers=0))

@@ -1,0 +1,43 @@
+"""What the command prints: findings of a run, windows of cycles, the content of files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fusion.campaign.config import CampaignError
+from fusion.products.results import Notice, assemble
+from fusion.report.terminal import describe_file, read_window, summary_rows
+from interferometry.deviations import build_deviations
+from tests.fusion.results_sample import PARTS
+
+
+def test_the_findings_of_a_run_in_a_few_rows() -> None:
+    rows = dict(summary_rows(assemble("A", PARTS, [Notice("clock", "The clocks disagree.", "Set clock_offset.")])))
+    assert rows["registration"] == "0.10 mm rms"
+    assert rows["A (cycles 1 to 5)"] == "1.00 \u00b1 0.20 \u00b5m"
+    assert rows["anomalies"] == "position 3, both approaches: scatter of the structure (p 0.01)"
+    assert rows["added"] == "step_event (p 0.001), held-out error 0.600 -> 0.400 \u00b5m"
+    assert rows["warning"] == "The clocks disagree."
+
+
+def test_a_window_names_cycles_that_were_measured() -> None:
+    deviations = build_deviations(
+        range(1, 9), [1, 2], np.array([0.0, 10.0]), np.zeros((8, 2, 2)), np.full((8, 2, 2), "NaT", "M8[ns]")
+    )
+    assert read_window(" 2 - 4 ", deviations) == [2, 3, 4]
+    assert read_window("8", deviations) == [8]
+    with pytest.raises(CampaignError, match="there are 1 to 8"):
+        read_window("4-2", deviations)
+
+
+def test_a_log_is_described_with_its_range(tmp_path: Path) -> None:
+    path = tmp_path / "environment.csv"
+    head = "time,air_temperature_degC,air_pressure_hPa,relative_humidity_percent,material_temperature_degC"
+    rows = [f"2026-03-09T06:{minute:02d}:00Z,{20 + minute / 10},1000,45,21" for minute in range(10)]
+    path.write_text("\n".join([head, *rows]) + "\n")
+    lines = describe_file(path)
+    assert lines[0] == f"{path}: environment, 10 rows, 2026-03-09 06:00 UTC to 2026-03-09 06:09 UTC"
+    assert "  air_temperature 20.00 to 20.90 degC" in lines

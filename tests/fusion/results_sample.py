@@ -1,0 +1,141 @@
+"""A whole results document, once with every part of a campaign with both instruments and once with the loop of a record."""
+
+from __future__ import annotations
+
+from typing import Any
+
+MEASURED = {"value": 1.0, "u": 0.1}
+BOTH = {"positive": [0.4, None], "negative": [0.5, 0.6]}
+SCORE = {
+    "effect": "step_event",
+    "parameters": {},
+    "gain": 9.0,
+    "excess_gain": 8.0,
+    "p_value": 0.001,
+    "family_wise_p": 0.01,
+}
+STEP = {
+    "effect": "step_event",
+    "parameters": {"time_s": 1800.0, "shape": "flat"},
+    "parameter_ranges": {"time_s": [1700.0, None], "shape": ["linear"]},
+    "p_value": 0.001,
+    "rmse_before_um": 0.6,
+    "rmse_after_um": 0.4,
+    "rms_um": 0.3,
+    "tied": [],
+    "runner_up": {"effect": "dead_path", "behind_by": 4.0, "p_value": 0.2},
+    "confirmed": "on later blocks of cycles",
+}
+LOOP = {
+    "declared": ["axis_expansion"],
+    "held_out": "cycles 41 to 60",
+    "noise_floor_um": 0.4,
+    "rmse_persistence_um": 0.9,
+    "rmse_declared_um": 0.6,
+    "rmse_final_um": 0.4,
+    "verdict": "explained",
+    "not_tried": {"dead_path": "no air"},
+    "blocked": {},
+}
+LEFT = {"shape": "", "rms_um": 0.0, "p_value": 0.4, "nearest": ""}
+RESIDUAL = {
+    "p_values": dict.fromkeys(
+        (
+            "memory",
+            "event",
+            "rhythm",
+            "curvature",
+            "one place",
+            "direction",
+            "direction along the axis",
+            "pattern",
+            "slow pattern",
+        ),
+        0.4,
+    ),
+    "drift_common_um": 0.1,
+    "drift_stretch_um": 0.0,
+    "event_s": 60.0,
+    "period_min": 4.0,
+    "period_is_cycle": True,
+}
+EVIDENCE = {
+    "kind": "scatter", "extra_um": 0.3, "probability": 0.9, "for": ["a"], "against": ["b"], "check": "c",
+    "probability_structural": 0.9, "probability_stick_slip": 0.0, "probability_slow": 0.1, "probability_step": 0.0,
+    "scatter_typical_um": 0.3, "scatter_positive_um": 0.6, "scatter_negative_um": 0.6, "serial_p": 0.4,
+    "approach_gain_nats": -0.5, "step_p": 0.6, "step_um": 0.1, "step_u_um": 0.1, "step_cycle": 12, "step_held_out_nats": 0.0,
+}  # fmt: skip
+PARTS: dict[str, Any] = {
+    "registration": {
+        "rms_mm": 0.1,
+        "leave_one_out_mm": {"F1": 0.2},
+        "frames_rejected": [{"file": "a.jpg", "index": 0, "reason": "cut short"}],
+    },
+    "alignment": {"clock_offset_s": {"value": 0.0, "u": None}},
+    "iso230": {"window": "cycles 1 to 5", **{f"{name}_um": MEASURED for name in "BREMA"}},
+    "neighbours": {"conventional_s_um": BOTH, "pair_s_um": BOTH, "ratio": BOTH},
+    "drift": {"profile_um": BOTH, "profile_u_um": BOTH, "scatter_um": BOTH},
+    "anomalies": [
+        {
+            "target": 3,
+            "direction": "both",
+            "p_value": 0.01,
+            "scatter_um": 0.7,
+            "cause": "structural",
+            "evidence": EVIDENCE,
+        }
+    ],
+    "hotspots": [{"x_mm": 1.0, "y_mm": 2.0, "peak_rise_K": 3.0, "targets": [3], "p_value": None, "lag_s": None}],
+    "loop": {
+        **LOOP,
+        "steps": [
+            {**STEP, "coefficients": [{"value": 1.0, "u": 0.1, "unit": "um"}], "held_out_p": 0.01, "event_cycle": 9}
+        ],
+        "unexplained": {**LEFT, "nearest_p": None, "nearest_share": None},
+        "declared_coefficients": [
+            {"effect": "axis_expansion", "value": 11.6, "u": 0.2, "unit": "ppm/K", "prior": 11.7, "prior_u": 2.0}
+        ],
+        "nuisance": {
+            "kind": "random walk",
+            "common_rms_um": 0.1,
+            "stretch_rms_um": 0.0,
+            "common_um_per_sqrt_h": 0.1,
+            "stretch_um_per_sqrt_h": 0.0,
+        },
+        "sealed_question": {},
+        "search": [[{**SCORE, "held_out_gain": 4.0, "held_out_p": 0.01, "share_not_separable": 0.0}]],
+        "identifiability": [
+            {
+                "effect": "dead_path",
+                "detectable_um": None,
+                "best_um": None,
+                "worst_um": None,
+                "visible_share": 0.1,
+                "looks_like": ["air_index"],
+                "note": "",
+            }
+        ],
+        "field_corrections": [],
+        "residual_tests": {"declared": RESIDUAL, "final": RESIDUAL},
+    },
+}
+ERRORS = {"rmse_persistence_um": 0.9, "rmse_declared_um": 0.6, "rmse_final_um": 0.4}
+RECORD_LOOP: dict[str, Any] = {
+    **LOOP,
+    "steps": [
+        {
+            **STEP,
+            "rms_by_channel_um": {"X": 0.3},
+            "chained_rmse_before_um": 0.7,
+            "chained_rmse_after_um": 0.5,
+            "rejected": {},
+            "event_s": None,
+        }
+    ],
+    "unexplained": {**LEFT, "p_values": {"rhythm": 0.4}, "variance_share": 0.1},
+    "channels": {"X": {**ERRORS, "noise_um": 0.1, "variance_share": 0.1}},
+    "chained": [{"first_h": 6.0, "last_h": 9.0, "effects": [], **ERRORS}],
+    "search": [
+        [{**SCORE, "chained_rmse_before_um": 0.7, "chained_rmse_after_um": 0.5, "chosen": True, "rejected": ""}]
+    ],
+}
