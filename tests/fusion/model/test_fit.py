@@ -10,8 +10,6 @@ import pytest
 from fusion.alignment.readings import Readings
 from fusion.effects.effect import Candidate, Effect, Prior
 from fusion.model.fit import (
-    ModelFit,
-    Term,
     again,
     condition,
     fit_model,
@@ -21,14 +19,7 @@ from fusion.model.fit import (
     unexplained_drift,
 )
 from interferometry.drift.gls import drift_system, fit_fixed_effects
-from tests.fusion.small_campaign import campaign
-
-RATIOS = np.array([2e-4, 5e-4])
-
-
-def term(columns: np.ndarray, name: str = "effect", **changes) -> Term:
-    columns = columns if columns.ndim == 2 else columns[:, None]
-    return Term(name, Candidate(columns, changes.pop("parameters", {}), ("um",) * columns.shape[1], **changes))
+from tests.fusion.small_campaign import RATIOS, campaign, dense_covariance, model_of, term
 
 
 def with_response(readings: Readings, rng: np.random.Generator, *named: tuple[float, np.ndarray]) -> Readings:
@@ -38,27 +29,6 @@ def with_response(readings: Readings, rng: np.random.Generator, *named: tuple[fl
     walk = 0.01 * np.cumsum(steps * rng.standard_normal(steps.size))
     response = profile + walk + 0.1 * rng.standard_normal(steps.size)
     return replace(readings, response=response + sum(size * column for size, column in named))
-
-
-def model_of(readings: Readings, terms: list[Term], used: np.ndarray | None = None, *, order: int = 1) -> ModelFit:
-    """A model with given drift variances: no search for them, so that dense algebra gives the same."""
-    used = np.ones(readings.seconds.size, bool) if used is None else used
-    design = np.column_stack([readings.profile, *(one.candidate.columns for one in terms)])
-    if order == 2:
-        design = np.column_stack([design, readings.loadings * (readings.seconds / 3600.0)[:, None]])
-    ratios = RATIOS if order == 1 else RATIOS / 1e4
-    system = drift_system(readings.seconds[used], readings.loadings[used], order=order, ratios=ratios)
-    fit = fit_fixed_effects(system, readings.response[used], design[used])
-    return ModelFit(readings, used, tuple(terms), fit, readings.profile)
-
-
-def dense_covariance(readings: Readings, ratios: np.ndarray, order: int) -> np.ndarray:
-    """Covariance of the readings over sigma squared: random walks or integrated walks that start at zero, and noise."""
-    early = np.minimum.outer(readings.seconds, readings.seconds)
-    late = np.maximum.outer(readings.seconds, readings.seconds)
-    walk = early if order == 1 else early**2 * (3.0 * late - early) / 6.0
-    parts = zip(ratios, readings.loadings.T, strict=True)
-    return np.eye(readings.seconds.size) + sum(ratio * np.outer(loading, loading) * walk for ratio, loading in parts)
 
 
 def test_columns_of_a_term_stand_behind_those_before_it():
@@ -142,7 +112,7 @@ def test_predictions_in_open_loop_are_those_of_dense_algebra(order, rng):
     readings = with_response(campaign(cycles=10), rng)
     column = np.cos(readings.seconds / 300.0)
     used = readings.cycle <= 7
-    model = model_of(readings, [term(column)], used, order=order)
+    model = model_of(readings, [term(column)], used, order=order, ratios=RATIOS if order == 1 else RATIOS / 1e4)
     design = model.whole_design()
     hours = readings.loadings * (readings.seconds / 3600.0)[:, None]
     expected_design = np.column_stack([readings.profile, column, *([hours] if order == 2 else [])])

@@ -1,0 +1,295 @@
+"""The procedure on a problem whose scores, confirmations and hold-out errors are written down beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+from fusion.effects.effect import Candidate
+from fusion.loop.closed_loop import (
+    choose,
+    drop_superfluous,
+    enter,
+    no_progress,
+    open_hold_out,
+    search,
+    verdict,
+    with_hold_out_errors,
+    withdraw,
+)
+from fusion.loop.decisions import Decision, Reason
+from fusion.loop.state import Confirmation, Confirmed, LoopState, Round, Score
+from fusion.model.fit import Term
+
+CANDIDATE = Candidate(np.zeros((2, 1)), {}, ("um",))
+LEVEL = 0.02
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model is its terms; ``origin`` says from which it was fitted again."""
+
+    terms: tuple[Term, ...]
+    origin: Model | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(term.effect for term in self.terms)
+
+
+@dataclass
+class Script:
+    """A problem that answers from what is written down, and notes what it was asked."""
+
+    rounds: list[Round] = field(default_factory=list)
+    refused: frozenset[str] = frozenset()
+    not_confirmed: frozenset[str] = frozenset()
+    losses: dict[str, float] = field(default_factory=dict)
+    error: Callable[[tuple[str, ...]], float] = lambda names: 1.0
+    judged: Callable[[Score], bool] = lambda score: True
+    asked: list[str] = field(default_factory=list)
+    hold_out_asked: list[tuple[str, ...]] = field(default_factory=list)
+
+    def refit(self, model: Model, terms: Sequence[Term]) -> Model:
+        return Model(tuple(terms), model)
+
+    def score(self, state: LoopState[Model]) -> Round:
+        self.asked.append("score")
+        return self.rounds.pop(0) if self.rounds else Round(())
+
+    def entry_level(self, score: Score) -> float:
+        return LEVEL
+
+    def refuse(self, score: Score, model: Model) -> Decision | None:
+        self.asked.append(f"refuse {score.name}")
+        return Decision(score.name, Reason.AT_SWITCHING, {"hours": 1.0}) if score.name in self.refused else None
+
+    def confirm(self, score: Score, state: LoopState[Model]) -> Score:
+        self.asked.append(f"confirm {score.name}")
+        passed = score.name not in self.not_confirmed
+        return replace(score, gain=77.0, confirmation=Confirmation(passed, Confirmed.LATER_PARTS))
+
+    def loss_without(self, model: Model, term: Term) -> float:
+        return self.losses.get(term.effect, 100.0)
+
+    def hold_out_error(self, terms: Sequence[Term]) -> float:
+        names = tuple(term.effect for term in terms)
+        self.hold_out_asked.append(names)
+        return self.error(names)
+
+    def is_judged_by_hold_out(self, score: Score) -> bool:
+        return self.judged(score)
+
+    def is_harmless(self, with_it_um: float, without_it_um: float) -> bool:
+        return with_it_um <= 1.05 * without_it_um
+
+    def ask_hold_out(self, state: LoopState[Model]) -> LoopState[Model]:
+        self.asked.append("ask hold-out")
+        return state
+
+
+def score(name: str, excess: float = 20.0, p_value: float = 0.001) -> Score:
+    return Score(name, CANDIDATE, excess=excess, p_value=p_value, family_wise_p=p_value)
+
+
+def start(*scores: Score) -> LoopState[Model]:
+    """The declared model, with one round scored where there are scores."""
+    state = LoopState(Model((Term("declared", CANDIDATE),)))
+    return state.scored(Round(scores)) if scores else state
+
+
+def with_steps(problem: Script, *names: str) -> LoopState[Model]:
+    state = start(*(score(name) for name in names))
+    for name in names:
+        state = enter(problem, state, problem.confirm(score(name), state))
+    problem.asked.clear()
+    return state
+
+
+def test_the_best_effect_that_is_significant_is_chosen():
+    problem = Script()
+    state, chosen = choose(problem, start(score("a", 20.0), score("b", 10.0)))
+    assert chosen.name == "a"
+    assert problem.asked == ["refuse a", "confirm a"]
+    # The round keeps the closer look that came with the confirmation.
+    assert [one.gain for one in state.rounds[-1].scores] == [77.0, 0.0]
+
+
+@pytest.mark.parametrize(("p_value", "name"), [(LEVEL, "a"), (LEVEL * 1.001, "b")])
+def test_an_effect_enters_up_to_the_level(p_value, name):
+    _, chosen = choose(Script(), start(score("a", 20.0, p_value), score("b", 19.0)))
+    assert chosen.name == name
+
+
+def test_another_level_can_be_asked_for():
+    assert choose(Script(), start(score("a", p_value=0.01)), level=0.005)[1] is None
+    assert choose(Script(), start(score("a", p_value=0.04)), level=0.05)[1].name == "a"
+
+
+def test_an_effect_without_a_candidate_or_withdrawn_for_good_is_passed_over():
+    scores = (replace(score("none"), candidate=None), score("wrong"), score("good"))
+    state = start(*scores).decide(Decision("wrong", Reason.WRONG_PATTERN, {"p_value": 0.1}))
+    problem = Script()
+    _, chosen = choose(problem, state)
+    assert chosen.name == "good" and problem.asked == ["refuse good", "confirm good"]
+
+
+def test_a_refusal_is_recorded_and_does_not_stand_in_the_way_of_a_weaker_effect():
+    problem = Script(refused=frozenset({"a"}))
+    state, chosen = choose(problem, start(score("a", 50.0), score("b", 5.0)))
+    assert chosen.name == "b"
+    assert [(decision.effect, decision.reason) for decision in state.decisions] == [("a", Reason.AT_SWITCHING)]
+
+
+@pytest.mark.parametrize(("excess", "name"), [(17.0, "b"), (16.9, None)])
+def test_a_much_weaker_effect_only_stands_in_for_one_that_was_not_confirmed(excess, name):
+    problem = Script(not_confirmed=frozenset({"a"}))
+    state, chosen = choose(problem, start(score("a", 20.0, 0.003), score("b", excess)))
+    assert (chosen.name if chosen else None) == name
+    (decision,) = state.decisions
+    assert decision == Decision("a", Reason.NOT_CONFIRMED, {"p_value": 0.003})
+
+
+def test_the_strongest_of_those_not_confirmed_sets_the_limit():
+    problem = Script(not_confirmed=frozenset({"a", "b"}))
+    _, chosen = choose(problem, start(score("a", 20.0), score("b", 18.0), score("c", 16.0)))
+    assert chosen is None
+
+
+def test_nothing_is_chosen_where_nothing_is_significant():
+    state = start(score("a", p_value=0.5))
+    after, chosen = choose(Script(), state)
+    assert chosen is None and after.decisions == ()
+
+
+def test_an_effect_enters_with_its_way_of_confirmation():
+    problem = Script()
+    confirmed = problem.confirm(score("a"), start())
+    state = enter(problem, start(score("a")), confirmed)
+    assert state.model.names == ("declared", "a")
+    assert state.steps[0].confirmed is Confirmed.LATER_PARTS
+    assert state.decisions[-1] == Decision("a", Reason.ENTERED)
+
+
+def test_the_search_adds_effects_until_none_is_left_and_asks_the_hold_out_set_once():
+    problem = Script([Round((score("a"), score("b"))), Round((score("b"),)), Round((score("c", p_value=0.5),))])
+    told = []
+    state = search(problem, start(), progress=lambda done, total, what: told.append((done, total, what)))
+    assert [step.effect for step in state.steps] == ["a", "b"]
+    assert state.model.names == ("declared", "a", "b")
+    assert problem.asked.count("ask hold-out") == 1 and problem.asked[-1] == "ask hold-out"
+    assert len(state.rounds) == 3
+    assert told == [(number, 6, f"searching for effect {number}") for number in (1, 2, 3)]
+    # An effect keeps the round in which it was chosen.
+    assert [len(step.round.scores) for step in state.steps] == [2, 1]
+
+
+def test_the_search_ends_after_four_effects():
+    problem = Script([Round((score(name),)) for name in "abcde"])
+    state = search(problem, start())
+    assert [step.effect for step in state.steps] == ["a", "b", "c", "d"]
+    assert len(problem.rounds) == 1 and "ask hold-out" not in problem.asked
+
+
+@pytest.mark.parametrize(("loss", "left"), [(1.99, ["b"]), (2.0, ["a", "b"])])
+def test_an_effect_that_a_later_one_makes_superfluous_is_dropped(loss, left):
+    problem = Script(losses={"a": loss, "b": 0.0})
+    state = drop_superfluous(problem, with_steps(problem, "a", "b"))
+    # The newest effect is not held against itself.
+    assert [step.effect for step in state.steps] == left
+    if left == ["b"]:
+        assert state.decisions[-1] == Decision("a", Reason.SUPERFLUOUS, {"loss": loss})
+        assert state.model.names == ("declared", "b")
+
+
+def test_superfluous_effects_are_dropped_one_after_the_other():
+    """Without the first the second is needed again."""
+    problem = Script(losses={"a": 1.0, "b": 1.0})
+    problem.loss_without = lambda model, term: 1.0 if {"a", "b"} <= set(model.names) else 50.0
+    state = drop_superfluous(problem, with_steps(problem, "a", "b", "c"))
+    assert [step.effect for step in state.steps] == ["b", "c"]
+
+
+def test_three_events_are_a_switching_without_a_name():
+    rounds = [Round((score("step_event"),)), Round((score("a"),)), *[Round((score("step_event"),))] * 2]
+    state = search(Script(rounds), start())
+    assert [step.effect for step in state.steps] == ["a"]
+    assert state.decisions[-1] == Decision("step_event", Reason.TOO_MANY_EVENTS, {"most": 2})
+    assert state.model.names == ("declared", "a")
+
+
+def test_two_events_may_happen():
+    state = search(Script([Round((score("step_event"),))] * 2), start())
+    assert [step.effect for step in state.steps] == ["step_event", "step_event"]
+
+
+def test_the_hold_out_errors_are_those_of_the_growing_chain():
+    problem = Script(error=lambda names: float(len(names)))
+    state = with_hold_out_errors(problem, with_steps(problem, "a", "b"))
+    assert state.errors_um == (1.0, 2.0, 3.0)
+    assert problem.hold_out_asked == [("declared",), ("declared", "a"), ("declared", "a", "b")]
+
+
+def test_errors_are_computed_again_only_once_the_hold_out_set_is_open():
+    problem = Script()
+    closed = withdraw(problem, with_steps(problem, "a", "b"), [0], [])
+    assert closed.errors_um == () and problem.hold_out_asked == []
+    opened = withdraw(problem, with_hold_out_errors(problem, with_steps(problem, "a", "b")), [0], [])
+    assert opened.errors_um == (1.0, 1.0)
+    assert [step.effect for step in opened.steps] == ["b"]
+
+
+def test_effects_that_do_no_harm_stay():
+    errors = {0: 2.0, 1: 1.5, 2: 1.0}
+    problem = Script(error=lambda names: errors[len(names) - 1])
+    state = open_hold_out(problem, with_steps(problem, "a", "b"))
+    assert [step.effect for step in state.steps] == ["a", "b"]
+    assert state.errors_um == (2.0, 1.5, 1.0)
+
+
+def test_the_effect_that_harms_most_is_withdrawn_and_the_others_judged_again():
+    """Both a and b make the error larger, b more; without b, a does no harm."""
+    errors = {
+        ("declared",): 1.0,
+        ("declared", "a"): 1.04,
+        ("declared", "b"): 1.5,
+        ("declared", "a", "b"): 2.0,
+    }
+    problem = Script(error=errors.__getitem__)
+    state = open_hold_out(problem, with_steps(problem, "a", "b"))
+    assert [step.effect for step in state.steps] == ["a"]
+    assert state.errors_um == (1.0, 1.04)
+    decision = state.decisions[-1]
+    assert (decision.effect, decision.reason) == ("b", Reason.HOLD_OUT_ERROR)
+    # Judged beside all others, with the error of the whole chain.
+    assert decision.evidence == {"p_value": 0.001, "without_um": 1.04, "with_um": 2.0}
+
+
+def test_effects_are_withdrawn_until_none_harms():
+    problem = Script(error=lambda names: 2.0 ** len(names))
+    state = open_hold_out(problem, with_steps(problem, "a", "b", "c"))
+    assert state.steps == () and state.errors_um == (2.0,)
+    assert [decision.reason for decision in state.decisions[-3:]] == [Reason.HOLD_OUT_ERROR] * 3
+    assert state.model.names == ("declared",)
+
+
+def test_an_effect_of_which_the_hold_out_error_says_nothing_is_not_judged_by_it():
+    problem = Script(error=lambda names: 2.0 ** len(names), judged=lambda one: one.name != "a")
+    state = open_hold_out(problem, with_steps(problem, "a", "b"))
+    assert [step.effect for step in state.steps] == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("added", "remains", "word"),
+    [(False, False, "complete"), (True, False, "explained"), (True, True, "partial"), (False, True, "unexplained")],
+)
+def test_the_outcome_has_one_word(added, remains, word):
+    assert verdict(added=added, remains=remains) == word
+
+
+def test_progress_need_not_be_watched(capsys):
+    no_progress(1, 2, "searching")
+    assert capsys.readouterr().out == ""
