@@ -290,7 +290,7 @@ def reductions(c: Array, y: Array, q: Array, groups: Sequence[Group]) -> tuple[A
             for j in range(i + 1):
                 whole = np.einsum("nm,nm->m", c[:, slots[i]], c[:, slots[j]])
                 gram[:, i, j] = gram[:, j, i] = whole - np.einsum("qm,qm->m", within[:, slots[i]], within[:, slots[j]])
-            own[i] = np.maximum(np.sqrt(whole), 1e-300)
+            own[i] = np.maximum(np.sqrt(whole), 1e-150)
         gram /= own.T[:, :, None] * own.T[:, None, :]
         good = np.linalg.eigvalsh(gram)[:, 0] > _SEPARABLE_SHARE
         # A candidate that is not separable explains nothing: its factor is replaced, its moment made zero.

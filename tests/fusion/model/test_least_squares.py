@@ -193,3 +193,17 @@ def test_a_candidate_of_which_the_model_holds_all_but_a_ten_thousandth_explains_
     assert told.tolist() == [separable]
     # What is outside the model points along the response: all of it is explained, or nothing.
     assert reduced[0, 0] == pytest.approx(1.0 if separable else 0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("width", [1, 2, 4])
+def test_a_candidate_with_a_column_of_zeros_explains_nothing(rng, width):
+    """A driver that is logged and never runs makes such columns; the other candidates are not touched by them."""
+    columns = rng.standard_normal((20, width))
+    columns[:, 0] = 0.0
+    candidates = [Candidate(c, {}, ("um",) * width) for c in (columns, rng.standard_normal((20, width)))]
+    groups = by_width(candidates, np.ones(20, bool))
+    y = rng.standard_normal((20, 1))
+    reduced, _, separable = reductions(groups[0].columns, y, np.zeros((20, 1)), groups)
+    assert separable.tolist() == [False, True]
+    assert reduced[0, 0] == 0.0
+    assert reduced[0, 1] == pytest.approx(y[:, 0] @ y[:, 0] - squares_beside(y[:, 0], candidates[1].columns))
