@@ -1,4 +1,4 @@
-"""The closed loop on campaigns of the twin: names what is missing, adds nothing where nothing is, leaves the unknown unnamed."""
+"""The closed loop along an axis: campaigns of the twin with one effect missing, and every step of it on a small campaign by hand."""
 
 from __future__ import annotations
 
@@ -13,12 +13,26 @@ from fusion.alignment.readings import Readings, ReadingsError, Series, read_fuse
 from fusion.effects.effect import Candidate, Effect, Prior
 from fusion.effects.jumps import event_instants, instants_near
 from fusion.effects.library import library
-from fusion.loop.axis import LoopError, close_loop, set_aside_sites
+from fusion.loop import axis
+from fusion.loop.axis import (
+    AxisProblem,
+    LoopError,
+    close_loop,
+    declare,
+    hold_out,
+    keep_right_patterns,
+    look_again,
+    set_aside_sites,
+)
+from fusion.loop.decisions import Decision, Reason
+from fusion.loop.state import Confirmation, Confirmed, LoopState, Round, Score, Step
+from fusion.model.fit import ModelFit
 from fusion.twin import simulate
 from fusion.twin.machine.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import driver_log, environment_log
 from fusion.twin.truth import deviations_of, fields_of
 from tests.fusion import loop_bench
+from tests.fusion.small_campaign import campaign, model_of, term
 
 DECLARED = ["axis_expansion", "table_offset"]
 
@@ -308,3 +322,236 @@ def test_an_event_among_the_hold_out_cycles_does_not_hide_what_acts_beside_it():
     found = close_loop(loop_bench.readings_of(*effects, seed=23018), DECLARED)
     assert [step.effect for step in found.steps] == ["step_event", "unseen_heat_source"]
     assert found.rmse_final_um < 1.1 * found.noise_floor_um
+
+
+@pytest.mark.parametrize(("cycles", "first"), [(10, 9), (12, 11), (13, 11), (50, 41)])
+def test_the_last_fifth_of_the_cycles_is_held_out_but_two_at_least(cycles, first):
+    readings = campaign(cycles=cycles)
+    used, description = hold_out(readings)
+    np.testing.assert_array_equal(used, readings.cycle < first)
+    assert description.startswith(f"cycles {first}-{cycles} held out; coefficients frozen at cycle {first - 1}")
+
+
+def test_cycles_that_are_missing_do_not_count():
+    readings = campaign(cycles=14)
+    gapped = readings.subset(~np.isin(readings.cycle, [3, 4]))
+    np.testing.assert_array_equal(hold_out(gapped)[0], gapped.cycle < 13)
+    with pytest.raises(LoopError, match="9 cycles are too few to hold some out"):
+        hold_out(readings.subset(readings.cycle <= 9))
+
+
+def test_a_declared_effect_has_the_prior_of_the_library():
+    readings = readings_of(test={"cycles": 20})
+    expansion, offset = declare(readings, DECLARED, library())
+    assert (expansion.effect, expansion.candidate.prior) == ("axis_expansion", Prior(11.7, 2.0))
+    assert (offset.effect, offset.candidate.prior) == ("table_offset", None)
+    with pytest.raises(LoopError, match="'axis_expansion' cannot be computed: the campaign holds no thermal frames"):
+        declare(campaign(), DECLARED, library())
+
+
+BARE = campaign(cycles=12)
+USED = BARE.cycle <= 10
+WAVE, LATE = np.sin(BARE.seconds / 100.0), (BARE.seconds >= 650.0).astype(float)
+
+
+def problem_of(*named: np.ndarray, effects: dict[str, Effect] | None = None) -> AxisProblem:
+    """A small campaign with noise of 0.1 um and what is named, of which two cycles are held out."""
+    noise = 0.1 * np.random.default_rng(6).standard_normal(BARE.seconds.size)
+    readings = replace(BARE, response=noise + sum(named, np.zeros(BARE.seconds.size)))
+    return AxisProblem(readings, USED, {} if effects is None else effects, np.random.default_rng(1))
+
+
+def score(name: str, candidate: Candidate, **changes) -> Score:
+    confirmation = Confirmation(True, Confirmed.LATER_CYCLES)
+    return Score(name, candidate, **{"family_wise_p": 1e-3, "confirmation": confirmation, **changes})
+
+
+def test_the_levels_of_the_search_add_up():
+    assert pytest.approx(0.025) == axis.ENTRY_LEVEL
+    assert problem_of().entry_level(score("a", term(WAVE).candidate)) == 0.015
+
+
+@pytest.mark.parametrize(("with_it", "harmless"), [(1.05, True), (1.06, False), (0.5, True)])
+def test_an_effect_may_raise_the_hold_out_error_by_a_twentieth(with_it, harmless):
+    assert problem_of().is_harmless(with_it, 1.0) is harmless
+
+
+def test_the_hold_out_error_judges_what_lasts():
+    problem = problem_of()
+    assert problem.is_judged_by_hold_out(score("a", term(WAVE).candidate))
+    assert not problem.is_judged_by_hold_out(score("a", term(LATE, event_s=650.0).candidate))
+
+
+@pytest.mark.parametrize(("event_s", "late"), [(1169.0, False), (1170.0, True), (1400.0, True), (None, False)])
+def test_an_event_is_late_from_one_cycle_before_the_hold_out_set_on(event_s, late):
+    """Cycle 11 starts at 1300 s, and a cycle takes 130 s."""
+    assert bool(problem_of().is_late(term(LATE, event_s=event_s))) is late
+
+
+def test_models_of_the_training_part_are_fitted_once():
+    problem = problem_of(WAVE)
+    declared = [term(WAVE)]
+    state = problem.start(declared)
+    assert problem.refit(state.model, declared) is state.model
+    assert problem.refit(state.model, []) is not state.model
+    whole = axis.fit_model(problem.readings, declared)
+    assert problem.refit(whole, declared).used.all()
+    np.testing.assert_array_equal(state.model.used, USED)
+
+
+def test_effects_that_cannot_be_tried_are_decided_at_the_start():
+    problem = problem_of(effects=library())
+    state = problem.start([])
+    told = state.not_tried()
+    assert told["thermal_lag"] == "the campaign holds no thermal frames"
+    assert set(library()) - set(told) == {
+        "angular_growth",
+        "reversal_drift",
+        "step_event",
+        "periodic_disturbance",
+        "pitch_error",
+        "laser_warm_up",
+    }
+
+
+def test_the_loss_without_a_term_is_that_of_the_likelihood_with_the_drift_kept():
+    problem = problem_of(0.5 * WAVE)
+    kept, asked = term(LATE), term(WAVE)
+    model = model_of(problem.readings, [kept, asked], USED)
+    without = model_of(problem.readings, [kept], USED)
+    expected = 0.5 * USED.sum() * np.log(without.fit.rss / model.fit.rss)
+    assert problem.loss_without(model, asked) == pytest.approx(expected)
+    assert problem.loss_without(model, asked) > 2.0 > problem.loss_without(model, kept)
+
+
+def test_an_event_among_the_hold_out_cycles_is_sized_on_the_other_half_of_the_targets():
+    """A step of 1 um in cycle 11: the training part cannot size it, the other targets can."""
+    late = (BARE.seconds >= 1300.0).astype(float)
+    problem = problem_of(late)
+    event = term(late, "step_event", event_s=1300.0)
+    assert problem.hold_out_error([]) > 0.7
+    assert problem.hold_out_error([event]) < 0.2
+
+
+def state_of(problem: AxisProblem, *names: str) -> LoopState[ModelFit]:
+    """A state after the hold-out set was opened, with a step for every name."""
+    terms = [term(np.roll(WAVE, 5 * k) * BARE.sign, name) for k, name in enumerate(names)]
+    scored = Round(tuple(score(name, one.candidate) for name, one in zip(names, terms, strict=True)))
+    steps = tuple(Step(one, scored, Confirmed.LATER_CYCLES) for one in scored.scores)
+    model = axis.fit_model(problem.readings, terms)
+    return LoopState(model, steps=steps, rounds=(scored,), errors_um=(9.0,) * (len(names) + 1))
+
+
+def test_what_was_found_after_a_wrong_pattern_goes_with_it(monkeypatch):
+    problem = problem_of()
+    state = state_of(problem, "a", "b", "c")
+    asked = []
+
+    def second_is_wrong(model, terms):
+        asked.append([one.effect for one in terms])
+        return {1: Decision("b", Reason.WRONG_PATTERN, {"p_value": 1e-5})} if len(terms) == 3 else {}
+
+    monkeypatch.setattr(axis, "wrong_patterns", second_is_wrong)
+    kept = keep_right_patterns(problem, state)
+    assert [step.effect for step in kept.steps] == ["a"]
+    assert asked == [["a", "b", "c"], ["a"]]
+    assert [(one.effect, one.reason) for one in kept.decisions] == [
+        ("b", Reason.WRONG_PATTERN),
+        ("c", Reason.BESIDE_WRONG_PATTERN),
+    ]
+    assert kept.decisions[1].evidence == {"beside": "b"}
+    # The errors are those of the chain that remains.
+    assert len(kept.errors_um) == 2 and kept.errors_um[0] == problem.hold_out_error([])
+
+
+def test_right_patterns_leave_the_state_as_it_is(monkeypatch):
+    monkeypatch.setattr(axis, "wrong_patterns", lambda model, terms: {})
+    state = state_of(problem_of(), "a")
+    assert keep_right_patterns(problem_of(), state) is state
+
+
+def second_look(problem: AxisProblem, monkeypatch, *rounds: Round) -> LoopState[ModelFit]:
+    scripted = iter(rounds)
+    monkeypatch.setattr(problem, "score", lambda state: next(scripted, Round(())))
+    monkeypatch.setattr(problem, "refuse", lambda score, model: None)
+    start = LoopState(axis.fit_model(problem.readings, []), errors_um=(problem.hold_out_error([]),))
+    return look_again(problem, start)
+
+
+def test_the_second_look_adds_what_the_training_part_could_not_show(monkeypatch):
+    late = (BARE.seconds >= 1300.0).astype(float)
+    problem = problem_of(late, effects={})
+    event = score("step_event", term(late, event_s=1300.0).candidate)
+    state = second_look(problem, monkeypatch, Round((event,)))
+    assert [(step.effect, step.confirmed) for step in state.steps] == [("step_event", Confirmed.LATE_EVENT)]
+    assert state.errors_um[1] < 0.3 * state.errors_um[0]
+    assert state.model.used.all()
+
+
+@pytest.mark.parametrize(("p_value", "entered"), [(0.005, True), (0.0051, False)])
+def test_the_second_look_has_a_level_of_its_own(p_value, entered, monkeypatch):
+    problem = problem_of(WAVE)
+    wave = score("periodic_disturbance", term(WAVE).candidate, family_wise_p=p_value)
+    state = second_look(problem, monkeypatch, Round((wave,)))
+    assert [step.confirmed for step in state.steps] == [Confirmed.SECOND_LOOK] * entered
+
+
+def test_an_effect_that_makes_the_hold_out_error_larger_does_not_enter_in_the_second_look(monkeypatch):
+    turned = np.where(USED, WAVE, -WAVE)
+    problem = problem_of(WAVE)
+    wrong = score("periodic_disturbance", term(turned).candidate)
+    state = second_look(problem, monkeypatch, Round((wrong,)), Round((wrong,)))
+    assert state.steps == () and len(state.errors_um) == 1
+    decision = state.last("periodic_disturbance")
+    assert decision.reason is Reason.SECOND_LOOK_ERROR
+    assert decision.evidence["with_um"] > 1.05 * decision.evidence["without_um"]
+    # It was refused for good, so that the second round chose nothing.
+    assert len(state.rounds) == 2
+
+
+def test_the_second_look_adds_no_third_event(monkeypatch):
+    instants = (400.0, 700.0, 1000.0)
+    steps = [(BARE.seconds >= instant).astype(float) for instant in instants]
+    problem = problem_of(*steps)
+    monkeypatch.setattr(problem, "hold_out_error", lambda terms: 1.0)
+    monkeypatch.setattr(problem, "loss_without", lambda model, term: 100.0)
+    rounds = [
+        Round((score("step_event", term(step, event_s=instant).candidate),))
+        for step, instant in zip(steps, instants, strict=True)
+    ]
+    state = second_look(problem, monkeypatch, *rounds)
+    assert [step.effect for step in state.steps] == ["step_event", "step_event"]
+
+
+def asked(problem: AxisProblem, *scores: Score) -> LoopState[ModelFit]:
+    return problem.ask_hold_out(problem.start([]).scored(Round(scores)))
+
+
+def test_the_strongest_effect_that_is_undecided_is_asked_for(monkeypatch):
+    effects = {name: Effect(name, "", "", lambda *_: iter(())) for name in ("weak", "a", "b")}
+    problem = problem_of(WAVE, effects=effects)
+    answers = {"a": (1.0, 0.5, 0.005)}
+    put = []
+
+    def ask(model, candidate, rng):
+        put.append(candidate)
+        return answers["a"]
+
+    monkeypatch.setattr(axis, "ask_hold_out", ask)
+    weak = score("weak", term(LATE).candidate, p_value=0.11)
+    first, second = (score(name, term(WAVE).candidate, p_value=0.1) for name in ("a", "b"))
+    state = asked(problem, Score("none", None), weak, first, second)
+    assert put == [first.candidate]
+    assert (state.question.effect, state.question.entered) == ("a", True)
+    assert (state.question.rmse_before_um, state.question.rmse_after_um, state.question.p_value) == (1.0, 0.5, 0.005)
+    assert state.steps[0].confirmed is Confirmed.HOLD_OUT_QUESTION
+    assert state.steps[0].score.confirmation.p_value == 0.005
+    # One question only, whatever the answer.
+    for answer in ((1.0, 0.5, 0.0051), (1.0, 1.0, 0.001)):
+        answers["a"] = answer
+        state = asked(problem, first, second)
+        assert state.steps == () and state.question.effect == "a" and not state.question.entered
+    # An effect against which something was decided is not asked for.
+    blocked = problem.start([]).decide(Decision("a", Reason.COLLINEAR)).scored(Round((first, second)))
+    assert problem.ask_hold_out(blocked).question.effect == "b"
+    assert asked(problem, weak).question is None
