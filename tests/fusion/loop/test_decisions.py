@@ -84,10 +84,10 @@ def test_the_sentences_read_as_they_are_meant():
     ).sentence
     assert hold_out == (
         "withdrawn: it was found in the training part (p = 0.0012), but the error on the hold-out set is not smaller with it "
-        "(0.41 um without, 0.52 um with)"
+        "(0.41 µm without, 0.52 µm with)"
     )
     again = Decision("dead_path", Reason.SECOND_LOOK_ERROR, {"without_um": 0.4, "with_um": 0.5}).sentence
-    assert again.endswith("rose from 0.400 to 0.500 um with it")
+    assert again.endswith("rose from 0.400 to 0.500 µm with it")
     noise = {"series": "t1", "noise_percent": 2.345, "limit_percent": 1.0}
     assert Decision("thermal_lag", Reason.TEMPERATURE_NOISE, noise).sentence.startswith(
         "the noise of t1 is 2.3 % of its range; above 1 % "
