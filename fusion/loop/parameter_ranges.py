@@ -59,7 +59,7 @@ def parameter_ranges(near: Sequence[Candidate], gains: Array, best: Candidate, b
 
 def _enclosed(tried: Array, low: float, high: float) -> list[float | None]:
     """The values next to those that fit: the likelihood falls somewhere between, so the interval is rather too wide."""
-    below, above = tried[tried < low * (1.0 - _SAME)], tried[tried > high * (1.0 + _SAME)]
+    below, above = tried[tried < low - _SAME * abs(low)], tried[tried > high + _SAME * abs(high)]
     lowest = float(below.max()) if below.size else 0.0 if low == 0.0 else None
     return [lowest, float(above.min()) if above.size else None]
 

@@ -242,7 +242,8 @@ def _determined(columns: Array) -> NDArray[np.bool_]:
     kept = np.zeros(columns.shape[1], bool)
     seen: set[bytes] = set()
     for k in np.flatnonzero(present):
-        key = (columns[:, k] / columns[np.argmax(np.abs(columns[:, k])), k]).tobytes()
+        # A zero times a negative sign is a negative zero, whose bytes differ: adding zero makes it positive.
+        key = (columns[:, k] / columns[np.argmax(np.abs(columns[:, k])), k] + 0.0).tobytes()
         kept[k] = key not in seen
         seen.add(key)
     return kept

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import xarray as xr
 
+from fusion.record.blocks import Record, reduce_record
+from fusion.record.hold_out import declare, hold_out
+from fusion.record.problem import RecordProblem, RecordState, search_record
 from fusion.twin.machine.recipe import EffectRecipe, Recipe
 from fusion.twin.record import simulate_record
 
@@ -37,3 +42,46 @@ def twin_table(*effects: EffectRecipe, seed: int, hours: float = 24.0) -> xr.Dat
     """A record of the twin without files."""
     table = simulate_record(Recipe().vary(campaign={"seed": seed}, record={"hours": hours}, effect=effects)).table
     return table_of(table["displacement"].values, table["temperature"].values, table["speed"].values)
+
+
+def linear_samples(
+    rng: np.random.Generator, samples: int = 2000, sensors: int = 4, channels: int = 2
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Displacements that follow wandering temperatures exactly, the temperatures, and a driver that switches every 200 samples."""
+    temperature = np.cumsum(rng.normal(0.0, 0.05, (samples, sensors)), axis=0) + 20.0
+    displacement = (temperature - 20.0) @ rng.normal(0.0, 2.0, (sensors, channels))
+    return displacement, temperature, (np.arange(samples) // 200 % 2) * 3000.0
+
+
+def searched(*effects: EffectRecipe, seed: int) -> tuple[RecordProblem, RecordState]:
+    """The search on the training part of a record of the twin that is declared quasi-static."""
+    record = reduce_record(twin_table(*effects, seed=seed))
+    train, _ = hold_out(record)
+    return search_record(record, train, declare(["quasi_static"], record))
+
+
+def record_of(
+    displacement: np.ndarray,
+    temperature: np.ndarray,
+    *,
+    drivers: Mapping[str, np.ndarray] | None = None,
+    block_s: float = 300.0,
+    parts: int = 8,
+    temperature_noise: float = 0.0,
+) -> Record:
+    """A record by hand: (blocks, channels) um, (blocks, sensors) degC, drivers as shares of their largest size."""
+    blocks = displacement.shape[0]
+    return Record(
+        start=np.datetime64("2026-01-05T06:00", "ns"),
+        seconds=block_s * (np.arange(blocks) + 0.5),
+        block_s=block_s,
+        displacement=displacement,
+        temperature=temperature,
+        temperature_noise=np.full(temperature.shape[1], temperature_noise),
+        drivers={name: {1: values, 2: values**2} for name, values in (drivers or {}).items()},
+        channels=tuple(f"ch{k + 1}" for k in range(displacement.shape[1])),
+        sensors=tuple(f"t{k + 1}" for k in range(temperature.shape[1])),
+        duplicates=(),
+        chained=np.arange(blocks) * parts // blocks,
+        gaps={},
+    )

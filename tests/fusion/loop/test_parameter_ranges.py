@@ -30,6 +30,35 @@ def test_a_range_is_open_where_the_neighbourhood_ends_first():
     assert parameter_ranges(near, np.array([5.0, 9.9, 10.0]), near[2], 10.0) == {"time_constant_min": [10.0, None]}
 
 
+@pytest.mark.parametrize(("behind", "minutes"), [(1.91, [10.0, None]), (1.93, [20.0, None])])
+def test_a_value_fits_as_well_within_half_a_chi_squared_of_one_degree(behind, minutes):
+    near = [state(minutes) for minutes in (10.0, 20.0, 30.0)]
+    gains = np.array([0.0, 10.0 - behind, 10.0])
+    assert parameter_ranges(near, gains, near[2], 10.0) == {"time_constant_min": minutes}
+
+
+def test_a_size_may_be_negative():
+    near = [Candidate(NOTHING, {"jump": size}, ("ppm",)) for size in (-20.0, -5.0, 5.0)]
+    gains = np.array([10.0, 0.0, 0.0])
+    assert parameter_ranges(near, gains, near[0], 10.0) == {"jump": [None, -5.0]}
+    assert parameter_ranges(near, gains[[1, 0, 2]], near[1], 10.0) == {"jump": [-20.0, 5.0]}
+
+
+def test_a_time_of_zero_is_the_lowest_and_an_absent_body_has_it():
+    near = [Candidate(NOTHING, {}, ("um",)), Candidate(NOTHING, {"second_time_constant_min": 5.0}, ("um",))]
+    found = parameter_ranges(near, np.array([9.0, 10.0]), near[1], 10.0)
+    assert found == {"second_time_constant_min": [0.0, None]}
+
+
+def test_values_that_were_computed_twice_are_one_and_derived_words_have_no_range():
+    near = [
+        Candidate(NOTHING, {"period_mm": period, "possible_leads": leads}, ("um",))
+        for period, leads in ((100.0 * (1.0 - 1e-7), "a"), (100.0, "b"), (120.0, "c"))
+    ]
+    assert parameter_ranges(near, np.array([2.0, 10.0, 2.0]), near[1], 10.0) == {"period_mm": [None, 120.0]}
+    assert parameter_ranges(near[1:2], np.array([10.0]), near[1], 10.0) == {}
+
+
 def test_a_state_that_fits_as_well_is_told_and_does_not_widen_the_numbers():
     near = [state(10.0), state(20.0), state(30.0), state(80.0, "warm_up"), state(90.0, "mean_rise")]
     found = parameter_ranges(near, np.array([5.0, 10.0, 5.0, 9.0, 7.9]), near[1], 10.0)

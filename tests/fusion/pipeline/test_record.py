@@ -1,0 +1,123 @@
+"""The main job on a record: what is declared, what is noted, and the product on its blocks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fusion.effects.effect import Candidate
+from fusion.model.fit import Term
+from fusion.pipeline.record import declared_effects, record_notices, record_variables
+from fusion.record.blocks import Record
+from tests.fusion.record_tables import record_of
+
+
+def campaign_with(*declared: str) -> SimpleNamespace:
+    return SimpleNamespace(model_fields_set={"model"}, model=SimpleNamespace(declared=declared))
+
+
+def test_a_record_is_declared_quasi_static_where_nothing_else_is_said():
+    silent = SimpleNamespace(model_fields_set=set(), model=SimpleNamespace(declared=("axis_expansion",)))
+    assert declared_effects(silent) == (["quasi_static"], [])
+    assert declared_effects(campaign_with("quasi_static")) == (["quasi_static"], [])
+    assert declared_effects(campaign_with()) == ([], [])
+
+
+def test_what_needs_positions_is_dropped_with_a_notice():
+    declared, (notice,) = declared_effects(campaign_with("axis_expansion", "table_offset"))
+    assert declared == ["quasi_static"]
+    assert notice.code == "declared_without_axis"
+    assert notice.message.startswith("axis_expansion; table_offset need positions along an axis")
+    # What has no meaning for a record is left to be refused by name.
+    declared, _ = declared_effects(campaign_with("table_offset", "quasi_static", "dead_path"))
+    assert declared == ["quasi_static", "dead_path"]
+
+
+def plain(**changes) -> Record:
+    record = record_of(np.zeros((50, 2)), np.zeros((50, 1)), drivers={"speed": np.zeros(50)})
+    return replace(record, **changes)
+
+
+def notices_of(record: Record) -> dict[str, str]:
+    return {notice.code: notice.message for notice in record_notices(record)}
+
+
+def test_a_whole_record_is_noted_for_nothing():
+    assert notices_of(plain()) == {}
+
+
+def test_gaps_and_missing_displacements_are_counted():
+    displacement = np.zeros((50, 2))
+    displacement[3:6, 1] = np.nan
+    told = notices_of(plain(gaps={"t1": 4, "speed": 1}, displacement=displacement))
+    assert told["record_gaps"] == "Blocks of 300 s without a value were interpolated: t1 (4 blocks); speed (1 blocks)."
+    assert told["record_displacements_missing"].startswith("3 block means of 100 of the displacements missing")
+    assert set(told) == {"record_gaps", "record_displacements_missing"}
+
+
+@pytest.mark.parametrize(("longer_s", "pauses"), [(150.0, 0), (151.0, 1)])
+def test_a_pause_is_longer_than_one_and_a_half_blocks(longer_s, pauses):
+    seconds = plain().seconds.copy()
+    seconds[20:] += longer_s
+    told = notices_of(plain(seconds=seconds))
+    assert len(told) == pauses
+    if pauses:
+        assert told["record_pauses"].startswith("Nothing was logged in 1 pause, the longest ")
+
+
+def test_dependent_sensors_and_missing_drivers_are_noted():
+    told = notices_of(plain(duplicates=("t2", "t3"), drivers={}))
+    assert told["record_sensors_dependent"] == "Left out because the other sensors tell the same: t2; t3."
+    assert told["no_drivers"].startswith("No driver was logged, so a heat source that no sensor sees")
+
+
+def result_of(record: Record, *, names: tuple[str, ...], chained: list[tuple[float, float]]) -> SimpleNamespace:
+    """As much of a result as the product asks for."""
+    candidate = Candidate(np.zeros((50, 1)), {}, ("um",))
+    terms = tuple(Term(name, candidate) for name in names)
+    predictions = [SimpleNamespace(predicted=np.full((50, 2), float(k))) for k in range(3)]
+    places = {id(term): k for k, term in enumerate(terms)}
+    return SimpleNamespace(
+        state=SimpleNamespace(model=SimpleNamespace(terms=terms)),
+        predictions=predictions,
+        errors=np.array([[5.0, 5.0], [1.0, 2.0]]),
+        chained=[SimpleNamespace(rmse_final_um=np.array(errors)) for errors in chained],
+        contribution=lambda term: np.full((50, 2), 10.0 + places[id(term)]),
+        whole=SimpleNamespace(sigma=np.array([0.1, 0.2])),
+        hold_out=np.arange(50) >= 40,
+    )
+
+
+def test_the_product_holds_the_record_on_its_blocks():
+    speed = np.linspace(0.0, 1.0, 50)
+    record = plain(drivers={"speed": {1: speed, 2: speed**2}})
+    dataset = record_variables(record, result_of(record, names=("a", "b", "a"), chained=[]))
+    assert dataset["effect"].values.tolist() == ["a 1", "b", "a 3"]
+    np.testing.assert_array_equal(dataset["contribution"][:, 0, 0], [10.0, 11.0, 12.0])
+    np.testing.assert_array_equal(dataset["driver"], speed[:, None])
+    np.testing.assert_array_equal(dataset["predicted_declared"], 0.0)
+    np.testing.assert_array_equal(dataset["predicted_final"], 2.0)
+    np.testing.assert_array_equal(dataset["sealed"], np.arange(50) >= 40)
+    # Parts are numbered from 1.
+    assert (int(dataset["part"].min()), int(dataset["part"].max())) == (1, 8)
+    assert dataset["time"].values[1] == np.datetime64("2026-01-05T06:07:30", "ns")
+    np.testing.assert_array_equal(dataset["noise"], [0.1, 0.2])
+    assert dataset.attrs == {"block_s": 300.0}
+
+
+def test_the_uncertainty_of_a_prediction_is_what_unseen_parts_were_missed_by():
+    record = plain()
+    alone = record_variables(record, result_of(record, names=(), chained=[]))
+    np.testing.assert_array_equal(alone["predicted_u"], [1.0, 2.0])
+    assert alone["contribution"].shape == (0, 50, 2)
+    # The root mean square over the parts, where it is larger than the error on the hold-out set.
+    chained = record_variables(record, result_of(record, names=(), chained=[(3.0, 1.0), (4.0, np.nan)]))
+    np.testing.assert_allclose(chained["predicted_u"], [np.sqrt(12.5), 2.0])
+
+
+def test_a_record_without_drivers_has_a_product_all_the_same():
+    record = plain(drivers={})
+    assert record_variables(record, result_of(record, names=("a",), chained=[]))["driver"].shape == (50, 0)

@@ -1,0 +1,126 @@
+"""The closed loop on a record as a whole: complete models stay, and effects that did not help are withdrawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from fusion.effects.effect import Candidate
+from fusion.loop.closed_loop import open_hold_out
+from fusion.loop.decisions import Reason
+from fusion.loop.state import Confirmed, LoopState, Round, Score, Step
+from fusion.model.fit import Term
+from fusion.record.blocks import reduce_record
+from fusion.record.loop import close_record, without_unrepeated
+from fusion.record.problem import ChainedPart, RecordProblem
+from fusion.twin.machine.recipe import EffectRecipe
+from tests.fusion.record_tables import searched, twin_table
+
+
+def test_a_complete_model_stays_as_it_is():
+    result = close_record(reduce_record(twin_table(seed=44)), ["quasi_static"])
+    assert (result.state.steps, result.verdict) == ((), "complete")
+    told = result.as_json()
+    assert told["rmse_final_um"] == told["rmse_declared_um"]
+    assert {one["effects"] == [] for one in told["chained"]} == {True}
+
+
+def test_an_effect_that_fails_on_the_hold_out_set_is_withdrawn():
+    problem, state = searched(EffectRecipe("periodic_disturbance", 0.6, parameters={"period_min": 37.0}), seed=44)
+    record, rows = problem.record, ~problem.train
+    displacement = record.displacement.copy()
+    displacement[rows] -= (
+        4.0 * np.cos(2 * np.pi * record.seconds[rows] / 2220.0)[:, None]
+    )  # the wave turns against itself
+    turned = RecordProblem(replace(record, displacement=displacement), problem.train, None, np.random.default_rng(1))
+    kept = open_hold_out(turned, state)
+    assert (kept.steps, len(kept.errors_um)) == ((), 1)
+    assert kept.decisions[-1].reason is Reason.HOLD_OUT_ERROR
+    assert kept.blocked()["periodic_disturbance"].startswith("withdrawn: it was found in the training part")
+
+
+def test_an_effect_that_earlier_parts_did_not_bear_out_is_withdrawn():
+    problem, state = searched(EffectRecipe("periodic_disturbance", 0.6, parameters={"period_min": 37.0}), seed=44)
+
+    def part(effects: tuple[str, ...], declared: float, final: float) -> ChainedPart:
+        return ChainedPart(0.0, 1.0, effects, np.array([9.0]), np.array([declared]), np.array([final]))
+
+    name = "periodic_disturbance"
+    helped, hurt, without = part((name,), 2.0, 1.0), part((name,), 1.0, 2.1), part((), 1.0, 1.0)
+    assert without_unrepeated(problem, state, [without]) is state
+    assert without_unrepeated(problem, state, [helped, without]) is state
+    kept = without_unrepeated(problem, state, [helped, hurt, without])
+    assert kept.steps == ()
+    assert "the 2 earlier part(s) of the record" in kept.blocked()[name]
+
+
+COLUMN = Candidate(np.zeros((2, 1)), {}, ("um",))
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model is its terms."""
+
+    terms: tuple[Term, ...]
+
+
+class Refitting:
+    """As much of a record as a withdrawal asks for: a model of what is kept."""
+
+    def refit(self, model: Model, terms: list[Term]) -> Model:
+        return Model(tuple(terms))
+
+
+def added(*names: str, event_s: float | None = None) -> LoopState[Model]:
+    scores = tuple(Score(name, replace(COLUMN, event_s=event_s), family_wise_p=0.004) for name in names)
+    scored = Round(scores)
+    return LoopState(
+        Model(tuple(Term(name, COLUMN) for name in ("quasi_static", *names))),
+        steps=tuple(Step(score, scored, Confirmed.LATER_PARTS) for score in scores),
+        rounds=(scored,),
+    )
+
+
+def part(effects: tuple[str, ...], declared: tuple[float, ...], final: tuple[float, ...]) -> ChainedPart:
+    return ChainedPart(0.0, 1.0, effects, np.ones(len(declared)), np.array(declared), np.array(final))
+
+
+@pytest.mark.parametrize(("final", "kept"), [(0.979, ["a"]), (0.98, [])])
+def test_an_effect_must_have_earned_its_place_where_it_was_tried(final, kept):
+    state = without_unrepeated(Refitting(), added("a"), [part(("a",), (1.0,), (final,)), part((), (9.0,), (9.0,))])
+    assert [step.effect for step in state.steps] == kept
+    if not kept:
+        assert state.decisions[-1].evidence == {"p_value": 0.004, "parts": 1, "without_um": 1.0, "with_um": final}
+        assert [term.effect for term in state.model.terms] == ["quasi_static"]
+
+
+def test_parts_and_channels_count_alike():
+    """Means over channels of 2 and 3 um before, and of 1 and 3.5 um after; a channel that was not measured is left out."""
+    parts = [part(("a",), (1.0, 3.0), (0.5, 1.5)), part(("a",), (3.0, np.nan), (3.5, np.nan))]
+    assert without_unrepeated(Refitting(), added("a"), parts).steps != ()
+    harmed = [parts[0], part(("a",), (3.0, np.nan), (4.1, np.nan))]
+    state = without_unrepeated(Refitting(), added("a"), harmed)
+    assert state.steps == ()
+    assert state.decisions[-1].evidence == {
+        "p_value": 0.004,
+        "parts": 2,
+        "without_um": pytest.approx(2.5),
+        "with_um": pytest.approx(2.55),
+    }
+
+
+def test_effects_are_withdrawn_one_after_the_other_and_the_others_stay():
+    parts = [part(("a", "c"), (1.0,), (2.0,)), part(("b",), (1.0,), (0.5,))]
+    state = without_unrepeated(Refitting(), added("a", "b", "c"), parts)
+    assert [step.effect for step in state.steps] == ["b"]
+    assert [(one.effect, one.reason) for one in state.decisions] == [
+        ("a", Reason.NOT_REPEATED),
+        ("c", Reason.NOT_REPEATED),
+    ]
+
+
+def test_an_event_is_not_judged_by_other_parts():
+    state = added("step_event", event_s=5.0)
+    assert without_unrepeated(Refitting(), state, [part(("step_event",), (1.0,), (2.0,))]) is state

@@ -1,0 +1,119 @@
+"""What a model of a record leaves: rhythms, courses and switchings in its innovations, and slow drifts in the hold-out set."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fusion.record.blocks import Record
+from fusion.record.model import RecordFit, fit_record
+from fusion.record.remainder import RecordRemainder, examine
+from interferometry.drift.gls import drift_system, fit_fixed_effects
+from tests.fusion.record_tables import record_of
+
+BLOCKS = 240
+BLOCK = np.arange(BLOCKS)
+
+
+def record_with(*shapes: np.ndarray, channels: int = 2, load: np.ndarray | None = None) -> Record:
+    noise = np.random.default_rng(11).standard_normal((BLOCKS, channels))
+    displacement = noise + sum(shapes, np.zeros(BLOCKS))[:, None]
+    return record_of(displacement, np.zeros((BLOCKS, 1)), drivers=None if load is None else {"speed": load})
+
+
+def quiet_fit(record: Record) -> RecordFit:
+    """A constant in every channel under a drift that is hardly there, so that innovations are what was put in."""
+    fits, rows = [], []
+    for response in record.displacement.T:
+        here = np.flatnonzero(np.isfinite(response))
+        system = drift_system(record.seconds[here], np.ones((here.size, 1)), order=1, ratios=np.array([1e-12]))
+        fits.append(fit_fixed_effects(system, response[here], np.ones((here.size, 1))))
+        rows.append(here)
+    return RecordFit(record, np.ones(BLOCKS, bool), (), tuple(fits), tuple(rows))
+
+
+def examined(record: Record, *, hold_out_rmse: float = 0.0) -> RecordRemainder:
+    errors = np.full(len(record.channels), hold_out_rmse)
+    return examine(quiet_fit(record), errors, np.random.default_rng(1))
+
+
+def test_noise_leaves_nothing():
+    left = examined(record_with())
+    assert left.shape == "" and left.rms_um == 0.0 and left.p_value > 0.02
+    assert set(left.p_values) == {"course in time", "rhythm", "switching"}
+
+
+def test_a_rhythm_is_told_with_its_period():
+    """Every six blocks of five minutes."""
+    left = examined(record_with(0.5 * np.cos(2.0 * np.pi * BLOCK / 6.0)), hold_out_rmse=0.1)
+    assert left.shape == "a rhythm of about 30 min"
+    assert left.p_value < 0.02 and left.rms_um == pytest.approx(0.1)
+
+
+def test_what_comes_and_goes_within_blocks_is_a_course_in_time():
+    noise = np.random.default_rng(2).standard_normal(BLOCKS + 8)
+    left = examined(record_with(1.0 * np.convolve(noise, np.ones(9), "valid") / 2.0))
+    assert left.shape == "changes that come and go within a few blocks, too quick for the drift"
+
+
+def test_quick_responses_at_switchings_are_told():
+    load = (BLOCK // 24 % 2).astype(float)
+    change = np.flatnonzero(np.diff(load)) + 1
+    kick = np.zeros(BLOCKS)
+    kick[change] = np.random.default_rng(4).choice([-6.0, 6.0], change.size)
+    left = examined(record_with(kick, load=load))
+    assert left.shape == "quick responses where a driver is switched"
+    # Where no driver was logged there is no switching to respond to.
+    assert examined(record_with(kick)).p_values["switching"] == 1.0
+
+
+def test_a_drift_that_nothing_follows_counts_from_a_tenth_of_the_variance():
+    record = record_with()
+    variance = float(np.mean(record.displacement.var(axis=0)))
+    below, above = (examined(record, hold_out_rmse=np.sqrt(share * variance)) for share in (0.099, 0.101))
+    assert below.shape == ""
+    assert above.shape == "a slow drift that neither temperatures nor drivers follow, largest in all channels alike"
+    assert above.rms_um == pytest.approx(np.sqrt(0.101 * variance))
+    np.testing.assert_allclose(above.variance_share, 0.101 * variance / record.displacement.var(axis=0))
+
+
+@pytest.mark.parametrize(
+    ("errors", "words"),
+    [
+        ((1.0, 0.71, 0.1), "ch1, ch2"),
+        ((1.0, 0.69, 0.1), "ch1"),
+        ((1.0, 0.9, 0.8), "all channels alike"),
+        ((1.0, np.nan, 0.8), "ch1, ch3"),
+    ],
+)
+def test_the_channels_with_the_larger_errors_are_named(errors, words):
+    left = examine(quiet_fit(record_with(channels=3)), np.array(errors), np.random.default_rng(1))
+    assert left.shape.endswith(f"largest in {words}")
+    assert left.rms_um == pytest.approx(np.nanmean(errors))
+
+
+def test_a_single_channel_is_named():
+    left = examine(quiet_fit(record_with(channels=1)), np.array([1.0]), np.random.default_rng(1))
+    assert left.shape.endswith("largest in ch1")
+
+
+def test_both_remainders_are_told():
+    left = examined(record_with(0.5 * np.cos(2.0 * np.pi * BLOCK / 6.0)), hold_out_rmse=2.0)
+    assert left.shape.startswith("a rhythm of about 30 min and a slow drift")
+
+
+def test_one_wild_block_makes_no_shape():
+    wild = np.zeros(BLOCKS)
+    wild[100] = 500.0
+    assert examined(record_with(wild)).shape == ""
+
+
+def test_blocks_without_a_value_are_no_shape(rng):
+    record = record_with(0.5 * np.cos(2.0 * np.pi * BLOCK / 6.0))
+    holed = record.displacement.copy()
+    holed[50:60, 0] = np.nan
+    assert examined(replace(record, displacement=holed)).shape == "a rhythm of about 30 min"
+    model = fit_record(record, [], np.ones(BLOCKS, bool))
+    assert examine(model, np.zeros(2), rng).p_values["rhythm"] < 0.02
