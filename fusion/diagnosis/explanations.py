@@ -471,7 +471,7 @@ def warm_up_share(seconds: Array, temperature: Array) -> float:
     Returns
     -------
     float
-        Coefficient of determination, 0..1; time constants as in :data:`fusion.attribution.warm_up.WARM_UP_CONSTANTS_S`.
+        Coefficient of determination, 0..1; time constants as in :data:`fusion.attribution.warm_up._WARM_UP_CONSTANTS_S`.
     """
     trend = (seconds - seconds.mean()) / np.ptp(seconds)
     design = np.column_stack([np.ones_like(seconds), trend, warm_up_columns(seconds)])

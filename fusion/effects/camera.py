@@ -58,6 +58,8 @@ CAMERA_OFFSET = Effect(
     source="uniform jump of the field without a jump of the readings",
     candidates=_camera_offset,
     needs=_needs_jump,
+    repeats=True,
+    errs_camera=True,
     label="jump of the camera's zero",
     remedy="Let the camera warm up and watch its flat-field corrections; the fields before and after the jump differ.",
 )
@@ -67,6 +69,7 @@ REFLECTED_SOURCE = Effect(
     source="reflection of (1 - emissivity) of the surroundings",
     candidates=_reflected_source,
     needs=_needs_patch,
+    errs_camera=True,
     label="reflection in the thermogram",
     remedy="Shield the reflecting source, or paint the reflecting part.",
 )

@@ -87,6 +87,14 @@ class Effect:
     declarable : bool
         Whether ``[model] declared`` may name it: it has exactly one candidate, whatever the readings and without a fitted model. A user's
         own effect that keeps this promise says so; it is not guessed, because the campaign file is checked before any reading.
+    repeats : bool
+        Whether it may be present more than once.
+    patterned : bool
+        Whether it is told by nothing but its pattern along the axis.
+    errs_camera : bool
+        Whether it is an error of the camera: it makes the field wrong, not the drift.
+    limitation : callable
+        ``limitation(readings)`` says what these readings hide of it, or returns an empty text.
     label : str
         Its name in words; by default the name with spaces.
     remedy : str
@@ -114,6 +122,10 @@ class Effect:
     excited_by: str = ""
     prior: Prior | None = None
     declarable: bool = False
+    repeats: bool = False
+    patterned: bool = False
+    errs_camera: bool = False
+    limitation: Callable[[Readings], str] = field(default=lambda readings: "")
     label: str = ""
     remedy: str = ""
 

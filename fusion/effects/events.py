@@ -92,6 +92,7 @@ STEP_EVENT = Effect(
     physics="A mount, clamp or optic slips once: all readings after that instant are shifted.",
     source="level shift at one instant",
     candidates=_step_event,
+    repeats=True,
     label="sudden step",
     remedy="Look at the clamping of optics and laser head, and at what happened at that time.",
 )
@@ -100,6 +101,7 @@ PERIODIC_DISTURBANCE = Effect(
     physics="Cooling, coolant or air conditioning switches in a fixed rhythm.",
     source="line in the spectrum of the readings' own times",
     candidates=_periodic_disturbance,
+    repeats=True,
     label="periodic disturbance",
     remedy="Compare its period with coolant, hydraulics and air conditioning.",
 )

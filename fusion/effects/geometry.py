@@ -104,11 +104,18 @@ def _pitch_error(readings: Readings, _: Mapping[str, float], near: Candidate | N
             yield Candidate(waves * state[:, None], parameters, (unit_of_state(readings, followed),) * 2)
 
 
+def _hidden_leads(readings: Readings) -> str:
+    """Leads of which evenly spaced targets see one phase only, in words."""
+    hidden = hidden_leads_mm(readings)
+    return f"evenly spaced targets hide leads of {hidden}; space them unevenly to see all" if hidden else ""
+
+
 ANGULAR_GROWTH = Effect(
     name="angular_growth",
     physics="Guide or table bends as it warms; the Abbe offset turns the growing angle into an error that is quadratic along the axis.",
     source="Abbe principle, Bryan 1979: 1 arcsec x 100 mm = 0.48 um",
     candidates=_angular_growth,
+    patterned=True,
     label="growing pitch or yaw of the axis",
     remedy="Measure pitch and yaw while the machine warms up; keep the Abbe offset short.",
 )
@@ -118,6 +125,7 @@ REVERSAL_DRIFT = Effect(
     source="ISO 230-2, reversal value B",
     candidates=_reversal_drift,
     needs=_needs_both_directions,
+    patterned=True,
     label="reversal that changes with time",
     remedy="Check screw preload, gibs and the scale's coupling; measure the reversal warm and cold.",
 )
@@ -126,6 +134,8 @@ PITCH_ERROR = Effect(
     physics="The cyclic error of the screw changes as it warms: a wave along the axis whose size follows a thermal state.",
     source="periodic error of the lead; aliased where the spacing is a multiple of the lead",
     candidates=_pitch_error,
+    patterned=True,
+    limitation=_hidden_leads,
     label="pitch error of the screw",
     remedy="Repeat with a target spacing that is no multiple of the screw's lead.",
 )

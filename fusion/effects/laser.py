@@ -120,6 +120,7 @@ SENSOR_FAULT = Effect(
     source="jump or frozen value in the environment log",
     candidates=_sensor_fault,
     needs=_needs_sensor_episode,
+    repeats=True,
     label="faulty sensor",
     remedy="Check the sensor named, and its cable and time stamps.",
 )

@@ -24,7 +24,6 @@ from fusion.loop.admissibility import AxisGrounds, refuse
 from fusion.loop.axis_pattern import wrong_patterns
 from fusion.loop.closed_loop import (
     HOLD_OUT_SHARE,
-    MAY_REPEAT,
     MOST_EFFECTS,
     MOST_EVENTS,
     Progress,
@@ -147,13 +146,11 @@ class AxisProblem:
         self, readings: Readings, used: NDArray[np.bool_], effects: Mapping[str, Effect], rng: np.random.Generator
     ) -> None:
         self.readings, self.used, self.effects, self.rng = readings, used, effects, rng
-        # The same few models are asked for again and again: before and after an effect, with it and without it.
-        self._trained: dict[tuple[int, ...], ModelFit] = {}
 
     def start(self, declared: Sequence[Term]) -> AxisState:
         """The state before the search: the declared model, and the effects that these readings cannot show."""
         missing = {name: effect.needs(self.readings) for name, effect in self.effects.items()}
-        return AxisState(self._train(declared)).decide(
+        return AxisState(fit_model(self.readings, declared, used=self.used)).decide(
             *(
                 Decision(name, Reason.NOT_AVAILABLE, {"because": because})
                 for name, because in missing.items()
@@ -163,14 +160,7 @@ class AxisProblem:
 
     def refit(self, model: ModelFit, terms: Sequence[Term]) -> ModelFit:
         """Fit other terms to the readings that a model was fitted to."""
-        return self._train(terms) if model.used is self.used else fit_model(self.readings, terms, used=model.used)
-
-    def _train(self, terms: Sequence[Term]) -> ModelFit:
-        """Fit terms to the training part, once; the models keep their terms, so that these identify them."""
-        key = tuple(id(term) for term in terms)
-        if key not in self._trained:
-            self._trained[key] = fit_model(self.readings, terms, used=self.used)
-        return self._trained[key]
+        return fit_model(self.readings, terms, used=model.used)
 
     def score(self, state: AxisState) -> Round:
         """Score the library; effects worth it are looked at more closely before they are compared, and are confirmed."""
@@ -216,7 +206,7 @@ class AxisProblem:
     def hold_out_error(self, terms: Sequence[Term]) -> float:
         """Open-loop error on the hold-out cycles, um; an event among them is sized on one half of the targets, tested on the other."""
         if not any(self.is_late(term) for term in terms):
-            return rmse(self._train(terms).open_loop_errors()[0])
+            return rmse(fit_model(self.readings, terms, used=self.used).open_loop_errors()[0])
         half = self.readings.target_index % 2 == 0
         parts = [fit_model(self.readings, terms, used=self.used | fitted) for fitted in (half, ~half)]
         return rmse(np.concatenate([part.open_loop_errors()[0] for part in parts]))
@@ -262,7 +252,8 @@ class AxisProblem:
     def _families(self, state: AxisState) -> tuple[Families, list[Decision]]:
         """Candidates of every effect that can be tried beside the model, those without any left out."""
         model, not_tried = state.model, state.not_tried()
-        present = {term.effect for term in model.terms} - MAY_REPEAT
+        repeating = {name for name, effect in self.effects.items() if effect.repeats}
+        present = {term.effect for term in model.terms} - repeating
         # One event happens once, however its column was weighed when it was found.
         happened = {(term.effect, term.candidate.event_s) for term in model.terms if term.candidate.event_s is not None}
 
@@ -388,7 +379,7 @@ def keep_right_patterns(problem: AxisProblem, state: AxisState) -> AxisState:
     problem : the campaign
     state : with a model fitted to all readings and the hold-out errors of its steps
     """
-    wrong = wrong_patterns(state.model, state.added)
+    wrong = wrong_patterns(state.model, state.added, problem.effects)
     if not wrong:
         return state
     first = min(wrong)

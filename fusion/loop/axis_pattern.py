@@ -7,13 +7,14 @@ held against a free one: the same course in time, with a size of its own at ever
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
 from scipy import stats
 
 from fusion._typing import Array
+from fusion.effects.effect import Effect
 from fusion.loop.decisions import Decision, Reason
 from fusion.model.fit import ModelFit, Term
 from fusion.model.least_squares import residual_squares
@@ -22,11 +23,9 @@ from fusion.model.least_squares import residual_squares
 LEVEL = 1e-3
 #: Share of a column that must lie outside the model for a site to have a say.
 _SEPARABLE = 1e-6
-#: Effects that have nothing but their pattern to be told by.
-_PATTERNED = frozenset({"angular_growth", "pitch_error", "reversal_drift"})
 
 
-def wrong_patterns(model: ModelFit, terms: Sequence[Term]) -> dict[int, Decision]:
+def wrong_patterns(model: ModelFit, terms: Sequence[Term], effects: Mapping[str, Effect]) -> dict[int, Decision]:
     """Decide which terms do not act along the axis as their physics says.
 
     An effect is wrong where a free pattern fits its course in time better; and two patterns of which one course would do are more likely
@@ -36,6 +35,7 @@ def wrong_patterns(model: ModelFit, terms: Sequence[Term]) -> dict[int, Decision
     ----------
     model : fitted to the readings
     terms : the added terms of the model
+    effects : the library by name
 
     Returns
     -------
@@ -48,7 +48,8 @@ def wrong_patterns(model: ModelFit, terms: Sequence[Term]) -> dict[int, Decision
         p_value = pattern_p_value(model, terms[k])
         if p_value < LEVEL:
             wrong[k] = Decision(terms[k].effect, Reason.WRONG_PATTERN, {"p_value": p_value})
-    patterned = [k for k in courses if terms[k].effect in _PATTERNED]
+    told_by_pattern = {name for name, effect in effects.items() if effect.patterned}
+    patterned = [k for k in courses if terms[k].effect in told_by_pattern]
     for first, second in combinations(patterned, 2):
         if _one_pattern(model, (terms[first], terms[second]), (courses[first], courses[second])):
             names = {"first": terms[first].effect, "second": terms[second].effect}

@@ -1,4 +1,4 @@
-"""Fields put right: where the loop finds that the camera erred, the error is taken out of the fields and all is computed again.
+"""Correction of the fields: errors of the camera that the loop found are taken out of the fields, and all is computed again.
 
 A step of the camera's zero is uniform from one frame on; a reflection is a patch that switches. Both were found as what they do to the
 prediction of the drift; here they become what is to be added to every cell of every frame. The field itself shows their size far more
@@ -15,15 +15,15 @@ import xarray as xr
 from fusion._typing import Array
 from fusion.alignment.align import cycle_bounds
 from fusion.alignment.reflection_patch import find_switching_patch
+from fusion.effects.camera import CAMERA_OFFSET, REFLECTED_SOURCE
 from fusion.loop.result import LoopResult
-from fusion.model.fit import CAMERA_ERRORS
 
 #: Standard uncertainties within which the sizes from the drift and from the field agree.
 _AGREEMENT = 3.0
 
 
 @dataclass(frozen=True)
-class FieldError:
+class FieldFault:
     """One error of the camera, as the loop found it.
 
     Attributes
@@ -53,7 +53,7 @@ class FieldError:
         }
 
 
-def find_field_errors(result: LoopResult, fields: xr.Dataset, fused: xr.Dataset) -> list[FieldError]:
+def find_field_errors(result: LoopResult, fields: xr.Dataset, fused: xr.Dataset) -> list[FieldFault]:
     """Return every error of the camera that entered the model, with the correction of the frames.
 
     Parameters
@@ -67,10 +67,10 @@ def find_field_errors(result: LoopResult, fields: xr.Dataset, fused: xr.Dataset)
     start = _start(fused)
     frame_cycle = _cycle_of(time, fused)
     for step in result.steps:
-        if step.effect not in CAMERA_ERRORS:
+        if step.effect not in (CAMERA_OFFSET.name, REFLECTED_SOURCE.name):
             continue
         size, u = float(step.coefficients[0]["value"]), float(step.coefficients[0]["u"])
-        if step.effect == "camera_offset":
+        if step.effect == CAMERA_OFFSET.name:
             size = _agreed(size, u, float(step.parameters["jump_of_the_field_K"]))
             # A microsecond of slack: the instant went through seconds in floating point.
             late = (time - start) / np.timedelta64(1, "s") >= float(step.parameters["time_s"]) - 1e-6
@@ -91,7 +91,7 @@ def find_field_errors(result: LoopResult, fields: xr.Dataset, fused: xr.Dataset)
         touched = np.flatnonzero(np.abs(error).max(axis=(1, 2)) > 0.0)
         first = int(frame_cycle[touched[0]]) if touched.size else int(frame_cycle[-1])
         errors.append(
-            FieldError(step.effect, f"{text} from cycle {first} on", size, u, first, -np.asarray(error, float))
+            FieldFault(step.effect, f"{text} from cycle {first} on", size, u, first, -np.asarray(error, float))
         )
     return errors
 
@@ -101,7 +101,7 @@ def _agreed(fitted: float, u: float, seen: float) -> float:
     return seen if abs(seen - fitted) <= _AGREEMENT * u else fitted
 
 
-def correct_fields(fields: xr.Dataset, errors: list[FieldError]) -> xr.Dataset:
+def correct_fields(fields: xr.Dataset, errors: list[FieldFault]) -> xr.Dataset:
     """Take the camera's errors out of every frame.
 
     Parameters
@@ -119,7 +119,7 @@ def correct_fields(fields: xr.Dataset, errors: list[FieldError]) -> xr.Dataset:
     return fields.assign(frame_temperature=frames.copy(data=frames.values + total))
 
 
-def corrected_variables(fields: xr.Dataset, fused: xr.Dataset, errors: list[FieldError]) -> dict[str, xr.Variable]:
+def corrected_variables(fields: xr.Dataset, fused: xr.Dataset, errors: list[FieldFault]) -> dict[str, xr.Variable]:
     """Corrected fields per cycle and the correction of every frame, for fusion.nc.
 
     Parameters

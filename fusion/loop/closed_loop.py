@@ -24,8 +24,6 @@ MOST_EFFECTS = 4
 MOST_EVENTS = 2
 #: An effect whose absence costs less log-likelihood than this is superfluous.
 SUPERFLUOUS_GAIN = 2.0
-#: Effects that may be present more than once.
-MAY_REPEAT = frozenset({"step_event", "camera_offset", "sensor_fault", "periodic_disturbance"})
 
 Progress = Callable[[int, int, str], None]
 
@@ -121,25 +119,45 @@ def choose(
     state : with the decisions about effects that were passed over
     score : of the chosen effect, None where there is none
     """
-    strongest = -np.inf
+    unconfirmed: Score | None = None
     for score in state.rounds[-1].scores:
         limit = problem.entry_level(score) if level is None else level
         if score.candidate is None or score.family_wise_p > limit or state.is_withdrawn(score.name):
             continue
-        # Where a stronger effect could not be confirmed, a much weaker one only stands in for it.
-        if score.excess < strongest - TIE_GAIN:
-            break
         refusal = problem.refuse(score, state.model)
         if refusal is not None:
             state = state.decide(refusal)
+            continue
+        # Where a stronger effect could not be confirmed, a much weaker one only stands in for it.
+        if unconfirmed is not None and score.excess < unconfirmed.excess - TIE_GAIN:
+            evidence: dict[str, float | str] = {"p_value": score.family_wise_p, "stronger": unconfirmed.name}
+            state = state.decide(Decision(score.name, Reason.STANDS_IN, evidence))
             continue
         score = problem.confirm(score, state)
         state = state.rescored(score)
         if score.confirmation is not None and score.confirmation.passed:
             return state, score
-        state = state.decide(Decision(score.name, Reason.NOT_CONFIRMED, {"p_value": score.family_wise_p}))
-        strongest = max(strongest, score.excess)
+        state = state.decide(not_confirmed(score, state.rounds[-1]))
+        if unconfirmed is None or score.excess > unconfirmed.excess:
+            unconfirmed = score
     return state, None
+
+
+def not_confirmed(score: Score, scored: Round) -> Decision:
+    """The decision about a significant effect that was not confirmed.
+
+    Parameters
+    ----------
+    score : Score
+        Of the effect, with its confirmation.
+    scored : Round
+        The round in which it was tried.
+    """
+    after_um = score.confirmation.error_um if score.confirmation is not None else np.nan
+    if np.isfinite(after_um):
+        evidence = {"p_value": score.family_wise_p, "before_um": scored.start_error_um, "after_um": after_um}
+        return Decision(score.name, Reason.NOT_PREDICTED, evidence)
+    return Decision(score.name, Reason.NOT_CONFIRMED, {"p_value": score.family_wise_p})
 
 
 def enter(problem: Problem[M], state: LoopState[M], score: Score) -> LoopState[M]:

@@ -26,6 +26,8 @@ class Reason(StrEnum):
     FOLLOWS_RATE = "follows the rate"
     SMOOTHING = "smoothing"
     NOT_CONFIRMED = "not confirmed"
+    NOT_PREDICTED = "later parts not predicted better"
+    STANDS_IN = "weaker than an unconfirmed effect"
     #: In the model for a while, and taken out again.
     SUPERFLUOUS = "superfluous"
     TOO_MANY_EVENTS = "too many events"
@@ -39,7 +41,7 @@ class Reason(StrEnum):
 
 NOT_TRIED = frozenset({Reason.NOT_AVAILABLE, Reason.NOT_COMPUTABLE})
 #: Decisions that say nothing against an effect: it is in, the data did not decide, or a later effect does its work.
-_NEUTRAL = frozenset({Reason.ENTERED, Reason.NOT_CONFIRMED, Reason.SUPERFLUOUS})
+_NEUTRAL = frozenset({Reason.ENTERED, Reason.NOT_CONFIRMED, Reason.NOT_PREDICTED, Reason.SUPERFLUOUS})
 #: Reasons against the name of an effect.
 BLOCKING = frozenset(Reason) - NOT_TRIED - _NEUTRAL
 #: Reasons that keep an effect out for the rest of the search. A hold-out error does not: with all readings in view the time constant
@@ -84,6 +86,13 @@ _SENTENCES: Mapping[Reason, str] = {
         "denoising, not from a lag"
     ),
     Reason.NOT_CONFIRMED: "significant (p = {p_value:.2g}), but not confirmed on readings that its coefficients were not fitted to",
+    Reason.NOT_PREDICTED: (
+        "significant (p = {p_value:.2g}), but the later parts of the training time are predicted no better with it ({before_um:.3g} to "
+        "{after_um:.3g} µm)"
+    ),
+    Reason.STANDS_IN: (
+        "significant (p = {p_value:.2g}), but much weaker than {stronger}, which is not confirmed: it explains a part of the same"
+    ),
     Reason.SUPERFLUOUS: "removed: an effect added later explains the same (log-likelihood lost without it: {loss:.1f})",
     Reason.TOO_MANY_EVENTS: "more than {most} events would be needed: that is a switching, for which the library has no name",
     Reason.HOLD_OUT_ERROR: (

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from fusion._typing import Array
 from fusion.effects.effect import Candidate, Effect
-from fusion.effects.geometry import hidden_leads_mm
 from fusion.loop.admissibility import WARM_UP_SHARE, warm_up_share
 from fusion.loop.confirmation import CandidateScorer
 from fusion.loop.state import DetectionLimit, Score
@@ -156,8 +155,4 @@ def _note(effect: Effect, candidate: Candidate, model: ModelFit, seen: int) -> s
     on_used = candidate.on(model.used)
     if effect.excited_by and warm_up_share(part, on_used) > WARM_UP_SHARE:
         return "one warm-up is all that excites it; switch the load on purpose to tell it from others"
-    if effect.name == "pitch_error":
-        hidden = hidden_leads_mm(part)
-        if hidden:
-            return f"evenly spaced targets hide leads of {hidden}; space them unevenly to see all"
-    return ""
+    return effect.limitation(part)

@@ -1,4 +1,4 @@
-"""A model of the drift: static profile, named terms, and the drift that nobody explains, fitted to readings.
+"""A model of the drift: static profile, named terms, and the unexplained drift, fitted to readings.
 
 Terms that depend on more than the readings: on the model's other coefficients, or on fields that have been put right since.
 """
@@ -263,8 +263,7 @@ def _site_variance(readings: Readings, fit: DriftFit) -> Array:
     return relative / np.mean(relative)
 
 
-#: Effects that make the field wrong, not the drift; and how often their size and the declared coefficients are fitted in turn.
-CAMERA_ERRORS = frozenset({"camera_offset", "reflected_source"})
+#: How often errors of the camera and the declared coefficients are sized in turn.
 _SETTLING_ROUNDS = 2
 
 
@@ -283,12 +282,13 @@ def settled(model: ModelFit, effects: Mapping[str, Effect]) -> ModelFit:
     ModelFit
         The same model where no term is an error of the camera.
     """
-    if not any(term.effect in CAMERA_ERRORS for term in model.terms):
+    camera_errors = {name for name, effect in effects.items() if effect.errs_camera}
+    if not any(term.effect in camera_errors for term in model.terms):
         return model
     for _ in range(_SETTLING_ROUNDS):
         known = model.coefficients()
         terms = [
-            again(term, model.readings, known, effects) if term.effect in CAMERA_ERRORS else term
+            again(term, model.readings, known, effects) if term.effect in camera_errors else term
             for term in model.terms
         ]
         model = fit_model(model.readings, terms, used=model.used)

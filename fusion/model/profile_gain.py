@@ -58,7 +58,8 @@ def profile_gains(
     -------
     ProfileGains
         Candidates in the order in which the groups number them. Columns of a candidate that may be present without the effect
-        (:attr:`Candidate.beside`) are part of the model it is held against, at the price of one unit of log-likelihood each.
+        (:attr:`fusion.effects.effect.Candidate.beside`) are part of the model it is held against, at the price of one unit of
+        log-likelihood each.
     """
     n, count = responses.shape
     size = sum(group.places.size for group in groups)

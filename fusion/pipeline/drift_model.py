@@ -16,7 +16,7 @@ from fusion.effects.effect import Effect, Prior
 from fusion.effects.library import library
 from fusion.effects.thermal import EXPANSION_U_PPM_PER_K
 from fusion.loop.axis import close_loop, on_corrected_fields, set_aside_sites
-from fusion.loop.camera_correction import FieldError, correct_fields, corrected_variables, find_field_errors
+from fusion.loop.camera_correction import FieldFault, correct_fields, corrected_variables, find_field_errors
 from fusion.loop.result import LoopResult
 from fusion.model.fit import ModelFit, fit_model
 from fusion.pipeline.positions import judge_positions, sites_of
@@ -30,7 +30,7 @@ from fusion.products.results import Notice, Outcome
 class CorrectedCamera:
     """Errors of the camera that the loop found, and both recordings aligned again on fields without them."""
 
-    errors: list[FieldError]
+    errors: list[FieldFault]
     fused: xr.Dataset
 
 
@@ -182,7 +182,7 @@ def library_for(source: Source) -> dict[str, Effect]:
     return {**effects, "axis_expansion": replace(effects["axis_expansion"], prior=expected)}
 
 
-def field_notices(errors: Sequence[FieldError]) -> list[Notice]:
+def field_notices(errors: Sequence[FieldFault]) -> list[Notice]:
     """Notices of camera errors that were taken out of the fields.
 
     Parameters

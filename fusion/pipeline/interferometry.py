@@ -1,4 +1,4 @@
-"""The stages after the thermal one: deviations evaluated, both recordings joined, correlated, modelled."""
+"""The stage that evaluates the readings, and the alignment of both recordings."""
 
 from __future__ import annotations
 

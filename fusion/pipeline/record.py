@@ -1,4 +1,4 @@
-"""The main job on a record: read, reduced to blocks, its loop closed, described for results.json and report."""
+"""The stage of a record: read, reduced to blocks, its loop closed, described for results.json and report."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""L3, L4 - A record of sensors and channels over hours instead of a positioning test: the same effects, the same loop.
+"""A record of temperature sensors and displacement channels over hours: the same effects and the same closed loop (level 4).
 
-Read it in the order of the work: `blocks` (samples averaged), `effects` (what may be missing), `model` (tested under a drift of its own),
-`prediction` (shrunken coefficients, hours ahead), `gates` (reasons not to name), `search`, `remainder` (what is left), `loop`.
+In the order of the work: `blocks` (samples averaged), `hold_out`, `effects` (candidates), `model` (every channel under its own drift),
+`prediction` (shrunken coefficients, hours ahead), `grounds` (admissibility), `problem` (what the loop asks), `loop`, `remainder`, `result`.
 """

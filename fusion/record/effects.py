@@ -46,13 +46,14 @@ class RecordEffect:
     candidates : from the record (and a candidate near which to look closer) to columns (blocks, q) that every channel follows with its
         own coefficients
     needs : why it cannot be tried with this record, or None
-    excited_by : as in the library
+    excited_by, repeats : as in the library
     """
 
     name: str
     candidates: Callable[[Record, Candidate | None], Iterator[Candidate]]
     needs: Callable[[Record], str | None]
     excited_by: str = ""
+    repeats: bool = False
 
 
 def _thermal_lag(record: Record, near: Candidate | None) -> Iterator[Candidate]:
@@ -202,11 +203,11 @@ def record_library(effects: Mapping[str, Effect] | None = None) -> tuple[dict[st
     adapted, not_tried = {}, {}
     for name, effect in (library() if effects is None else effects).items():
         if name in _CANDIDATES:
-            adapted[name] = RecordEffect(name, _CANDIDATES[name], _needs(name), effect.excited_by)
+            adapted[name] = RecordEffect(name, _CANDIDATES[name], _needs(name), effect.excited_by, effect.repeats)
         elif name in built_in:
             not_tried[name] = _ALONG_AN_AXIS
         else:
-            adapted[name] = RecordEffect(name, _as_it_is(effect), _own_needs(effect), effect.excited_by)
+            adapted[name] = RecordEffect(name, _as_it_is(effect), _own_needs(effect), effect.excited_by, effect.repeats)
     return adapted, not_tried
 
 

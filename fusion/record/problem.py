@@ -18,7 +18,7 @@ from fusion._typing import Array
 from fusion.effects.effect import Candidate, Effect
 from fusion.effects.library import LIBRARY
 from fusion.loop.admissibility import refuse
-from fusion.loop.closed_loop import MAY_REPEAT, Progress, no_progress, search
+from fusion.loop.closed_loop import Progress, no_progress, search
 from fusion.loop.decisions import Decision, Reason
 from fusion.loop.scoring import Families, collect_candidates, of_same_kind, refine, score_effects
 from fusion.loop.state import Confirmation, Confirmed, LoopState, Round, Score
@@ -127,7 +127,8 @@ class RecordProblem:
     def _families(self, state: RecordState) -> tuple[Families, list[Decision]]:
         """Candidates of every effect that can be tried beside the model and that vary over the training part."""
         not_tried = state.not_tried()
-        present = {term.effect for term in state.model.terms} - MAY_REPEAT
+        repeating = {name for name, effect in self.effects.items() if effect.repeats}
+        present = {term.effect for term in state.model.terms} - repeating
         offers = {
             name: partial(self._offer, name, None)
             for name in self.effects

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.loop.closed_loop import verdict
-from fusion.loop.decisions import Decision, Reason
+from fusion.loop.closed_loop import not_confirmed, verdict
 from fusion.loop.state import Round, Step, rivals
 from fusion.model.fit import Term, place_of
 from fusion.record.blocks import Record
@@ -149,15 +148,7 @@ def _error_after(step: Step) -> float:
 def _rejected(scored: Round) -> dict[str, str]:
     """Effects of a round that were significant and not confirmed, with the reason in words."""
     return {
-        score.name: Decision(
-            score.name,
-            Reason.NOT_CONFIRMED,
-            {
-                "p_value": score.family_wise_p,
-                "before_um": scored.start_error_um,
-                "after_um": score.confirmation.error_um,
-            },
-        ).sentence
+        score.name: not_confirmed(score, scored).sentence
         for score in scored.scores
         if score.confirmation is not None and not score.confirmation.passed
     }

@@ -388,15 +388,14 @@ def test_an_event_is_late_from_one_cycle_before_the_hold_out_set_on(event_s, lat
     assert bool(problem_of().is_late(term(LATE, event_s=event_s))) is late
 
 
-def test_models_of_the_training_part_are_fitted_once():
+def test_models_are_fitted_again_to_the_readings_of_the_model_before():
     problem = problem_of(WAVE)
     declared = [term(WAVE)]
     state = problem.start(declared)
-    assert problem.refit(state.model, declared) is state.model
-    assert problem.refit(state.model, []) is not state.model
+    np.testing.assert_array_equal(state.model.used, USED)
+    np.testing.assert_array_equal(problem.refit(state.model, []).used, USED)
     whole = axis.fit_model(problem.readings, declared)
     assert problem.refit(whole, declared).used.all()
-    np.testing.assert_array_equal(state.model.used, USED)
 
 
 def test_effects_that_cannot_be_tried_are_decided_at_the_start():
@@ -447,7 +446,7 @@ def test_what_was_found_after_a_wrong_pattern_goes_with_it(monkeypatch):
     state = state_of(problem, "a", "b", "c")
     asked = []
 
-    def second_is_wrong(model, terms):
+    def second_is_wrong(model, terms, effects):
         asked.append([one.effect for one in terms])
         return {1: Decision("b", Reason.WRONG_PATTERN, {"p_value": 1e-5})} if len(terms) == 3 else {}
 
@@ -465,7 +464,7 @@ def test_what_was_found_after_a_wrong_pattern_goes_with_it(monkeypatch):
 
 
 def test_right_patterns_leave_the_state_as_it_is(monkeypatch):
-    monkeypatch.setattr(axis, "wrong_patterns", lambda model, terms: {})
+    monkeypatch.setattr(axis, "wrong_patterns", lambda model, terms, effects: {})
     state = state_of(problem_of(), "a")
     assert keep_right_patterns(problem_of(), state) is state
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from fusion.effects.library import library
 from fusion.loop.axis_pattern import LEVEL, pattern_p_value, wrong_patterns
 from fusion.loop.decisions import Reason
 from fusion.model.fit import ModelFit
@@ -48,7 +49,7 @@ def test_a_stretch_that_differs_by_direction_is_no_reversal():
     """The nearest effect of the library is found, but its pattern is the wrong one."""
     seen = COURSE * BARE.share * BARE.sign
     model = fitted(seen, ("reversal_drift", REVERSAL))
-    ((place, decision),) = wrong_patterns(model, model.terms).items()
+    ((place, decision),) = wrong_patterns(model, model.terms, library()).items()
     assert (place, decision.effect, decision.reason) == (0, "reversal_drift", Reason.WRONG_PATTERN)
     assert decision.evidence["p_value"] == pattern_p_value(model, model.terms[0]) < LEVEL
 
@@ -71,14 +72,14 @@ def test_one_target_of_its_own_does_not_make_a_pattern_wrong(seed):
     model = fitted(BENDING + odd, ("angular_growth", BENDING), seed=seed)
     # Thirteen sizes beside the term's own: with that target the pattern would be wrong.
     assert stats.chi2.sf(free_statistic(model), 13) < LEVEL
-    assert wrong_patterns(model, model.terms) == {}
+    assert wrong_patterns(model, model.terms, library()) == {}
     assert 0.01 < pattern_p_value(model, model.terms[0]) < 0.99
 
 
 def test_two_targets_of_their_own_make_a_pattern_wrong():
     odd = COURSE * np.select([BARE.target == 3, BARE.target == 6], [0.2, -0.2], 0.0)
     model = fitted(BENDING + odd, ("angular_growth", BENDING))
-    assert wrong_patterns(model, model.terms)[0].reason is Reason.WRONG_PATTERN
+    assert wrong_patterns(model, model.terms, library())[0].reason is Reason.WRONG_PATTERN
     # What is left of the statistic without the largest target is referred to two degrees of freedom fewer.
     statistic = free_statistic(model)
     assert stats.chi2.sf(statistic, 11) < pattern_p_value(model, model.terms[0]) < stats.chi2.sf(0.25 * statistic, 11)
@@ -88,14 +89,14 @@ def test_an_event_has_no_pattern_to_be_tested():
     late = (BARE.seconds > 3000.0) * BARE.share
     readings = replace(BARE, response=np.where(BARE.target == 2, 5.0, 0.0) * (BARE.seconds > 3000.0))
     model = model_of(readings, [term(late, "step_event", event_s=3000.0)], ratios=QUIET)
-    assert wrong_patterns(model, model.terms) == {}
+    assert wrong_patterns(model, model.terms, library()) == {}
 
 
 def test_two_patterns_with_one_course_are_one_pattern_without_a_name():
     """A bending and a reversal with the same course, sized so that together they come close to a stretch of one direction."""
     seen = COURSE * BARE.share**2 * (BARE.sign > 0)
     model = fitted(seen, ("angular_growth", BENDING), ("reversal_drift", REVERSAL))
-    wrong = wrong_patterns(model, model.terms)
+    wrong = wrong_patterns(model, model.terms, library())
     assert [wrong[place].reason for place in (0, 1)] == [Reason.SHARED_PATTERN] * 2
     assert wrong[0].evidence == {"first": "angular_growth", "second": "reversal_drift"}
 
@@ -103,14 +104,14 @@ def test_two_patterns_with_one_course_are_one_pattern_without_a_name():
 def test_two_patterns_with_courses_of_their_own_keep_their_names():
     other = OTHER_COURSE * 0.5 * BARE.sign
     model = fitted(BENDING + other, ("angular_growth", BENDING), ("reversal_drift", other))
-    assert wrong_patterns(model, model.terms) == {}
+    assert wrong_patterns(model, model.terms, library()) == {}
 
 
 def test_an_effect_with_a_course_of_its_own_physics_shares_no_pattern():
     """A dead path is told by the index of air, not by its pattern, so that one common course is no objection."""
     flat = COURSE.copy()
     model = fitted(flat + REVERSAL, ("dead_path", flat), ("reversal_drift", REVERSAL))
-    assert wrong_patterns(model, model.terms) == {}
+    assert wrong_patterns(model, model.terms, library()) == {}
 
 
 @pytest.mark.parametrize("size", [3.0, -3.0])

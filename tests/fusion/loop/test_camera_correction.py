@@ -11,7 +11,7 @@ import xarray as xr
 from fusion.alignment.align import AxisGeometry, align
 from fusion.alignment.readings import read_fused
 from fusion.loop.axis import close_loop, on_corrected_fields
-from fusion.loop.camera_correction import FieldError, correct_fields, corrected_variables, find_field_errors
+from fusion.loop.camera_correction import FieldFault, correct_fields, corrected_variables, find_field_errors
 from fusion.twin import simulate
 from fusion.twin.machine.recipe import EffectRecipe, Recipe
 from fusion.twin.simulate import driver_log, environment_log
@@ -142,8 +142,8 @@ def test_a_reflection_is_its_pattern_times_what_it_adds_to_its_lowest_state() ->
     assert error.text.startswith("a reflected source added up to 2.00 ± 0.10 K over a patch from cycle 4 on")
 
 
-def field_error(*corrections: float) -> FieldError:
-    return FieldError("camera_offset", "it erred", 0.5, 0.1, 5, np.array(corrections)[:, None, None] * np.ones((1, 2)))
+def field_error(*corrections: float) -> FieldFault:
+    return FieldFault("camera_offset", "it erred", 0.5, 0.1, 5, np.array(corrections)[:, None, None] * np.ones((1, 2)))
 
 
 def test_all_errors_are_taken_out_of_the_frames_and_the_input_stays() -> None:

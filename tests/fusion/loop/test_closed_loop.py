@@ -149,8 +149,10 @@ def test_a_much_weaker_effect_only_stands_in_for_one_that_was_not_confirmed(exce
     problem = Script(not_confirmed=frozenset({"a"}))
     state, chosen = choose(problem, start(score("a", 20.0, 0.003), score("b", excess)))
     assert (chosen.name if chosen else None) == name
-    (decision,) = state.decisions
+    decision, *others = state.decisions
     assert decision == Decision("a", Reason.NOT_CONFIRMED, {"p_value": 0.003})
+    # What is passed over is never left without a reason.
+    assert [other.reason for other in others] == ([] if name else [Reason.STANDS_IN])
 
 
 def test_the_strongest_of_those_not_confirmed_sets_the_limit():

@@ -22,6 +22,8 @@ FIELDS = {
     Reason.TEMPERATURE_NOISE: {"series", "noise_percent", "limit_percent"},
     Reason.FOLLOWS_RATE: {"series"},
     Reason.SMOOTHING: {"series", "advantage"},
+    Reason.NOT_PREDICTED: {"p_value", "before_um", "after_um"},
+    Reason.STANDS_IN: {"p_value", "stronger"},
     Reason.NOT_CONFIRMED: {"p_value"},
     Reason.SUPERFLUOUS: {"loss"},
     Reason.TOO_MANY_EVENTS: {"most"},
@@ -32,7 +34,7 @@ FIELDS = {
     Reason.BESIDE_WRONG_PATTERN: {"beside"},
     Reason.NOT_REPEATED: {"p_value", "parts", "without_um", "with_um"},
 }
-WORDS = {"because", "driver", "series", "first", "second", "beside"}
+WORDS = {"stronger", "because", "driver", "series", "first", "second", "beside"}
 
 
 def decided(tree: ast.Module) -> list[tuple[Reason, set[str]]]:
@@ -98,7 +100,7 @@ def test_the_sentences_read_as_they_are_meant():
 
 def test_reasons_are_divided_as_the_procedure_needs_them():
     assert {Reason.NOT_AVAILABLE, Reason.NOT_COMPUTABLE} == NOT_TRIED
-    neutral = {Reason.ENTERED, Reason.NOT_CONFIRMED, Reason.SUPERFLUOUS}
+    neutral = {Reason.ENTERED, Reason.NOT_CONFIRMED, Reason.NOT_PREDICTED, Reason.SUPERFLUOUS}
     assert set(Reason) - NOT_TRIED - neutral == BLOCKING
     assert not NOT_TRIED & BLOCKING and not neutral & BLOCKING
     assert {

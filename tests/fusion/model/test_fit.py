@@ -181,7 +181,7 @@ def camera_error(name: str) -> Effect:
             late = (readings.seconds >= instant).astype(float)
             yield Candidate((-coefficients.get("offset", 0.0) * late)[:, None], {"time_s": instant}, ("K",))
 
-    return Effect(name, "", "", candidates)
+    return Effect(name, "", "", candidates, errs_camera=True)
 
 
 def test_a_term_is_computed_anew_for_the_same_parameters():

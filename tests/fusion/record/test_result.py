@@ -118,7 +118,9 @@ def test_an_added_effect_is_told_with_its_size_and_its_rivals():
     assert step["tied"] == ["thermal_lag"]
     assert step["runner_up"] == {"effect": "thermal_lag", "behind_by": pytest.approx(1.0), "p_value": 2e-3}
     assert step["rejected"] == {
-        "thermal_lag": Decision("thermal_lag", Reason.NOT_CONFIRMED, {"p_value": 2e-3}).sentence
+        "thermal_lag": Decision(
+            "thermal_lag", Reason.NOT_PREDICTED, {"p_value": 2e-3, "before_um": 0.8, "after_um": 0.9}
+        ).sentence
     }
     assert step["confirmed"] == str(Confirmed.LATER_PARTS) and step["event_s"] is None
 
