@@ -69,7 +69,7 @@ def detect_hotspots(rise: xr.DataArray, *, least_prominence_K: float = 0.1, limi
     Raises
     ------
     ThermographyError
-        The field is not (y, x) with at least 3 x 3 cells.
+        The field is no DataArray (y, x) with at least 3 x 3 cells.
 
     Notes
     -----
@@ -84,6 +84,10 @@ def detect_hotspots(rise: xr.DataArray, *, least_prominence_K: float = 0.1, limi
     >>> round(spot.x_mm), round(spot.y_mm), round(spot.peak_rise_K, 1)
     (150, 70, 2.0)
     """
+    if not isinstance(rise, xr.DataArray):
+        raise ThermographyError(
+            f"rise is of type {type(rise).__name__}; give a DataArray (y, x), as fields['temperature_rise'].isel(cycle=-1)"
+        )
     if rise.dims != ("y", "x") or min(rise.shape) < 3:
         raise ThermographyError(
             f"rise has dims {rise.dims} and shape {rise.shape}; give one field (y, x) of at least 3 x 3 cells"
