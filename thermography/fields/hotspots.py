@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from skimage import measure, morphology
 
+from thermography._constants import MAD_TO_SIGMA
 from thermography._typing import Array
 from thermography.errors import ThermographyError
 
@@ -124,7 +125,7 @@ def _noise(residual: Array, seen: NDArray[np.bool_]) -> float:
     """Noise of the smoothed field, K, from the difference between the field and the smoothed one."""
     # A Gaussian of width s leaves 1 / (4 pi s^2) of the variance of white noise.
     kept = 1 / (4 * np.pi * _SMOOTHING_CELLS**2)
-    return 1.4826 * float(np.median(np.abs(residual[seen]))) * np.sqrt(kept / (1 - kept))
+    return MAD_TO_SIGMA * float(np.median(np.abs(residual[seen]))) * np.sqrt(kept / (1 - kept))
 
 
 def _hotspot(
