@@ -122,7 +122,7 @@ def read_frame(path: str | os.PathLike[str]) -> Frame:
     FlirFormatError
         Where the file is not radiometric or its first frame is damaged.
     OSError
-        Where the file cannot be opened.
+        Where the file cannot be opened (FileNotFoundError where there is none); its ``filename`` names it.
 
     See Also
     --------

@@ -261,3 +261,9 @@ def test_a_single_path_is_one_file(tmp_path: Path, kind: type) -> None:
     frames, rejected = index_frames(kind(tmp_path / "a.jpg"))
     assert [frame.path for frame in frames] == [tmp_path / "a.jpg"]
     assert rejected == []
+
+
+def test_a_missing_file_is_named_by_the_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError) as caught:
+        read_frame(tmp_path / "a.jpg")
+    assert Path(caught.value.filename) == tmp_path / "a.jpg"
