@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from interferometry._typing import Array
+from interferometry.contract import check_dataset
 from interferometry.drift.gls import von_neumann_p_value
 from interferometry.errors import InterferometryError
 
@@ -90,7 +91,7 @@ def detect_anomalies(
     deviations : xarray.Dataset
         The deviations that it was estimated from (keeps ``contract.DEVIATIONS``).
     level : float
-        Probability of any false anomaly in a whole test.
+        Probability of any false anomaly in a whole test, between 0 and 1 (both excluded).
     permutations : int
         Number of permutations; at least 199 for a level of 0.05.
     seed : int
@@ -105,7 +106,8 @@ def detect_anomalies(
     Raises
     ------
     InterferometryError
-        ``permutations`` are too few to reach ``level`` in the kind with the smallest weight.
+        A Dataset lacks a variable, ``level`` is no probability between 0 and 1, or ``permutations`` are too few to reach it in the kind
+        with the smallest weight.
 
     Notes
     -----
@@ -129,6 +131,10 @@ def detect_anomalies(
     >>> [(a.target, a.direction, a.kind, a.stands_out) for a in detect_anomalies(estimate_drift(test), test)]
     [(3, 'both', 'scatter', True)]
     """
+    check_dataset(estimated, "estimated")
+    check_dataset(deviations, "deviations")
+    if not 0 < level < 1:
+        raise InterferometryError(f"level={level} is no probability between 0 and 1; 0.05 is usual")
     needed = int(np.ceil(1.0 / (level * min(WEIGHTS.values()))))
     if permutations + 1 < needed:
         raise InterferometryError(f"permutations={permutations} cannot reach level={level}; use at least {needed - 1}")

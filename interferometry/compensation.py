@@ -15,6 +15,7 @@ import ref_index
 import xarray as xr
 
 from interferometry._typing import Array
+from interferometry.contract import check_dataset
 from interferometry.errors import InterferometryError
 
 #: Vacuum wavelength of the stabilised HeNe laser in nm, as genuine files imply it (632.990616 .. 632.990634).
@@ -22,6 +23,8 @@ VACUUM_WAVELENGTH_NM = 632.990625
 REFERENCE_TEMPERATURE_DEGC = 20.0
 #: Readings farther than this from any logged condition are refused.
 LONGEST_GAP_S = 900.0
+#: Vacuum wavelengths in nm for which Ciddor's equation holds.
+WAVELENGTHS_NM = (300.0, 1700.0)
 #: Air and 40 K of steel together change a length by less than this.
 LARGEST_SCALE = 1e-3
 
@@ -288,7 +291,10 @@ def compensate(
     ------
     CompensationError
         No reading has a time, one lies more than 15 minutes from any logged condition, or the applied factor differs by more than
-        1000 ppm from the one of these conditions.
+        1000 ppm from the one of these conditions; or a number is not finite, the dead path negative, or the wavelength outside
+        300 nm .. 1700 nm.
+    InterferometryError
+        ``deviations`` or ``environment`` lack a variable of ``contract.DEVIATIONS`` or ``contract.ENVIRONMENT``.
 
     Notes
     -----
@@ -311,6 +317,14 @@ def compensate(
     >>> redone["correction_scale"].values.round(2).tolist()
     [[[-1.37], [-1.37]]]
     """
+    check_dataset(deviations, "deviations")
+    check_dataset(environment, "environment")
+    _check_numbers(
+        expansion_coefficient_ppm_per_K=expansion_coefficient_ppm_per_K,
+        dead_path_mm=dead_path_mm,
+        zero_mm=zero_mm,
+        wavelength_nm=wavelength_nm,
+    )
     air, outside = _conditions_at(deviations, environment)
     if material_temperature_degC is not None:
         air["material_temperature"] = material_temperature_degC.values
@@ -330,6 +344,20 @@ def compensate(
         "dead_path_u": sensors.dead_path_mm * 1e3 * np.abs(change) * (dead_path_mm != 0),
     }
     return _corrected(deviations, added, u, index).assign_attrs(outside_environment=outside)
+
+
+def _check_numbers(**numbers: float) -> None:
+    """Refuse numbers that are not finite, a negative dead path, and a wavelength beyond the equation for the index."""
+    for name, value in numbers.items():
+        if not np.isfinite(value):
+            raise CompensationError(f"{name}={value} is not finite; give a number")
+    if numbers["dead_path_mm"] < 0:
+        raise CompensationError(f"dead_path_mm={numbers['dead_path_mm']} is negative; give the distance, 0 or more")
+    if not WAVELENGTHS_NM[0] <= numbers["wavelength_nm"] <= WAVELENGTHS_NM[1]:
+        raise CompensationError(
+            f"wavelength_nm={numbers['wavelength_nm']} lies outside {WAVELENGTHS_NM[0]:g} .. {WAVELENGTHS_NM[1]:g}; "
+            f"a HeNe laser has {VACUUM_WAVELENGTH_NM} nm in vacuum"
+        )
 
 
 def _corrected(deviations: xr.Dataset, added: dict[str, Array], u: dict[str, Array], index: Array) -> xr.Dataset:

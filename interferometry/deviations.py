@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
+from interferometry.errors import InterferometryError
+
 DIMS = ("cycle", "direction", "target")
 DIRECTIONS = ("positive", "negative")
 
@@ -70,6 +72,11 @@ def build_deviations(
         Keeps ``contract.DEVIATIONS``: ``deviation`` (um), ``time`` (UTC) and ``quality_flag`` (cycle, direction, target), ``position``
         (mm; target). Missing readings are flagged.
 
+    Raises
+    ------
+    InterferometryError
+        An array does not have the shape that the numbers of cycles and targets give.
+
     Notes
     -----
     Target positions, directions of approach and deviations as in ISO 230-2:2014, clause 3.
@@ -85,6 +92,13 @@ def build_deviations(
     >>> test["quality_flag"].values.tolist()
     [[[0, 0], [0, 1]]]
     """
+    cells = (len(cycles), len(DIRECTIONS), len(targets))
+    arrays = {"position_mm": (position_mm, cells[2:]), "deviation_um": (deviation_um, cells), "time": (time, cells)}
+    for name, (values, shape) in arrays.items():
+        if np.shape(values) != shape:
+            raise InterferometryError(
+                f"{name} has shape {np.shape(values)}; {len(cycles)} cycles, 2 directions and {len(targets)} targets need {shape}"
+            )
     missing = np.where(np.isnan(deviation_um), np.uint8(MISSING.mask), np.uint8(0))
     return xr.Dataset(
         {

@@ -20,6 +20,7 @@ import GTC
 import numpy as np
 import xarray as xr
 
+from interferometry.contract import check_dataset
 from interferometry.deviations import DIRECTIONS
 from interferometry.errors import InterferometryError
 
@@ -114,7 +115,8 @@ def evaluate_iso230(
     Raises
     ------
     InterferometryError
-        The window names a cycle that was not measured, or no target has two readings in it.
+        ``deviations`` lack a variable of ``contract.DEVIATIONS``, the window names a cycle that was not measured, or no target has two
+        readings in it.
 
     Notes
     -----
@@ -134,6 +136,7 @@ def evaluate_iso230(
     >>> {name: float(result[name]) for name in QUANTITIES}
     {'B': 2.0, 'R': 2.0, 'E': 6.0, 'M': 4.5, 'A': 6.0}
     """
+    check_dataset(deviations, "deviations")
     deviations = deviations.reindex(direction=list(DIRECTIONS))
     x, numbers = _select(deviations, cycles)
     count = np.isfinite(x).sum(axis=0)

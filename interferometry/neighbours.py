@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 from scipy import optimize, stats
 
+from interferometry.contract import check_dataset
 from interferometry.errors import InterferometryError
 
 #: Probability that two standard deviations of a normal distribution cover; Student's t replaces the 2 below it.
@@ -116,7 +117,7 @@ def evaluate_neighbours(deviations: xr.Dataset) -> xr.Dataset:
     Raises
     ------
     InterferometryError
-        Fewer than two targets.
+        ``deviations`` lack a variable of ``contract.DEVIATIONS``, or hold fewer than two targets.
 
     Notes
     -----
@@ -134,6 +135,7 @@ def evaluate_neighbours(deviations: xr.Dataset) -> xr.Dataset:
     >>> links["mean_difference"].values.tolist(), links["standard_deviation"].values.tolist()
     ([[-1.0], [-2.0]], [[0.0], [0.0]])
     """
+    check_dataset(deviations, "deviations")
     x = _along_axis(deviations)
     if x.sizes["target"] < 2:
         raise InterferometryError(f"{x.sizes['target']} target has no neighbour; measure at least two target positions")

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from interferometry._typing import Array
+from interferometry.contract import check_dataset
 from interferometry.deviations import DIMS, OUTLIER, set_flag, sort_readings
 from interferometry.drift.gls import DriftFit, average_drift, estimate, von_neumann_p_value
 from interferometry.drift.state_space import Order, Smoothed
@@ -99,6 +100,8 @@ def estimate_drift(
     ------
     DriftDataError
         Fewer than two cycles or targets hold readings, no reading has a time, readings repeat exactly, or an argument is unknown.
+    InterferometryError
+        ``deviations`` lack a variable of ``contract.DEVIATIONS``.
 
     Notes
     -----
@@ -201,6 +204,9 @@ def fit_joint(
     DriftDataError
         As `estimate_drift`.
     """
+    check_dataset(deviations, "deviations")
+    if order not in (None, 1, 2):
+        raise DriftDataError(f"order={order!r} is neither 1 (random walk), 2 (integrated random walk) nor None")
     readings = sort_readings(deviations)
     _check_readings(deviations, readings)
     if robust:

@@ -87,6 +87,8 @@ def read_deviations(
     ------
     LaserFormatError
         The file cannot be used as a whole.
+    OSError
+        The file cannot be opened (FileNotFoundError where there is none); its ``filename`` names it.
 
     Notes
     -----
@@ -308,6 +310,8 @@ def read_environment(path: str | Path) -> xr.Dataset:
     ------
     LaserFormatError
         A column is missing, or fewer than half of the lines can be used.
+    OSError
+        The file cannot be opened (FileNotFoundError where there is none); its ``filename`` names it.
 
     Notes
     -----

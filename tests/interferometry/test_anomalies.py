@@ -8,6 +8,7 @@ import xarray as xr
 
 from interferometry.anomalies import Anomaly, detect_anomalies, generalised_esd
 from interferometry.drift.estimate import estimate_drift
+from interferometry.errors import InterferometryError
 from tests.interferometry.simulated_campaigns import SIGMA_UM, simulate
 
 PERMUTATIONS = 249
@@ -118,3 +119,10 @@ def test_generalised_esd_of_one_side_leaves_the_other_alone(rng: np.random.Gener
 
 def test_generalised_esd_without_spread() -> None:
     assert not generalised_esd(np.full(8, 2.0), most=3).any()
+
+
+@pytest.mark.parametrize("level", [2, 1, 0, -0.05, np.nan])
+def test_a_level_that_is_no_probability_is_refused(level: float, rng: np.random.Generator) -> None:
+    deviations, _ = simulate(rng, cycles=5)
+    with pytest.raises(InterferometryError, match=f"level={level} is no probability between 0 and 1"):
+        detect_anomalies(estimate_drift(deviations), deviations, level=level)

@@ -206,3 +206,30 @@ def test_a_missing_reading_stays_missing_and_leaves_the_others_alone(campaign: t
     assert np.argwhere(np.isnan(redone["deviation"].values)).tolist() == [[3, 0, 5]]
     kept = np.isfinite(redone["deviation"].values)
     np.testing.assert_array_equal(redone["deviation"].values[kept], complete["deviation"].values[kept])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("wavelength_nm", -1.0, "lies outside 300 .. 1700"),
+        ("wavelength_nm", 0.633, "lies outside 300 .. 1700"),
+        ("wavelength_nm", np.nan, "is not finite"),
+        ("expansion_coefficient_ppm_per_K", np.nan, "is not finite"),
+        ("dead_path_mm", np.inf, "is not finite"),
+        ("dead_path_mm", -5.0, "is negative"),
+        ("zero_mm", np.nan, "is not finite"),
+    ],
+)
+def test_a_number_that_has_no_meaning_is_refused(
+    name: str, value: float, reason: str, rng: np.random.Generator
+) -> None:
+    deviations = simulate(rng, cycles=2)[0]
+    conditions = {
+        "air_temperature": 20.0,
+        "air_pressure": 1013.25,
+        "relative_humidity": 50.0,
+        "material_temperature": 20.0,
+    }
+    environment = xr.Dataset({key: ("time", [number]) for key, number in conditions.items()}, {"time": [START]})
+    with pytest.raises(CompensationError, match=f"{name}={value} {reason}"):
+        compensate(deviations, environment, **{name: value})  # type: ignore[arg-type]

@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from interferometry.contract import DEVIATIONS
-from interferometry.io.readers import read_deviations
+from interferometry.anomalies import detect_anomalies
+from interferometry.compensation import compensate
+from interferometry.contract import DEVIATIONS, ENVIRONMENT, ESTIMATE
+from interferometry.drift.estimate import estimate_drift
+from interferometry.errors import InterferometryError
+from interferometry.io.readers import read_deviations, read_environment
 from interferometry.io.writers import write_deviations_csv, write_rtl
+from interferometry.iso230 import evaluate_iso230
+from interferometry.neighbours import compare, evaluate_neighbours
 from tests.interferometry.simulated_campaigns import simulate
 
 
@@ -32,3 +38,56 @@ def test_built_deviations_keep_the_contract(rng: np.random.Generator) -> None:
 def test_read_deviations_keep_the_contract(name: str, write: object, tmp_path: Path, rng: np.random.Generator) -> None:
     write(tmp_path / name, simulate(rng, cycles=2)[0])  # type: ignore[operator]
     assert keeps_contract(read_deviations(tmp_path / name))
+
+
+ENTRIES = {
+    "estimate_drift": estimate_drift,
+    "evaluate_iso230": evaluate_iso230,
+    "evaluate_neighbours": evaluate_neighbours,
+    "compare": compare,
+    "compensate": lambda deviations: compensate(deviations, xr.Dataset()),
+}
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
+def test_an_evaluation_refuses_what_is_no_dataset_of_deviations(entry: str, rng: np.random.Generator) -> None:
+    good = simulate(rng, cycles=2)[0]
+    faults = {
+        r"deviations is of type NoneType, not a Dataset; give what read_deviations or build_deviations returns": None,
+        r"deviations has no variable 'deviation' \(cycle, direction, target\); give what read_deviations": xr.Dataset(),
+        r"deviations has no variable 'position' \(target\); give": good.drop_vars("position"),
+        r"deviations has 'deviation' over \(target, cycle, direction\) instead of 'deviation' \(cycle,": good.transpose(
+            "target", ...
+        ),
+    }
+    for message, dataset in faults.items():
+        with pytest.raises(InterferometryError, match=message):
+            ENTRIES[entry](dataset)
+
+
+def test_anomalies_and_compensation_name_which_dataset_is_wrong(rng: np.random.Generator) -> None:
+    good = simulate(rng, cycles=2)[0]
+    with pytest.raises(
+        InterferometryError, match=r"estimated has no variable 'standardised' .*; give what estimate_drift"
+    ):
+        detect_anomalies(good, good)
+    with pytest.raises(InterferometryError, match="deviations has no variable 'deviation'"):
+        detect_anomalies(estimate_drift(good), xr.Dataset())
+    with pytest.raises(InterferometryError, match=r"environment has no variable 'time' .*; give what read_environment"):
+        compensate(good, xr.Dataset())
+
+
+def test_what_the_package_returns_keeps_the_contracts_of_estimate_and_environment(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    estimated = estimate_drift(simulate(rng, cycles=4)[0])
+    assert {name: (estimated[name].dims, estimated[name].dtype.kind) for name in ESTIMATE} == {
+        name: (dims, kind) for name, (dims, _, kind) in ESTIMATE.items()
+    }
+    header = "time,air_temperature_degC,air_pressure_hPa,relative_humidity_percent,material_temperature_degC"
+    (tmp_path / "environment.csv").write_text(f"{header}\n2026-03-09T06:30:00Z,23.5,1000.2,42,23.9\n", encoding="utf-8")
+    environment = read_environment(tmp_path / "environment.csv")
+    assert {
+        name: (environment[name].dims, environment[name].attrs.get("units", ""), environment[name].dtype.kind)
+        for name in ENVIRONMENT
+    } == ENVIRONMENT

@@ -14,6 +14,7 @@ from interferometry.deviations import (
     set_flag,
     sort_readings,
 )
+from interferometry.errors import InterferometryError
 from tests.interferometry.simulated_campaigns import simulate
 
 
@@ -60,3 +61,21 @@ def test_readings_are_sorted_by_time_and_those_without_value_or_time_left_out() 
     assert readings["seconds"].values.tolist() == [0.0, 6.0, 14.0, 20.0, 36.0, 44.0]
     assert readings["sign"].values.tolist() == [1, 1, -1, -1, 1, -1]
     assert readings["position"].values.tolist() == [0.0, 100.0, 100.0, 0.0, 100.0, 100.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("position_mm", r"position_mm has shape \(4,\); 2 cycles, 2 directions and 3 targets need \(3,\)"),
+        ("deviation_um", r"deviation_um has shape \(2, 2, 4\); .* need \(2, 2, 3\)"),
+        ("time", r"time has shape \(2, 2, 4\); .* need \(2, 2, 3\)"),
+    ],
+)
+def test_arrays_of_other_sizes_are_refused_with_their_shapes(name: str, message: str) -> None:
+    def arrays(targets: int) -> dict[str, np.ndarray]:
+        shape = (2, 2, targets)
+        time = np.full(shape, np.datetime64("NaT", "ns"))
+        return {"position_mm": np.arange(float(targets)), "deviation_um": np.zeros(shape), "time": time}
+
+    with pytest.raises(InterferometryError, match=message):
+        build_deviations([1, 2], [1, 2, 3], **{**arrays(3), name: arrays(4)[name]})

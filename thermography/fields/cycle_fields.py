@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from thermography._constants import MAD_TO_SIGMA
 from thermography._typing import Array
 from thermography.fields.resampling import PlanWeights
 from thermography.radiometry.averaging import AVERAGING_LIMIT_K, MeanTemperature
@@ -210,7 +211,7 @@ def noise_of_differences(image: Array, interior: NDArray[np.bool_]) -> float:
     # Second differences down, then across: the sum of squared weights is 36, so that the noise is 6 times that of one pixel.
     down = values[:-2] - 2 * values[1:-1] + values[2:]
     both = down[:, :-2] - 2 * down[:, 1:-1] + down[:, 2:]
-    return 1.4826 * float(np.nanmedian(np.abs(both[interior[1:-1, 1:-1]]))) / 6
+    return MAD_TO_SIGMA * float(np.nanmedian(np.abs(both[interior[1:-1, 1:-1]]))) / 6
 
 
 def position_covariance(registration: Registration, grid: PlanGrid) -> Array:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from skimage import measure, morphology
 
+from thermography._constants import MAD_TO_SIGMA
 from thermography._typing import Array
 from thermography.errors import ThermographyError
 
@@ -69,7 +70,7 @@ def detect_hotspots(rise: xr.DataArray, *, least_prominence_K: float = 0.1, limi
     Raises
     ------
     ThermographyError
-        The field is not (y, x) with at least 3 x 3 cells.
+        The field is no DataArray (y, x) with at least 3 x 3 cells.
 
     Notes
     -----
@@ -84,6 +85,10 @@ def detect_hotspots(rise: xr.DataArray, *, least_prominence_K: float = 0.1, limi
     >>> round(spot.x_mm), round(spot.y_mm), round(spot.peak_rise_K, 1)
     (150, 70, 2.0)
     """
+    if not isinstance(rise, xr.DataArray):
+        raise ThermographyError(
+            f"rise is of type {type(rise).__name__}; give a DataArray (y, x), as fields['temperature_rise'].isel(cycle=-1)"
+        )
     if rise.dims != ("y", "x") or min(rise.shape) < 3:
         raise ThermographyError(
             f"rise has dims {rise.dims} and shape {rise.shape}; give one field (y, x) of at least 3 x 3 cells"
@@ -120,7 +125,7 @@ def _noise(residual: Array, seen: NDArray[np.bool_]) -> float:
     """Noise of the smoothed field, K, from the difference between the field and the smoothed one."""
     # A Gaussian of width s leaves 1 / (4 pi s^2) of the variance of white noise.
     kept = 1 / (4 * np.pi * _SMOOTHING_CELLS**2)
-    return 1.4826 * float(np.median(np.abs(residual[seen]))) * np.sqrt(kept / (1 - kept))
+    return MAD_TO_SIGMA * float(np.median(np.abs(residual[seen]))) * np.sqrt(kept / (1 - kept))
 
 
 def _hotspot(

@@ -122,7 +122,7 @@ def read_frame(path: str | os.PathLike[str]) -> Frame:
     FlirFormatError
         Where the file is not radiometric or its first frame is damaged.
     OSError
-        Where the file cannot be opened.
+        Where the file cannot be opened (FileNotFoundError where there is none); its ``filename`` names it.
 
     See Also
     --------
@@ -156,13 +156,15 @@ def read_frame(path: str | os.PathLike[str]) -> Frame:
         return first._read_from(file)
 
 
-def index_frames(paths: Iterable[str | os.PathLike[str]]) -> tuple[list[FrameReference], list[RejectedFrame]]:
+def index_frames(
+    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+) -> tuple[list[FrameReference], list[RejectedFrame]]:
     """List all frames of many radiometric FLIR files by reading their headers only.
 
     Parameters
     ----------
-    paths : iterable of str or path-like
-        Radiometric JPEG, SEQ, CSQ or FFF files, in any order.
+    paths : str, path-like or iterable of them
+        Radiometric JPEG, SEQ, CSQ or FFF files, in any order; or one such file.
 
     Returns
     -------
@@ -184,7 +186,7 @@ def index_frames(paths: Iterable[str | os.PathLike[str]]) -> tuple[list[FrameRef
     """
     frames: list[FrameReference] = []
     rejected: list[RejectedFrame] = []
-    for path in map(Path, paths):
+    for path in map(Path, [paths] if isinstance(paths, str | os.PathLike) else paths):
         try:
             with path.open("rb", buffering=0) as file:
                 for result in _walk(file, path):

@@ -16,7 +16,14 @@ from numpy.typing import ArrayLike
 from thermography._typing import Array
 from thermography.errors import ThermographyError
 from thermography.io.frame import CameraParameters
-from thermography.radiometry.planck import ZERO_CELSIUS_K, black_body_signal, count_line, override, signal_slope
+from thermography.radiometry.planck import (
+    ZERO_CELSIUS_K,
+    RadiometryError,
+    black_body_signal,
+    count_line,
+    override,
+    signal_slope,
+)
 
 #: Parameters of the measurement formula that may be uncertain, with their range.
 _RANGES = {
@@ -128,7 +135,7 @@ def temperature_uncertainty(
     inputs : InputUncertainty, optional
         Standard uncertainties of the inputs; by default those of a painted surface in a workshop and a common bolometer camera.
     frames : int or array of the same shape
-        Number of frames that were averaged.
+        Number of frames that were averaged, from 1; 0 where there is no temperature (NaN).
 
     Returns
     -------
@@ -138,7 +145,7 @@ def temperature_uncertainty(
     Raises
     ------
     RadiometryError
-        Where a parameter makes the measurement formula meaningless.
+        Where a parameter makes the measurement formula meaningless, or a temperature is the average of fewer than one frame.
 
     Notes
     -----
@@ -158,6 +165,12 @@ def temperature_uncertainty(
     """
     inputs = inputs or InputUncertainty()
     kelvin = np.asarray(temperature, np.float64) + ZERO_CELSIUS_K
+    too_few = np.isfinite(kelvin) & ~(np.asarray(frames) >= 1)
+    if too_few.any():
+        raise RadiometryError(
+            f"frames={np.broadcast_to(frames, too_few.shape)[too_few][0]} for a temperature; give the number of frames that "
+            "were averaged, 1 or more"
+        )
     signal = black_body_signal(kelvin, parameters)
     kelvin_per_count = 1 / signal_slope(kelvin, parameters)
     gain, _ = count_line(parameters)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import median_abs_deviation
 
+from thermography._constants import MAD_TO_SIGMA
 from thermography._typing import Array
 from thermography.registration.plan import Fiducial, PlanGrid
 
@@ -22,8 +23,6 @@ _LEAST_CONTRAST = 2.0
 _LARGEST_ASPECT = 4.0
 #: Smallest area of a spot, px.
 _LEAST_AREA_PX = 12
-#: Normal standard deviation over median absolute deviation.
-_SIGMA_PER_MAD = 1.4826
 
 
 @dataclass(frozen=True)
@@ -256,7 +255,7 @@ def _robust_plane(basis: Array, values: NDArray[np.floating], mask: NDArray[np.b
         plane = basis @ coefficients
         residual = values - plane
         # Residuals of a fit with a constant term: their deviation is taken about zero.
-        noise = _SIGMA_PER_MAD * float(np.median(np.abs(residual[kept])))
+        noise = MAD_TO_SIGMA * float(np.median(np.abs(residual[kept])))
         keep = mask & (np.abs(residual) <= max(4 * noise, 1e-9))
         if keep.sum() < 6 or (keep == kept).all():
             break

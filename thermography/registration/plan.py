@@ -176,7 +176,7 @@ def read_fiducials(path: str | Path) -> list[Fiducial]:
     FiducialError
         A column is missing, a value is not a finite number, a diameter is not positive, or fewer than four discs are listed.
     OSError
-        The file cannot be read.
+        The file cannot be opened (FileNotFoundError where there is none); its ``filename`` names it.
 
     Notes
     -----

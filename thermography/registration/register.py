@@ -180,7 +180,8 @@ def register(
     Raises
     ------
     RegistrationError
-        Fewer than four fiducials are located, they lie on a line, or their arrangement is ambiguous.
+        The temperature is neither a frame nor a stack, fewer than four disc fiducials are listed or located, they lie on a line, or
+        their arrangement is ambiguous.
     MarkerError
         The markers in view are those of another plan.
 
@@ -204,8 +205,17 @@ def register(
     ('homography', [100, 50])
     """
     frame = np.asarray(temperature, float)
+    if frame.ndim not in (2, 3) or frame.size == 0:
+        raise RegistrationError(
+            f"temperature has shape {frame.shape}; give one frame (row, column) or a stack (time, row, column)"
+        )
     frame = frame.mean(axis=0) if frame.ndim == 3 else frame
     listed, left_out = _without_duplicates(identify_plan(frame, fiducials))
+    if len(listed) < 4:
+        raise RegistrationError(
+            f"fiducials lists {len(listed)} different discs; a plan is located by at least 4"
+            + (f" ({_reasons(left_out)})" if left_out else "")
+        )
     if not use_hints:
         listed = [replace(disc, column_px=None, row_px=None) for disc in listed]
     spots = detect_discs(frame)

@@ -249,3 +249,9 @@ def test_the_order_of_targets_does_not_matter(rng: np.random.Generator) -> None:
 def test_sorted_readings_hold_the_real_time(rng: np.random.Generator) -> None:
     readings = sort_readings(simulate(rng, cycles=2)[0])
     assert float(readings["seconds"][32]) == pytest.approx(CYCLE_S)
+
+
+@pytest.mark.parametrize("order", [0, 3, "2"])
+def test_an_unknown_order_is_refused(order: object, rng: np.random.Generator) -> None:
+    with pytest.raises(DriftDataError, match=f"order={order!r} is neither 1 "):
+        estimate_drift(simulate(rng, cycles=2)[0], order=order)  # type: ignore[arg-type]

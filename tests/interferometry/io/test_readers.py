@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -230,3 +231,10 @@ def test_environment_in_another_unit_is_refused(tmp_path: Path) -> None:
     path.write_text(ENVIRONMENT + "\n2026-03-09T06:32:00Z,23.7,101.3,42,23.8\n", encoding="utf-8")
     with pytest.raises(LaserFormatError, match=r"1 of 1 lines cannot be used.*lies outside 500 .. 1200"):
         read_environment(path)
+
+
+@pytest.mark.parametrize("read", [read_deviations, read_environment])
+def test_a_missing_file_is_named_by_the_error(read: Callable[[Path], object], tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError) as caught:
+        read(tmp_path / "laser.csv")
+    assert Path(caught.value.filename) == tmp_path / "laser.csv"

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from thermography.errors import ThermographyError
 from thermography.fields.hotspots import detect_hotspots
 
 X = np.arange(140) * 5.0 + 2.5
@@ -57,3 +58,9 @@ def test_masked_discs_neither_make_nor_break_hotspots(rng):
 def test_a_stack_is_refused():
     with pytest.raises(ValueError, match=r"give one field \(y, x\) of at least 3 x 3 cells"):
         detect_hotspots(xr.concat([plane()], "cycle"))
+
+
+@pytest.mark.parametrize("rise", [None, np.zeros((4, 4)), "temperature_rise"])
+def test_what_is_no_data_array_is_refused(rise):
+    with pytest.raises(ThermographyError, match=rf"rise is of type {type(rise).__name__}; give a DataArray \(y, x\)"):
+        detect_hotspots(rise)

@@ -253,3 +253,17 @@ def test_ten_thousand_frames_are_indexed_without_their_pixels(tmp_path: Path) ->
     assert len(frames) == 10_000 and rejected == []
     assert frames[-1].shape == template.counts.shape
     assert path.stat().st_size == 10_000 * len(record)
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_single_path_is_one_file(tmp_path: Path, kind: type) -> None:
+    write_jpeg(tmp_path / "a.jpg", np.full((8, 8), 18000, np.uint16), PARAMETERS, TIME)
+    frames, rejected = index_frames(kind(tmp_path / "a.jpg"))
+    assert [frame.path for frame in frames] == [tmp_path / "a.jpg"]
+    assert rejected == []
+
+
+def test_a_missing_file_is_named_by_the_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError) as caught:
+        read_frame(tmp_path / "a.jpg")
+    assert Path(caught.value.filename) == tmp_path / "a.jpg"

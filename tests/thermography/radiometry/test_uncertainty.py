@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.thermography.flir_mutations import PARAMETERS
+from thermography.errors import ThermographyError
 from thermography.io.frame import CameraParameters
 from thermography.radiometry.planck import counts_from_temperature, override, temperature_from_counts
 from thermography.radiometry.uncertainty import InputUncertainty, temperature_rise_uncertainty, temperature_uncertainty
@@ -137,3 +138,14 @@ def test_the_uncertainty_of_metal_is_large() -> None:
 def test_negative_uncertainty_is_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"uncertainty of emissivity = -0\.1: expected 0 or more"):
         InputUncertainty(emissivity=-0.1)
+
+
+@pytest.mark.parametrize("frames", [0, -1, np.nan, np.array([4, 0])])
+def test_a_temperature_averaged_over_no_frame_is_refused(frames: object) -> None:
+    with pytest.raises(ThermographyError, match=r"frames=.* for a temperature; give the number of frames"):
+        temperature_uncertainty(np.array([25.0, 26.0]), PARAMETERS, frames=frames)  # type: ignore[arg-type]
+
+
+def test_cells_without_a_temperature_may_have_no_frames() -> None:
+    budget = temperature_uncertainty(np.array([25.0, np.nan]), PARAMETERS, frames=np.array([4, 0]))
+    assert np.isfinite(budget.total_u).tolist() == [True, False]

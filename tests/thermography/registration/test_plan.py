@@ -1,5 +1,7 @@
 """The plan's grid and its fiducials: exact geometry, and faults of the fiducial file that name their line."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -68,3 +70,9 @@ def test_marker_column_of_the_fiducial_file(tmp_path):
     path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,marker", *rows[1:], "M7,120,40,52,7"]))
     with pytest.raises(FiducialError, match="lists 3 fiducials; a plan is located by at least 4"):
         read_fiducials(path)
+
+
+def test_a_missing_file_is_named_by_the_error(tmp_path):
+    with pytest.raises(FileNotFoundError) as caught:
+        read_fiducials(tmp_path / "fiducials.csv")
+    assert Path(caught.value.filename) == tmp_path / "fiducials.csv"

@@ -125,3 +125,18 @@ def test_points_on_a_line_are_refused():
     line = [Fiducial(f"L{i}", 50.0 + 100 * i, 90.0, 16.0) for i in range(5)]
     with pytest.raises(RegistrationError, match="lie on a line or on one spot; spread at least four"):
         register_points({d.name: (d.x_mm, 200.0) for d in line}, line, (480, 640))
+
+
+@pytest.mark.parametrize("shape", [(), (5,), (2, 2, 48, 64), (0, 64)])
+def test_what_is_neither_a_frame_nor_a_stack_is_refused(shape):
+    with pytest.raises(RegistrationError, match=r"temperature has shape .*; give one frame"):
+        register(np.zeros(shape), DISCS, grid=GRID)
+
+
+@pytest.mark.parametrize("fiducials", [[], DISCS[:3], [*DISCS[:3], DISCS[0]]])
+def test_a_list_of_fewer_than_four_discs_is_refused(fiducials):
+    count = min(len(fiducials), 3)
+    with pytest.raises(
+        RegistrationError, match=f"fiducials lists {count} different discs; a plan is located by at least 4"
+    ):
+        register(np.zeros((48, 64)), fiducials, grid=GRID)
