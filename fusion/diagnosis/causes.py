@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fusion.products.results import Cause
+from fusion.products.results_axis import Cause
 
 
 @dataclass(frozen=True)

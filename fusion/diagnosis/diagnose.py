@@ -32,7 +32,7 @@ from fusion.diagnosis.explanations import (
     warm_up_share,
 )
 from fusion.diagnosis.scatter import ScatterFit, fit_scatter
-from fusion.products.results import Cause
+from fusion.products.results_axis import Cause
 
 #: Minimum probability of each cause, set and checked on simulated campaigns by tests/soak/test_diagnosis_rates.py.
 THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "stick_slip": 0.4, "step": 0.6}

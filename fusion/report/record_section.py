@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from fusion.products.results import RecordLoop, Results
+from fusion.products.results import Results
+from fusion.products.results_loop import RecordLoop
 from fusion.record.problem import ENTRY_LEVEL, EVENT_LEVEL
 from fusion.report import plots_record
 from fusion.report.model_section import parameters, refused_effects, steps_table

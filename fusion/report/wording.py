@@ -11,7 +11,9 @@ import numpy as np
 
 from fusion.diagnosis.causes import CAUSES
 from fusion.effects.library import describe_effect
-from fusion.products.results import Loop, Quantity, RecordLoop, Results
+from fusion.products.results import Results
+from fusion.products.results_loop import Loop, RecordLoop
+from fusion.products.results_part import Quantity
 
 
 class EffectWords(NamedTuple):
