@@ -44,6 +44,8 @@ APPROACH_NATS = {"along": 2.1, "one_direction": 4.0, "slow": 2.0}
 WARM_UP_SHARE = 0.98
 #: Levels of the bootstrap tests; local temperature is the cause that costs most when it is wrong.
 LEVELS = {"step": 0.05, "local_temperature": 0.02}
+#: Level above which a serial p-value is called not significant in a sentence; it takes no part in the choice of the cause.
+_SERIAL_LEVEL = 0.05
 
 
 class Flagged(Protocol):
@@ -305,8 +307,31 @@ def _support(case: _Case, leading: str) -> list[str]:
             f"scatter that depends on the direction of approach raises the log-likelihood by {case.approach_gain:+.1f} nats"
         )
     elif leading == "structural":
-        sentences.append(f"no significant serial correlation (p = {case.serial_p:.3f}), equal in both directions")
+        sentences += [_serial_sentence(case.serial_p), _directions_sentence(residual)]
     return sentences
+
+
+def _serial_sentence(p_value: float) -> str:
+    """Return what the order of the readings in time shows."""
+    if p_value > _SERIAL_LEVEL:
+        return f"no significant serial correlation (p = {p_value:.3f})"
+    return f"serial correlation p = {p_value:.3f}"
+
+
+def _directions_sentence(residual: Residual) -> str:
+    """Return the standard deviations of both directions, and whether they agree within their expanded uncertainty (k = 2).
+
+    The standard uncertainty of a standard deviation s of n normally distributed readings is s / sqrt(2 (n - 1)) (JCGM 100:2008, E.4.3).
+    """
+    positive, negative = residual.scatter_um
+    freedom = np.isfinite(residual.values).sum(axis=1) - 1
+    if (freedom < 1).any():
+        return "directions not compared: fewer than two readings in one of them"
+    numbers = f"{positive:.2f} µm in the positive direction, {negative:.2f} µm in the negative direction"
+    u_positive, u_negative = np.array([positive, negative]) / np.sqrt(2.0 * freedom)
+    if abs(positive - negative) <= 2.0 * np.hypot(u_positive, u_negative):
+        return f"standard deviations equal within their uncertainty: {numbers}"
+    return f"standard deviation {numbers}"
 
 
 def _evidence(case: _Case, probability: dict[str, float]) -> dict[str, Any]:
