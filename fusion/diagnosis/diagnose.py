@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from fusion.diagnosis.causes import CAUSES
+from fusion.diagnosis.causes import CAUSES, undetermined_check
 from fusion.diagnosis.explanations import (
     LAGS_S,
     ProfileFit,
@@ -248,7 +248,7 @@ def _judge(case: _Case, direction: str) -> Diagnosis:
         evidence=_evidence(case, probability),
         for_it=tuple(_support(case, leading)),
         against_it=tuple(against),
-        check=CAUSES[cause].check,
+        check=undetermined_check(leading) if cause == "undetermined" else CAUSES[cause].check,
     )
 
 

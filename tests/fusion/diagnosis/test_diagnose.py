@@ -141,3 +141,12 @@ def test_directions_are_called_equal_only_within_their_uncertainty(negative_um, 
     row /= row.std()
     residual = SimpleNamespace(values=np.stack([row, negative_um * row]), scatter_um=(1.0, negative_um))
     assert _directions_sentence(residual) == sentence
+
+
+def test_what_to_check_without_a_cause_ends_with_the_leading_candidate():
+    generic = causes.CAUSES["undetermined"].check
+    assert causes.undetermined_check("stick_slip").startswith(
+        f"{generic} If the cause is stick-slip: inspect lubrication"
+    )
+    # A random walk is no cause, so there is nothing of its own to inspect.
+    assert causes.undetermined_check("slow") == causes.undetermined_check("undetermined") == generic
