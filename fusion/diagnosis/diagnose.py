@@ -289,14 +289,14 @@ def _support(case: _Case, leading: str) -> list[str]:
     if leading == "step":
         fit = case.step
         sentences.append(
-            f"step of {fit.coefficient:+.2f} ± {fit.coefficient_u:.2f} µm at cycle {case.step_cycle} (p = {fit.p_value:.3f}), "
-            f"hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
+            f"step of {fit.coefficient:+.2f} ± {2.0 * fit.coefficient_u:.2f} µm (k = 2) at cycle {case.step_cycle} "
+            f"(p = {fit.p_value:.3f}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
         )
     elif leading == "local_temperature" and case.temperature is not None:
         fit = case.temperature
         sentences.append(
-            f"{fit.coefficient:+.3f} ± {fit.coefficient_u:.3f} µm per K of local temperature rise, lag {LAGS_S[fit.best]:.0f} s "
-            f"(p = {fit.p_value:.3f}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
+            f"{fit.coefficient:+.3f} ± {2.0 * fit.coefficient_u:.3f} µm per K (k = 2) of local temperature rise, "
+            f"lag {LAGS_S[fit.best]:.0f} s (p = {fit.p_value:.3f}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
         )
     elif leading == "stick_slip":
         positive, negative = residual.scatter_um

@@ -40,7 +40,8 @@ def test_the_step_is_dated_and_measured(rng):
     # The first reading after the step is that of cycle 61.
     assert abs(diagnosis.evidence["step_cycle"] - 61) <= 1
     assert diagnosis.evidence["step_um"] == pytest.approx(1.0, abs=4 * diagnosis.evidence["step_u_um"])
-    assert any("step of +" in sentence for sentence in diagnosis.for_it)
+    expanded = f"± {2 * diagnosis.evidence['step_u_um']:.2f} µm (k = 2)"
+    assert any("step of +" in sentence and expanded in sentence for sentence in diagnosis.for_it)
     assert diagnosis.check == causes.CAUSES["step"].check
 
 
