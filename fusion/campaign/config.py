@@ -28,6 +28,7 @@ from fusion.effects.effect import Effect
 from fusion.effects.library import library
 from fusion.effects.thermal import QUASI_STATIC
 from fusion.errors import FusionError
+from fusion.model.fit import CAMERA_ERRORS
 
 #: What a record may be declared with: every displacement a linear function of the temperatures.
 RECORD_EFFECTS = (QUASI_STATIC,)
@@ -119,7 +120,12 @@ def _declarable(name: str, info: ValidationInfo) -> str:
         return name
     choice = f"can be declared here: {', '.join(allowed)}"
     if name in effects and not effects[name].declarable:
-        text = f"the parameters of this effect are not known beforehand; remove it, the closed loop tries it anyway; {choice}"
+        lacking = (
+            "the columns of this effect need a fitted model"
+            if name in CAMERA_ERRORS
+            else "the parameters of this effect are not known beforehand"
+        )
+        text = f"{lacking}; remove it, the closed loop tries it anyway; {choice}"
     elif name in (*effects, *RECORD_EFFECTS):
         text = f"this effect has no meaning for a {'record' if info.context.record else 'campaign with positions'}; {choice}"
     else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fusion.products.results import Cause
+from fusion.products.results_axis import Cause
 
 
 @dataclass(frozen=True)
@@ -49,3 +49,28 @@ CAUSES: dict[Cause, CauseRecord] = {
         "sensor at this position.",
     ),
 }
+
+
+def undetermined_check(leading: str) -> str:
+    """Return what to do where no cause is named, and what to inspect if the leading explanation holds after all.
+
+    Parameters
+    ----------
+    leading : str
+        Leading explanation; one that is no cause (a random walk) has nothing of its own to inspect.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> undetermined_check("step").partition(". ")[2][:50]
+    'If the cause is sudden step: inspect fixture, opti'
+    """
+    generic = CAUSES["undetermined"].check
+    candidates = {name: record for name, record in CAUSES.items() if name != "undetermined"}
+    candidate = candidates.get(leading)  # type: ignore[call-overload]
+    if candidate is None:
+        return generic
+    return f"{generic} If the cause is {candidate.words}: {candidate.check[0].lower()}{candidate.check[1:]}"

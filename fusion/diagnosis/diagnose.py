@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from fusion.diagnosis.causes import CAUSES
+from fusion.diagnosis.causes import CAUSES, undetermined_check
 from fusion.diagnosis.explanations import (
     LAGS_S,
     ProfileFit,
@@ -32,7 +32,7 @@ from fusion.diagnosis.explanations import (
     warm_up_share,
 )
 from fusion.diagnosis.scatter import ScatterFit, fit_scatter
-from fusion.products.results import Cause
+from fusion.products.results_axis import Cause
 
 #: Minimum probability of each cause, set and checked on simulated campaigns by tests/soak/test_diagnosis_rates.py.
 THRESHOLDS: dict[str, float] = {"structural": 0.3, "local_temperature": 0.8, "stick_slip": 0.4, "step": 0.6}
@@ -44,6 +44,8 @@ APPROACH_NATS = {"along": 2.1, "one_direction": 4.0, "slow": 2.0}
 WARM_UP_SHARE = 0.98
 #: Levels of the bootstrap tests; local temperature is the cause that costs most when it is wrong.
 LEVELS = {"step": 0.05, "local_temperature": 0.02}
+#: Level above which a serial p-value is called not significant in a sentence; it takes no part in the choice of the cause.
+_SERIAL_LEVEL = 0.05
 
 
 class Flagged(Protocol):
@@ -246,7 +248,7 @@ def _judge(case: _Case, direction: str) -> Diagnosis:
         evidence=_evidence(case, probability),
         for_it=tuple(_support(case, leading)),
         against_it=tuple(against),
-        check=CAUSES[cause].check,
+        check=undetermined_check(leading) if cause == "undetermined" else CAUSES[cause].check,
     )
 
 
@@ -287,14 +289,14 @@ def _support(case: _Case, leading: str) -> list[str]:
     if leading == "step":
         fit = case.step
         sentences.append(
-            f"step of {fit.coefficient:+.2f} ± {fit.coefficient_u:.2f} µm at cycle {case.step_cycle} (p = {fit.p_value:.3f}), "
-            f"hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
+            f"step of {fit.coefficient:+.2f} ± {2.0 * fit.coefficient_u:.2f} µm (k = 2) at cycle {case.step_cycle} "
+            f"(p = {fit.p_value:.3f}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
         )
     elif leading == "local_temperature" and case.temperature is not None:
         fit = case.temperature
         sentences.append(
-            f"{fit.coefficient:+.3f} ± {fit.coefficient_u:.3f} µm per K of local temperature rise, lag {LAGS_S[fit.best]:.0f} s "
-            f"(p = {fit.p_value:.3f}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
+            f"{fit.coefficient:+.3f} ± {2.0 * fit.coefficient_u:.3f} µm per K (k = 2) of local temperature rise, "
+            f"lag {LAGS_S[fit.best]:.0f} s (p = {fit.p_value:.3f}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
         )
     elif leading == "stick_slip":
         positive, negative = residual.scatter_um
@@ -305,8 +307,31 @@ def _support(case: _Case, leading: str) -> list[str]:
             f"scatter that depends on the direction of approach raises the log-likelihood by {case.approach_gain:+.1f} nats"
         )
     elif leading == "structural":
-        sentences.append(f"no significant serial correlation (p = {case.serial_p:.3f}), equal in both directions")
+        sentences += [_serial_sentence(case.serial_p), _directions_sentence(residual)]
     return sentences
+
+
+def _serial_sentence(p_value: float) -> str:
+    """Return what the order of the readings in time shows."""
+    if p_value > _SERIAL_LEVEL:
+        return f"no significant serial correlation (p = {p_value:.3f})"
+    return f"serial correlation p = {p_value:.3f}"
+
+
+def _directions_sentence(residual: Residual) -> str:
+    """Return the standard deviations of both directions, and whether they agree within their expanded uncertainty (k = 2).
+
+    The standard uncertainty of a standard deviation s of n normally distributed readings is s / sqrt(2 (n - 1)) (JCGM 100:2008, E.4.3).
+    """
+    positive, negative = residual.scatter_um
+    freedom = np.isfinite(residual.values).sum(axis=1) - 1
+    if (freedom < 1).any():
+        return "directions not compared: fewer than two readings in one of them"
+    numbers = f"{positive:.2f} µm in the positive direction, {negative:.2f} µm in the negative direction"
+    u_positive, u_negative = np.array([positive, negative]) / np.sqrt(2.0 * freedom)
+    if abs(positive - negative) <= 2.0 * np.hypot(u_positive, u_negative):
+        return f"standard deviations equal within their uncertainty: {numbers}"
+    return f"standard deviation {numbers}"
 
 
 def _evidence(case: _Case, probability: dict[str, float]) -> dict[str, Any]:

@@ -75,7 +75,7 @@ def find_field_errors(result: LoopResult, fields: xr.Dataset, fused: xr.Dataset)
             # A microsecond of slack: the instant went through seconds in floating point.
             late = (time - start) / np.timedelta64(1, "s") >= float(step.parameters["time_s"]) - 1e-6
             error = size * np.broadcast_to(late[:, None, None], fields["frame_temperature"].shape)
-            text = f"the camera read {size:+.3f} ± {u:.3f} K too high"
+            text = f"the camera read {size:+.3f} ± {2.0 * u:.3f} K (k = 2) too high"
         else:
             temperature = fields["frame_temperature"].values.astype(float)
             patch = find_switching_patch(temperature - temperature[0])
@@ -86,7 +86,7 @@ def find_field_errors(result: LoopResult, fields: xr.Dataset, fused: xr.Dataset)
             size = _agreed(size, u, 1.0)
             error = size * course[:, None, None] * patch.pattern
             height = float(course.max())
-            text = f"a reflected source added up to {size * height:.2f} ± {u * height:.2f} K over a patch"
+            text = f"a reflected source added up to {size * height:.2f} ± {2.0 * u * height:.2f} K (k = 2) over a patch"
             size, u = size * height, u * height
         touched = np.flatnonzero(np.abs(error).max(axis=(1, 2)) > 0.0)
         first = int(frame_cycle[touched[0]]) if touched.size else int(frame_cycle[-1])

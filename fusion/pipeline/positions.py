@@ -8,7 +8,7 @@ from typing import Any
 
 import xarray as xr
 
-from fusion.diagnosis.causes import CAUSES
+from fusion.diagnosis.causes import undetermined_check
 from fusion.diagnosis.diagnose import Diagnosis, diagnose
 from interferometry.anomalies import Anomaly, detect_anomalies
 from interferometry.drift.estimate import estimate_drift
@@ -78,12 +78,13 @@ def temper(anomaly: Anomaly, diagnosis: Diagnosis) -> Diagnosis:
     Returns
     -------
     Diagnosis
-        With the cause ``undetermined`` and the reason, where the anomaly's p-value is above 0.02.
+        With the cause ``undetermined``, the reason, and the check of the withdrawn cause as a condition,
+        where the anomaly's p-value is above 0.02.
     """
     if diagnosis.cause == "undetermined" or anomaly.p_value <= _CAUSE_LEVEL:
         return diagnosis
     doubt = f"the position itself is flagged only near the limit (p = {anomaly.p_value:.2g}); before a cause, it needs more cycles"
-    check = CAUSES["undetermined"].check
+    check = undetermined_check(diagnosis.cause)
     return replace(diagnosis, cause="undetermined", check=check, against_it=(doubt, *diagnosis.against_it))
 
 

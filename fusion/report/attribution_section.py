@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.attribution.family_wise import LEVEL
-from fusion.products.results import CorrelationPart, DutyPart, PlacePart, TestedPart
+from fusion.products.results_attribution import CorrelationPart, DutyPart, PlacePart, TestedPart
 from fusion.report.findings import attribution_headline, randomised_causes
 from fusion.report.plots_attribution import CHANNELS, caption_of, rate_text
 from fusion.report.tables import Row, Table, Words, table

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from fusion.diagnosis.causes import CAUSES
-from fusion.products.results import AnomalyPart, CorrelationPart, DriftPart, Iso230Part, Loop
+from fusion.products.results_attribution import CorrelationPart
+from fusion.products.results_axis import AnomalyPart, DriftPart, Iso230Part
+from fusion.products.results_loop import Loop
 from fusion.report.wording import join, number, p_value, place, quantity
 
 #: Axis values in the terms of ISO 230-2:2014, in the order of the report.

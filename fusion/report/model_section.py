@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from fusion.products.results import (
+from fusion.products.results_axis import Evidence
+from fusion.products.results_loop import (
     AxisLoop,
     Coefficient,
-    Evidence,
     HoldOutQuestion,
     Loop,
     Nothing,

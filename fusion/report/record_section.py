@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from fusion.products.results import RecordLoop, Results
+from fusion.products.results import Results
+from fusion.products.results_loop import RecordLoop, RecordScorePart
 from fusion.record.problem import ENTRY_LEVEL, EVENT_LEVEL
 from fusion.report import plots_record
 from fusion.report.model_section import parameters, refused_effects, steps_table
@@ -202,9 +203,17 @@ def _channels_table(loop: RecordLoop) -> Table:
 def _rejected_table(loop: RecordLoop) -> Table:
     """Return the candidates that passed the search and were rejected, with the reason."""
     rows = [
-        [effect_words(score.effect).name, score.rejected] for turn in loop.search for score in turn if score.rejected
+        [effect_words(score.effect).name, score.rejected]
+        for turn in loop.search
+        for score in turn
+        if _is_rejected(score)
     ]
     return table([Words("Effect"), Words("Why it did not enter")], rows, stacked=True)
+
+
+def _is_rejected(score: RecordScorePart) -> bool:
+    """Return whether a candidate was tried on the forward-chained parts and did not enter."""
+    return score.chained_rmse_after_um is not None and not score.chosen
 
 
 def _candidates_table(loop: RecordLoop) -> Table:
@@ -232,7 +241,7 @@ def _candidates_table(loop: RecordLoop) -> Table:
                     number(score.excess_gain, 3),
                     p_value(score.family_wise_p),
                     "–" if score.chained_rmse_after_um is None else f"{before} to {after}",
-                    "chosen" if score.chosen else "predicts no better" if score.rejected else "",
+                    "chosen" if score.chosen else "predicts no better" if _is_rejected(score) else "",
                 ]
             )
     return table(columns, rows)

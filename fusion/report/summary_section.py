@@ -12,7 +12,10 @@ from fusion.attribution.family_wise import LEVEL as ATTRIBUTION_LEVEL
 from fusion.diagnosis.remainder import LEVEL as REMAINDER_LEVEL
 from fusion.loop.axis import ASKED_LEVEL, ENTRY_LEVEL, SEARCH_LEVEL, SECOND_LEVEL
 from fusion.products.grouped import group, has
-from fusion.products.results import AxisLoop, Loop, NeighboursPart, Quantity, Results
+from fusion.products.results import Results
+from fusion.products.results_axis import NeighboursPart
+from fusion.products.results_loop import AxisLoop, Loop
+from fusion.products.results_part import Quantity
 from fusion.report.attribution_section import describe_correlation
 from fusion.report.findings import ISO230_TERMS, anomaly_cause, anomaly_place, iso230_values, standing_out
 from fusion.report.model_section import (

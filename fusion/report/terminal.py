@@ -14,7 +14,8 @@ from fusion.attribution.duty_plan import DutyPlanError, Machine, plan_duty, swit
 from fusion.campaign.config import CampaignError
 from fusion.campaign.inputs import counted, left_out_notices
 from fusion.campaign.quantities import read_quantity
-from fusion.products.results import Loop, Results
+from fusion.products.results import Results
+from fusion.products.results_loop import Loop
 from fusion.products.store import write_atomically
 from fusion.report.findings import (
     anomaly_cause,

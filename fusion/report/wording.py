@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fusion.diagnosis.causes import CAUSES
 from fusion.effects.library import describe_effect
-from fusion.products.results import Loop, Quantity, RecordLoop, Results
+from fusion.products.results import Results
+from fusion.products.results_loop import Loop, RecordLoop
+from fusion.products.results_part import Quantity
 
 
 class EffectWords(NamedTuple):
@@ -236,7 +237,7 @@ def next_steps(results: Results) -> list[str]:
             steps.append(
                 "Log more of what happens at the machine (duty, coolant, doors, air) in the next test: what is left has no name."
             )
-    steps += [f"Position {anomaly.target}: {CAUSES[anomaly.cause].check}" for anomaly in results.anomalies or ()]
+    steps += [f"Position {anomaly.target}: {anomaly.evidence.check}" for anomaly in results.anomalies or ()]
     steps += [warning.remedy for warning in results.warnings]
     unique = list(dict.fromkeys(step for step in steps if step))
     return unique or ["Nothing has to be done: use the profile and its uncertainty as they are."]

@@ -176,6 +176,12 @@ def test_files_and_effects_are_checked_together_with_the_values(folder: Path) ->
     )
 
 
+@pytest.mark.parametrize("effect", ["camera_offset", "reflected_source"])
+def test_an_error_of_the_camera_is_refused_for_its_true_reason(folder: Path, effect: str) -> None:
+    with pytest.raises(CampaignError, match=f'"{effect}": the columns of this effect need a fitted model; remove it'):
+        load(folder, TEXT.replace("table_offset", effect))
+
+
 def test_a_record_is_declared_with_what_has_a_meaning_for_it(folder: Path) -> None:
     assert load(folder, RECORD + '[model]\ndeclared = ["quasi_static"]\n').model.declared == ("quasi_static",)
     with pytest.raises(

@@ -1,12 +1,13 @@
 """Causes of anomalous targets: each is named where its effect is large, none where the data do not decide."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from fusion.diagnosis import causes
-from fusion.diagnosis.diagnose import THRESHOLDS, diagnose
+from fusion.diagnosis.diagnose import THRESHOLDS, _directions_sentence, _serial_sentence, diagnose
 from fusion.diagnosis.explanations import DiagnosisError
 from tests.fusion import field_simulator as simulator
 from tests.fusion.residual_simulator import CAUSES, odd_position
@@ -39,7 +40,8 @@ def test_the_step_is_dated_and_measured(rng):
     # The first reading after the step is that of cycle 61.
     assert abs(diagnosis.evidence["step_cycle"] - 61) <= 1
     assert diagnosis.evidence["step_um"] == pytest.approx(1.0, abs=4 * diagnosis.evidence["step_u_um"])
-    assert any("step of +" in sentence for sentence in diagnosis.for_it)
+    expanded = f"± {2 * diagnosis.evidence['step_u_um']:.2f} µm (k = 2)"
+    assert any("step of +" in sentence and expanded in sentence for sentence in diagnosis.for_it)
     assert diagnosis.check == causes.CAUSES["step"].check
 
 
@@ -116,3 +118,36 @@ def test_too_few_cycles_are_refused(rng):
     fused = odd_position("structural", rng).isel(cycle=slice(0, 8))
     with pytest.raises(DiagnosisError, match="target 3 has readings in 8 cycles; a diagnosis needs 12"):
         diagnose([Flag(3)], fused)
+
+
+def test_scatter_of_the_structure_is_described_by_what_was_tested():
+    assert _serial_sentence(0.051) == "no significant serial correlation (p = 0.051)"
+    assert _serial_sentence(0.05) == "serial correlation p = 0.050"
+
+
+@pytest.mark.parametrize(
+    ("negative_um", "sentence"),
+    [
+        # 51 readings each: u = s / 10, so that 1.00 and 1.30 differ by 0.30 and agree within 2 * hypot(0.10, 0.13) = 0.33.
+        (
+            1.3,
+            "standard deviations equal within their uncertainty: 1.00 µm in the positive direction, 1.30 µm in the negative direction",
+        ),
+        (1.4, "standard deviation 1.00 µm in the positive direction, 1.40 µm in the negative direction"),
+        (np.nan, "directions not compared: fewer than two readings in one of them"),
+    ],
+)
+def test_directions_are_called_equal_only_within_their_uncertainty(negative_um, sentence):
+    row = np.resize([1.0, -1.0], 51)
+    row /= row.std()
+    residual = SimpleNamespace(values=np.stack([row, negative_um * row]), scatter_um=(1.0, negative_um))
+    assert _directions_sentence(residual) == sentence
+
+
+def test_what_to_check_without_a_cause_ends_with_the_leading_candidate():
+    generic = causes.CAUSES["undetermined"].check
+    assert causes.undetermined_check("stick_slip").startswith(
+        f"{generic} If the cause is stick-slip: inspect lubrication"
+    )
+    # A random walk is no cause, so there is nothing of its own to inspect.
+    assert causes.undetermined_check("slow") == causes.undetermined_check("undetermined") == generic

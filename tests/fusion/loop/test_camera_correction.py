@@ -102,7 +102,7 @@ def test_a_step_of_the_zero_is_taken_out_from_its_frame_on() -> None:
     (error,) = find_field_errors(camera_step(0.5, 0.1, jump=0.6, time_s=90.0), small_fields(), small_fused())
     np.testing.assert_array_equal(error.correction[:, 0, 0], [0.0, 0.0, -0.6, -0.6, -0.6, -0.6])
     assert (error.effect, error.size_K, error.size_u_K, error.first_cycle) == ("camera_offset", 0.6, 0.1, 5)
-    assert error.text == "the camera read +0.600 ± 0.100 K too high from cycle 5 on"
+    assert error.text == "the camera read +0.600 ± 0.200 K (k = 2) too high from cycle 5 on"
     assert error.as_json() == {
         "effect": "camera_offset",
         "text": error.text,
@@ -139,7 +139,7 @@ def test_a_reflection_is_its_pattern_times_what_it_adds_to_its_lowest_state() ->
     assert error.size_K == pytest.approx(2.0, rel=0.02) and error.size_u_K == pytest.approx(0.1, rel=0.02)
     right = temperature + error.correction
     np.testing.assert_allclose(right, 20.0, atol=0.05)
-    assert error.text.startswith("a reflected source added up to 2.00 ± 0.10 K over a patch from cycle 4 on")
+    assert error.text.startswith("a reflected source added up to 2.00 ± 0.20 K (k = 2) over a patch from cycle 4 on")
 
 
 def field_error(*corrections: float) -> FieldFault:

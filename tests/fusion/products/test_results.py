@@ -99,3 +99,25 @@ def test_results_that_cannot_be_read_name_file_and_remedy(tmp_path: Path) -> Non
     (tmp_path / "results.json").write_text('{"schema": 1, "campaign": "A", "warnings": [], "colour": "red"}')
     with pytest.raises(ResultsError, match=r"results.json: not the results of this version .*; run the campaign again"):
         read_results(tmp_path)
+
+
+@pytest.mark.parametrize(("loop", "kind"), [(PARTS["loop"], "axis"), (RECORD_LOOP, "record")])
+def test_one_wrong_value_is_one_fault_with_its_place(tmp_path: Path, loop: dict[str, Any], kind: str) -> None:
+    document = {"schema": 1, "campaign": "A", "warnings": [], "loop": {**loop, "verdict": "perfect"}}
+    with pytest.raises(ValidationError) as caught:
+        Results.model_validate(document)
+    assert [fault["loc"] for fault in caught.value.errors()] == [("loop", kind, "verdict")]
+    (tmp_path / "results.json").write_text(json.dumps(document))
+    with pytest.raises(
+        ResultsError, match=r"thermofuse \(loop.verdict: Input should be 'complete'.*'unexplained'\); run"
+    ):
+        read_results(tmp_path)
+
+
+def test_several_faults_are_counted_after_the_first(tmp_path: Path) -> None:
+    document = deepcopy(assemble("A", PARTS, []).as_json())
+    document["anomalies"][0]["cause"] = "magic"
+    document["hotspots"][0]["colour"] = "red"
+    (tmp_path / "results.json").write_text(json.dumps(document))
+    with pytest.raises(ResultsError, match=r"\(anomalies\[0\].cause: Input should be .*, and 1 more\)"):
+        read_results(tmp_path)

@@ -46,3 +46,13 @@ def test_the_page_stays_readable_with_many_channels() -> None:
     assert (len(told["shown"]), told["omitted"]) == (6, 3)
     assert "driver" not in told["sentences"][0]
     assert "drivers" not in draw_record(record(channels=9, drivers=0))
+
+
+def test_a_candidate_that_was_tried_and_not_chosen_is_rejected_whatever_the_sentence() -> None:
+    (scores,) = RECORD_LOOP["search"]
+    tried = {**scores[0], "chosen": False, "rejected": ""}
+    untried = {**tried, "chained_rmse_after_um": None}
+    results = assemble("R", {"loop": {**RECORD_LOOP, "search": [[tried, untried]]}}, [])
+    told = describe_record(results, {"inputs": {}}, record())
+    assert [row.cells[-1] for row in told["candidates"].rows] == ["predicts no better", ""]
+    assert len(told["rejected"].rows) == 1

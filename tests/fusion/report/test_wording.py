@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from fusion.products.results import AnomalyPart, Loop, Notice, RecordLoop, Results, StepPart, Unexplained, Verdict
+from fusion.products.results_axis import Evidence
 from fusion.report import wording
 
 
@@ -68,13 +69,15 @@ def test_every_verdict_has_its_sentence(found: Loop, sentence: str) -> None:
 def test_next_steps_start_with_the_model_and_leave_out_what_asks_for_nothing() -> None:
     results = Results.model_construct(
         loop=loop("partial", "dead_path"),
-        anomalies=(AnomalyPart.model_construct(target=3, cause="structural"),),
+        anomalies=(
+            AnomalyPart.model_construct(target=3, evidence=Evidence.model_construct(check="Inspect the guide.")),
+        ),
         warnings=(Notice("gaps", "Gaps are allowed for.", ""), Notice("camera", "Late.", "Start the camera earlier.")),
     )
     first, second, third, last = wording.next_steps(results)
     assert first == wording.effect_words("dead_path").remedy
     assert second.startswith("Log more of what happens at the machine")
-    assert third.startswith("Position 3: ") and last == "Start the camera earlier."
+    assert third == "Position 3: Inspect the guide." and last == "Start the camera earlier."
     quiet = Results.model_construct(loop=loop("complete"), anomalies=(), warnings=())
     assert wording.next_steps(quiet) == ["Nothing has to be done: use the profile and its uncertainty as they are."]
 

@@ -1,0 +1,180 @@
+"""Parts of results.json on the thermograms and the readings of the axis: registration, ISO 230-2, drift, anomalies, hotspots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal, get_args
+
+from pydantic import Field
+
+from fusion.products.results_part import ByDirection, Number, Quantity, ResultPart
+
+Cause = Literal["structural", "local_temperature", "stick_slip", "step", "undetermined"]
+Direction = Literal["positive", "negative", "both"]
+CAUSES: tuple[Cause, ...] = get_args(Cause)
+
+
+class RejectedFrame(ResultPart):
+    """A thermogram that was not used."""
+
+    file: str
+    """File, relative to the campaign file."""
+    index: int
+    """Number of the frame in its file, from 0."""
+    reason: str
+    """Why it was not used."""
+
+
+class RegistrationPart(ResultPart):
+    """Registration of the thermograms to the plan."""
+
+    rms_mm: Number
+    """Root mean square of the registration residuals of the fiducials, mm."""
+    leave_one_out_mm: Mapping[str, Number]
+    """Distance by which each fiducial is missed when it takes no part in the registration, mm, by name."""
+    frames_rejected: tuple[RejectedFrame, ...]
+    """Thermograms that were not used."""
+
+
+class AlignmentPart(ResultPart):
+    """Both instruments on one clock."""
+
+    clock_offset_s: Quantity
+    """Camera clock minus laser clock, s; u is 0 where the campaign states the offset and null where it is assumed."""
+
+
+class Iso230Part(ResultPart):
+    """Axis values by ISO 230-2:2014, clause 4, of one window of cycles."""
+
+    window: str
+    """Cycles that were evaluated."""
+    B_um: Quantity
+    """Reversal error B of the axis, um."""
+    R_um: Quantity
+    """Bidirectional positioning repeatability R, um."""
+    E_um: Quantity
+    """Bidirectional systematic positioning error E, um."""
+    M_um: Quantity
+    """Mean bidirectional positioning error M, um."""
+    A_um: Quantity
+    """Bidirectional positioning accuracy A, um."""
+
+
+class NeighboursPart(ResultPart):
+    """Standard deviations of neighbour differences beside the conventional ones, per link from one target to the next."""
+
+    conventional_s_um: ByDirection
+    """Conventional standard deviation (n - 1), drift included, um."""
+    pair_s_um: ByDirection
+    """Standard deviation of the differences between neighbouring targets (n - 1), um."""
+    ratio: ByDirection
+    """Conventional standard deviation over that of the differences, 1."""
+
+
+class DriftPart(ResultPart):
+    """Joint estimate of profile and drift, per target."""
+
+    profile_um: ByDirection
+    """Positioning deviation without drift, at the mean thermal state of the test, um."""
+    profile_u_um: ByDirection
+    """Standard uncertainty of the profile, um."""
+    scatter_um: ByDirection
+    """Standard deviation of a reading after profile and drift were subtracted, um."""
+
+
+class Evidence(ResultPart):
+    """What the cause of an anomaly rests on."""
+
+    kind: Literal["scatter", "slow", "step", "periodic"]
+    """What stands out."""
+    extra_um: Number
+    """Size of what stands out beyond the other targets, um."""
+    probability: Number
+    """Probability of the leading explanation among those that were compared."""
+    support: tuple[str, ...] = Field(alias="for")
+    """Sentences for the leading explanation."""
+    against: tuple[str, ...]
+    """Sentences against it, the runner-up first."""
+    check: str
+    """What to inspect on the machine."""
+    probability_structural: Number
+    """Probability of scatter of the structure."""
+    probability_stick_slip: Number
+    """Probability of stick-slip."""
+    probability_slow: Number
+    """Probability of a slow motion without a known cause."""
+    probability_step: Number
+    """Probability of one step."""
+    probability_local_temperature: Number = None
+    """Probability of a local temperature; absent where the camera does not see the target."""
+    scatter_typical_um: Number
+    """Median scatter of the other targets, um."""
+    scatter_positive_um: Number
+    """Scatter of the approach in positive direction, um."""
+    scatter_negative_um: Number
+    """Scatter of the approach in negative direction, um."""
+    serial_p: Number
+    """p-value of the order of the readings in time."""
+    approach_gain_nats: Number
+    """Gain in log-likelihood of an effect bound to the direction of approach, nats."""
+    step_p: Number
+    """p-value of one step (parametric bootstrap)."""
+    step_um: Number
+    """Height of the step, um."""
+    step_u_um: Number
+    """Standard uncertainty of the height, um."""
+    step_cycle: int
+    """First cycle after the step."""
+    step_held_out_nats: Number
+    """Gain of the step on the direction that it was not fitted to, nats."""
+    temperature_p: Number = None
+    """p-value of the local temperature (parametric bootstrap)."""
+    temperature_um_per_K: Number = None
+    """Displacement per local rise, um/K."""
+    temperature_u_um_per_K: Number = None
+    """Standard uncertainty of the displacement per rise, um/K."""
+    temperature_lag_s: Number = None
+    """Time constant between local rise and displacement, s."""
+    temperature_held_out_nats: Number = None
+    """Gain of the local temperature on the direction that it was not fitted to, nats."""
+    temperature_warm_up_share: Number = None
+    """Share of the local rise that one warm-up curve explains, 1."""
+
+    def numbers(self) -> dict[str, float | int | None]:
+        """Return the numbers that the diagnosis states, by name."""
+        sentences = {"kind", "support", "against", "check"}
+        return {name: value for name, value in self if name in self.model_fields_set - sentences}
+
+
+class AnomalyPart(ResultPart):
+    """A target that stands out from the others."""
+
+    target: int = Field(ge=1)
+    """Target number, from 1."""
+    direction: Direction
+    """Direction of approach that stands out."""
+    p_value: Number
+    """p-value, family-wise over all targets and both directions."""
+    scatter_um: Number
+    """Standard deviation of its readings after profile and drift were subtracted, um."""
+    cause: Cause
+    """Cause, ``undetermined`` where the data do not decide."""
+    evidence: Evidence
+    """What the cause rests on."""
+
+
+class HotspotPart(ResultPart):
+    """A place that warms more than its surroundings."""
+
+    x_mm: Number
+    """Place of the peak on the plan, x, mm."""
+    y_mm: Number
+    """Place of the peak on the plan, y, mm."""
+    peak_rise_K: Number
+    """Rise of the peak since the first cycle, K."""
+    targets: tuple[int, ...]
+    """Targets whose drift follows it."""
+    p_value: Number
+    """p-value of its strongest part of the drift, family-wise over everything that was tested."""
+    lag_s: Number
+    """Time constant between its temperature and the drift, s."""

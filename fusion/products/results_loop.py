@@ -1,0 +1,367 @@
+"""Parts of results.json on the closed loop, along an axis and on a record: added effects, search, detection limits, residual."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+from fusion.products.results_part import Number, ResultPart
+
+Verdict = Literal["complete", "explained", "partial", "unexplained"]
+#: Value of a parameter of an effect: a number in the unit that its name ends with, or a word.
+Parameter = float | int | str
+#: Range of a parameter that fits as well: its ends (None where the data set none), or the other words.
+Range = tuple[Number, ...] | tuple[str, ...]
+
+
+class Nothing(ResultPart):
+    """An empty object: there is none."""
+
+
+class RunnerUp(ResultPart):
+    """The next best effect of a round of the search."""
+
+    effect: str
+    """Name of the effect."""
+    behind_by: Number
+    """Log-likelihood gain beyond chance that it lies behind the chosen effect, nats."""
+    p_value: Number
+    """Its own p-value, family-wise over the search."""
+
+
+class Coefficient(ResultPart):
+    """A coefficient of an effect, fitted to all cycles."""
+
+    value: Number
+    """Estimate."""
+    u: Number
+    """Standard uncertainty."""
+    unit: str
+    """Unit of value and uncertainty."""
+    prior: Number = None
+    """What was expected beforehand; absent where nothing was."""
+    prior_u: Number = None
+    """Standard uncertainty of what was expected."""
+
+
+class DeclaredCoefficient(Coefficient):
+    """A coefficient of a declared effect."""
+
+    effect: str
+    """Name of the effect."""
+
+
+class StepPart(ResultPart):
+    """An effect that the closed loop added."""
+
+    effect: str
+    """Name of the effect."""
+    parameters: Mapping[str, Parameter]
+    """Parameters; a name ends with its unit."""
+    parameter_ranges: Mapping[str, Range]
+    """Values of the parameters that fit as well (profile likelihood, 95 %)."""
+    p_value: Number
+    """p-value that let it in, family-wise over the search."""
+    rmse_before_um: Number
+    """Root mean square error on the hold-out without it, um."""
+    rmse_after_um: Number
+    """Root mean square error on the hold-out with it, um."""
+    rms_um: Number
+    """Root mean square of its contribution, um."""
+    tied: tuple[str, ...]
+    """Effects that these data cannot tell from it."""
+    runner_up: RunnerUp | Nothing
+    """The next best effect."""
+    confirmed: str
+    """How it was confirmed."""
+
+
+class AxisStep(StepPart):
+    """An effect that the closed loop added along an axis."""
+
+    coefficients: tuple[Coefficient, ...]
+    """Coefficients of its columns."""
+    held_out_p: Number
+    """p-value of its gain on readings that its coefficients were not fitted to."""
+    event_cycle: int | None
+    """Cycle in which an event happened; null for an effect that is no event."""
+
+
+class RecordStep(StepPart):
+    """An effect that the closed loop added on a record."""
+
+    rms_by_channel_um: Mapping[str, Number]
+    """Root mean square of its contribution, um, by channel."""
+    chained_rmse_before_um: Number
+    """Error of the forward-chained parts before it, um."""
+    chained_rmse_after_um: Number
+    """Error of the forward-chained parts with it, um."""
+    rejected: Mapping[str, str]
+    """Effects of the same round that were rejected, with the reason."""
+    event_s: Number
+    """Instant of an event, s from the start; null for an effect that is no event."""
+
+
+class Unexplained(ResultPart):
+    """Structure that the final model leaves."""
+
+    shape: str
+    """What it looks like; empty where nothing is left."""
+    rms_um: Number
+    """Its root mean square, um."""
+    p_value: Number
+    """p-value of any structure in the residual, family-wise over the shapes."""
+    nearest: str
+    """Effect that comes closest to it; empty where none does."""
+
+
+class AxisUnexplained(Unexplained):
+    """Structure that the final model leaves along an axis."""
+
+    nearest_p: Number
+    """p-value of the nearest effect in the search."""
+    nearest_share: Number
+    """Share of the structure that the nearest effect explains, 1."""
+
+
+class RecordUnexplained(Unexplained):
+    """Structure that the final model leaves of a record."""
+
+    p_values: Mapping[str, Number]
+    """p-value by shape, each shape by itself."""
+    variance_share: Number
+    """Share of the displacements' variance on the hold-out that is left, mean over the channels, 1."""
+
+
+class Nuisance(ResultPart):
+    """Drift that the model lets wander beside profile and effects."""
+
+    kind: Literal["random walk", "integrated random walk"]
+    """Stochastic model of this drift."""
+    common_rms_um: Number
+    """Root mean square of the part that all targets share, um."""
+    stretch_rms_um: Number
+    """Root mean square of the stretch at the far end of travel, um."""
+    common_um_per_sqrt_h: Number = None
+    """Process noise of the common part of a random walk, um/sqrt(h)."""
+    stretch_um_per_sqrt_h: Number = None
+    """Process noise of the stretch of a random walk, um/sqrt(h)."""
+    common_um_in_1_h: Number = None
+    """What the common part of an integrated random walk reaches in one hour, um."""
+    stretch_um_in_1_h: Number = None
+    """What the stretch of an integrated random walk reaches in one hour, um."""
+
+
+class HoldOutQuestion(ResultPart):
+    """The one question that was put to the hold-out."""
+
+    effect: str
+    """Name of the effect."""
+    parameters: Mapping[str, Parameter]
+    """Parameters; a name ends with its unit."""
+    rmse_before_um: Number
+    """Root mean square error on the hold-out without it, um."""
+    rmse_after_um: Number
+    """Root mean square error on the hold-out with it, um."""
+    p_value: Number
+    """p-value of its gain on the hold-out."""
+    entered: bool
+    """Whether it entered the model."""
+
+
+class CandidateScore(ResultPart):
+    """Best candidate of one effect in one round of the search."""
+
+    effect: str
+    """Name of the effect."""
+    parameters: Mapping[str, Parameter]
+    """Parameters of the best candidate; empty where none can be told from the model."""
+    gain: Number
+    """Gain in log-likelihood, nats."""
+    excess_gain: Number
+    """Gain beyond the mean gain where nothing is missing, nats."""
+    p_value: Number
+    """p-value of the gain for this effect alone."""
+    family_wise_p: Number
+    """p-value of the gain, family-wise over the search."""
+
+
+class AxisScore(CandidateScore):
+    """Best candidate of one effect along an axis."""
+
+    held_out_gain: Number
+    """Gain on readings that its coefficients were not fitted to, nats."""
+    held_out_p: Number
+    """p-value of that gain."""
+    share_not_separable: Number
+    """Share of the candidates that are collinear with the model, 1."""
+
+
+class RecordScorePart(CandidateScore):
+    """Best candidate of one effect on a record."""
+
+    chained_rmse_before_um: Number
+    """Error of the forward-chained parts before the round, um."""
+    chained_rmse_after_um: Number
+    """Error of the forward-chained parts with it, um; null where it was not tried."""
+    chosen: bool
+    """Whether it entered the model."""
+    rejected: str
+    """Why it did not enter; empty where it did or was not tried."""
+
+
+class DetectionLimit(ResultPart):
+    """How large an effect must be to be detected with these readings."""
+
+    effect: str
+    """Name of the effect."""
+    detectable_um: Number
+    """Root mean square detected with 80 % power, median over the candidates, um; null where none can be told from the model."""
+    best_um: Number
+    """The same for the candidate that is easiest to detect, um."""
+    worst_um: Number
+    """The same for the candidate that is hardest to detect, um."""
+    visible_share: Number
+    """Share of the effect's root mean square that profile and declared effects leave, 1."""
+    looks_like: tuple[str, ...]
+    """Effects that are collinear with what is visible of it."""
+    note: str
+    """What stands in the way; empty where nothing does."""
+
+
+class FieldCorrection(ResultPart):
+    """An error of the camera that was taken out of the fields."""
+
+    effect: str
+    """``camera_offset`` or ``reflected_source``."""
+    text: str
+    """What was wrong, in one sentence."""
+    size_K: Number
+    """Largest size of the error, K."""
+    size_u_K: Number
+    """Standard uncertainty of the size, K."""
+    first_cycle: int
+    """First cycle whose field it touches."""
+
+
+class ResidualPart(ResultPart):
+    """Tests of the residual of one model."""
+
+    p_values: Mapping[str, Number]
+    """p-value by shape (permutation test), each shape by itself."""
+    drift_common_um: Number
+    """Root mean square of the unexplained drift that all targets share, um."""
+    drift_stretch_um: Number
+    """Root mean square of the unexplained stretch at the far end of travel, um."""
+    event_s: Number
+    """Instant of the strongest shift, s from the first reading."""
+    period_min: Number
+    """Period of the strongest rhythm, min."""
+    period_is_cycle: bool
+    """Whether that period is the cycle's own or a part of it."""
+
+
+class ResidualTestsPart(ResultPart):
+    """Tests of the residual before and after the closed loop."""
+
+    declared: ResidualPart
+    """Residual of the declared model."""
+    final: ResidualPart
+    """Residual of the final model."""
+
+
+class Loop(ResultPart):
+    """What the closed loop found, whatever it was closed on."""
+
+    declared: tuple[str, ...]
+    """Declared effects."""
+    held_out: str
+    """What was held out."""
+    noise_floor_um: Number
+    """Standard deviation of a single reading or block mean that no model explains, um."""
+    rmse_persistence_um: Number
+    """Root mean square error on the hold-out of repeating the last value, um."""
+    rmse_declared_um: Number
+    """Root mean square error on the hold-out of the declared model, um."""
+    rmse_final_um: Number
+    """Root mean square error on the hold-out of the final model, um."""
+    steps: tuple[StepPart, ...]
+    """Effects that were added, in turn."""
+    verdict: Verdict
+    """complete: nothing lacks; explained: effects were added, nothing is left; partial: something is left; unexplained: no effect fits."""
+    unexplained: Unexplained
+    """What is left."""
+    not_tried: Mapping[str, str]
+    """Effects that were not tried, with the reason."""
+    blocked: Mapping[str, str]
+    """Effects that were tried and not admitted, with the reason."""
+
+
+class AxisLoop(Loop):
+    """What the closed loop found along an axis."""
+
+    declared_coefficients: tuple[DeclaredCoefficient, ...]
+    """Coefficients of the declared effects."""
+    steps: tuple[AxisStep, ...]
+    """Effects that were added, in turn."""
+    unexplained: AxisUnexplained
+    """What is left."""
+    nuisance: Nuisance
+    """Drift without a cause in the final model."""
+    sealed_question: HoldOutQuestion | Nothing
+    """The one question that was put to the hold-out."""
+    search: tuple[tuple[AxisScore, ...], ...]
+    """Scores of every round of the search."""
+    identifiability: tuple[DetectionLimit, ...]
+    """Detection limits of the effects."""
+    field_corrections: tuple[FieldCorrection, ...]
+    """Errors of the camera that were taken out of the fields."""
+    residual_tests: ResidualTestsPart
+    """Tests of the residual."""
+
+
+class ChannelErrors(ResultPart):
+    """Errors of one channel of a record on the hold-out."""
+
+    rmse_persistence_um: Number
+    """Root mean square error of repeating the last value, um."""
+    rmse_declared_um: Number
+    """Root mean square error of the declared model, um."""
+    rmse_final_um: Number
+    """Root mean square error of the final model, um."""
+    noise_um: Number
+    """Standard deviation of a block mean that no model explains, um."""
+    variance_share: Number
+    """Share of the displacement's variance on the hold-out that is left, 1."""
+
+
+class ChainedPart(ResultPart):
+    """One part of a record, predicted by the whole procedure on the time before it; errors are means over the channels."""
+
+    first_h: Number
+    """Start of the part, h."""
+    last_h: Number
+    """End of the part, h."""
+    effects: tuple[str, ...]
+    """Effects found before it."""
+    rmse_persistence_um: Number
+    """Root mean square error of repeating the last value, um."""
+    rmse_declared_um: Number
+    """Root mean square error of the declared model, um."""
+    rmse_final_um: Number
+    """Root mean square error of the final model, um."""
+
+
+class RecordLoop(Loop):
+    """What the closed loop found on a record; errors are means over the channels."""
+
+    steps: tuple[RecordStep, ...]
+    """Effects that were added, in turn."""
+    unexplained: RecordUnexplained
+    """What is left."""
+    channels: Mapping[str, ChannelErrors]
+    """Errors by channel."""
+    chained: tuple[ChainedPart, ...]
+    """Forward-chained parts."""
+    search: tuple[tuple[RecordScorePart, ...], ...]
+    """Scores of every round of the search."""

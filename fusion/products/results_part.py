@@ -1,0 +1,40 @@
+"""What the parts of results.json have in common: their base class, types of values, and quantities with an uncertainty.
+
+A number is None (``null`` in the file) where the data do not determine it.
+"""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict
+
+Number = float | None
+
+
+class ResultPart(BaseModel):
+    """Base class of every part: immutable, without unknown keys, each field described by its docstring."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", use_attribute_docstrings=True, serialize_by_alias=True, allow_inf_nan=False
+    )
+
+
+class Quantity(ResultPart):
+    """A measured value with its standard uncertainty."""
+
+    value: Number
+    """Estimate, in the unit that the key ends with."""
+    u: Number
+    """Standard uncertainty (k = 1), same unit; null where it is not known."""
+
+
+class ByDirection(ResultPart):
+    """One value per target for each direction of approach; a direction that was not measured is absent."""
+
+    positive: tuple[Number, ...] = ()
+    """Values of the approach in positive direction, in the order of the targets."""
+    negative: tuple[Number, ...] = ()
+    """Values of the approach in negative direction, in the order of the targets."""
+
+    def values(self) -> list[float]:
+        """Return the values of both directions that are determined."""
+        return [value for value in (*self.positive, *self.negative) if value is not None]
