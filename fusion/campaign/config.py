@@ -28,7 +28,6 @@ from fusion.effects.effect import Effect
 from fusion.effects.library import library
 from fusion.effects.thermal import QUASI_STATIC
 from fusion.errors import FusionError
-from fusion.model.fit import CAMERA_ERRORS
 
 #: What a record may be declared with: every displacement a linear function of the temperatures.
 RECORD_EFFECTS = (QUASI_STATIC,)
@@ -122,7 +121,7 @@ def _declarable(name: str, info: ValidationInfo) -> str:
     if name in effects and not effects[name].declarable:
         lacking = (
             "the columns of this effect need a fitted model"
-            if name in CAMERA_ERRORS
+            if effects[name].errs_camera
             else "the parameters of this effect are not known beforehand"
         )
         text = f"{lacking}; remove it, the closed loop tries it anyway; {choice}"

@@ -13,6 +13,8 @@ from fusion.effects.states import thermal_states, unit_of_state
 
 #: Shortest lead of a screw that is tried where the targets are spaced unevenly.
 SHORTEST_LEAD_MM = 4.0
+#: Smallest amplitude of a wave at the targets that is more than rounding.
+_VISIBLE = 1e-6
 
 
 def _needs_both_directions(readings: Readings) -> str | None:
@@ -95,13 +97,15 @@ def _pitch_error(readings: Readings, _: Mapping[str, float], near: Candidate | N
     for frequency in frequencies:
         phase = 2 * np.pi * frequency * readings.position_mm
         waves = np.column_stack([np.cos(phase), np.sin(phase)])
+        # Targets at every half wave show one phase only; what is left of the other is rounding.
+        waves = waves[:, np.abs(waves).max(axis=0) > _VISIBLE]
         for state, followed in states:
             parameters: Parameters = {
                 **followed,
                 "period_mm": float(1 / frequency),
                 "possible_leads": _aliased_lead_mm(readings, frequency),
             }
-            yield Candidate(waves * state[:, None], parameters, (unit_of_state(readings, followed),) * 2)
+            yield Candidate(waves * state[:, None], parameters, (unit_of_state(readings, followed),) * waves.shape[1])
 
 
 def _hidden_leads(readings: Readings) -> str:
