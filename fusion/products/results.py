@@ -716,6 +716,41 @@ class RecordLoop(Loop):
     """Scores of every round of the search."""
 
 
+class CheckPart(_Part):
+    """One consistency check of the inputs."""
+
+    code: str
+    """Short name; under ``[accept] doubts`` of the campaign file it says that the doubt is known."""
+    value: Number
+    """What was found, in the unit that the evidence names."""
+    limit: Number
+    """Limit that the value is held against."""
+    passed: bool
+    """Whether the inputs agree."""
+    evidence: str
+    """One sentence with the numbers."""
+    remedy: str
+    """What to correct; empty where the check is passed."""
+    endangers: str
+    """Figures that are wrong if the doubt is right."""
+
+
+class InputsPart(_Part):
+    """Whether instruments, logs and physics agree."""
+
+    state: Literal["sound", "doubted", "corrected"]
+    """``doubted``: a check is not passed and not accepted, so that causes hold only if the input is right."""
+    accepted: tuple[str, ...]
+    """Codes of the doubts that the campaign file accepts."""
+    checks: tuple[CheckPart, ...]
+    """Every check, also those that are passed."""
+
+    @property
+    def doubts(self) -> tuple[CheckPart, ...]:
+        """Checks that are not passed and not accepted."""
+        return tuple(check for check in self.checks if not check.passed and check.code not in self.accepted)
+
+
 class Results(_Part):
     """results.json of a run; a part that a campaign does not have is absent."""
 
@@ -727,6 +762,8 @@ class Results(_Part):
     """Title of the campaign."""
     warnings: tuple[Notice, ...]
     """Everything that was left out, is doubtful, or was not possible."""
+    inputs: InputsPart | None = None
+    """Consistency of the inputs."""
     registration: RegistrationPart | None = None
     """Registration of the thermograms to the plan."""
     alignment: AlignmentPart | None = None
