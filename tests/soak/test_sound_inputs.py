@@ -64,7 +64,7 @@ def test_sound_campaigns_are_not_doubted(capsys: pytest.CaptureFixture[str]) -> 
         result = close_loop(read_fused(fused), ["axis_expansion", "table_offset"])
         times = deviations["time"].values.ravel()
         checks = [
-            *check_readings(deviations, plan_extent_mm=truth.recipe.plan.size_mm[0]),
+            *check_readings(deviations, plan_extent_mm=truth.recipe.plan.width_mm),
             *check_log(environment, times, name="environment", file="environment.csv", endangers=""),
             *check_log(drivers, times, name="drivers", file="drivers.csv", endangers=""),
             *check_expansion(result.declared_coefficients),
