@@ -21,6 +21,9 @@ CODES = (
     "approach_labels",
     "environment_coverage",
     "drivers_coverage",
+    "camera_settings",
+    "camera_parameters",
+    "camera_range",
     "expansion_coefficient",
 )
 

@@ -9,8 +9,10 @@ from fusion.campaign.config import CampaignError
 from fusion.campaign.inputs import Source
 from fusion.consistency.checks import CODES, Check
 from fusion.consistency.coefficients import check_expansion
+from fusion.consistency.frames import check_frames
 from fusion.consistency.logs import check_log
 from fusion.consistency.readings import check_readings
+from fusion.pipeline.thermal import overridden_parameters
 
 
 def check_source(source: Source) -> list[Check]:
@@ -24,7 +26,7 @@ def check_source(source: Source) -> list[Check]:
     Returns
     -------
     list of Check
-        Of the readings and of the logs.
+        Of the readings, the logs and the frames.
 
     Raises
     ------
@@ -57,6 +59,7 @@ def check_source(source: Source) -> list[Check]:
             file=drivers.file if drivers is not None else "the drivers' log",
             endangers="every effect that follows a load, and the verdict that none is missing",
         ),
+        *check_frames(source.frames, overridden=set(overridden_parameters(source))),
     ]
 
 
