@@ -15,7 +15,14 @@ APART = {"benchmarks", "soak"}
 #: Modules without a test file of their name: types, errors and packaging, which every test uses.
 NO_TEST_OF_THEIR_OWN = {"__init__", "_constants", "_typing", "errors"}
 #: Parts of one thing that are tested where they are put together.
-TESTED_TOGETHER = {"results_attribution", "results_axis", "results_loop", "results_part", "results_record"}
+TESTED_TOGETHER = {
+    "results_attribution",
+    "results_axis",
+    "results_inputs",
+    "results_loop",
+    "results_part",
+    "results_record",
+}
 
 
 def modules(package: str) -> list[Path]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -263,10 +263,39 @@ def _warn_times(references: Sequence[FrameReference]) -> Iterator[FileWarning]:
         )
 
 
-def _warn_parameters(p: CameraParameters, references: Sequence[FrameReference]) -> Iterator[FileWarning]:
-    """Warn about implausible parameters."""
+def check_series(references: Sequence[FrameReference], *, overridden: Collection[str] = ()) -> list[FileWarning]:
+    """Check the settings that the frames of one series store, without reading a pixel.
+
+    Parameters
+    ----------
+    references : sequence of FrameReference
+        Frames of one measurement.
+    overridden : collection of str
+        Names of the `CameraParameters` that are replaced anyway; what is stored of them does not matter.
+
+    Returns
+    -------
+    list of FileWarning
+        About frames of several cameras, parameters that vary within the series, and implausible parameters.
+
+    Notes
+    -----
+    Meaning of the parameters: docs/method/radiometry.md.
+    """
+    if not references:
+        return []
+    cameras = [warning for warning in _warn_times(references) if warning.code == "several_cameras"]
+    return [*cameras, *_warn_parameters(references[0].parameters, references, overridden)]
+
+
+def _warn_parameters(
+    p: CameraParameters, references: Sequence[FrameReference], overridden: Collection[str] = ()
+) -> Iterator[FileWarning]:
+    """Warn about implausible parameters that are not overridden."""
     varying = [
-        each.name for each in fields(p) if len({getattr(frame.parameters, each.name) for frame in references}) > 1
+        each.name
+        for each in fields(p)
+        if each.name not in overridden and len({getattr(frame.parameters, each.name) for frame in references}) > 1
     ]
     if varying:
         yield FileWarning(
@@ -275,6 +304,8 @@ def _warn_parameters(p: CameraParameters, references: Sequence[FrameReference]) 
             "Override them if the scene did not change.",
         )
     for name in ("reflected_temperature_K", "atmospheric_temperature_K"):
+        if name in overridden:
+            continue
         value, quantity = getattr(p, name), name.removesuffix("_K").replace("_", " ")
         if not value > 150:
             yield FileWarning(
@@ -288,17 +319,17 @@ def _warn_parameters(p: CameraParameters, references: Sequence[FrameReference]) 
                 f"{quantity} {value - ZERO_CELSIUS_K:.0f} degC: probably K stored as degC.",
                 f"Give {quantity.replace(' ', '_')}.",
             )
-    if not 0 < p.emissivity < 1:
+    if "emissivity" not in overridden and not 0 < p.emissivity < 1:
         yield FileWarning(
             "emissivity", f"emissivity {p.emissivity:g} is not that of a real surface.", "Give emissivity."
         )
-    if p.object_distance_m <= 0:
+    if "object_distance_m" not in overridden and p.object_distance_m <= 0:
         yield FileWarning(
             "distance_zero",
             f"distance {p.object_distance_m:g} m: the atmosphere is not corrected.",
             "Give object_distance.",
         )
-    if not 0 < p.relative_humidity <= 1:
+    if "relative_humidity" not in overridden and not 0 < p.relative_humidity <= 1:
         yield FileWarning(
             "humidity", f"relative humidity {p.relative_humidity:g}.", "Give relative_humidity as a fraction."
         )
@@ -336,7 +367,7 @@ def _warn_pixels(frames: Sequence[Frame]) -> Iterator[FileWarning]:
                 f"up to {share} of the pixels of a frame are {label} of the calibrated range of the camera.",
                 "Select another range in the camera.",
             )
-    outside_share = max((_share_outside(frame) for frame in frames), default=0.0)
+    outside_share = max((share_outside_range(frame) for frame in frames), default=0.0)
     if outside_share > 0:
         limits = frames[0].limits
         yield FileWarning(
@@ -353,8 +384,19 @@ def _warn_pixels(frames: Sequence[Frame]) -> Iterator[FileWarning]:
         )
 
 
-def _share_outside(frame: Frame) -> float:
-    """Return the share of pixels outside the temperatures for which the camera is calibrated."""
+def share_outside_range(frame: Frame) -> float:
+    """Share of the pixels outside the temperatures for which the camera is calibrated.
+
+    Parameters
+    ----------
+    frame : Frame
+        With the parameters and limits that it stores.
+
+    Returns
+    -------
+    float
+        0 where the file stores no limits or gives no temperature.
+    """
     limits = frame.limits
     if not limits.maximum_K > limits.minimum_K > 0:
         return 0.0

@@ -287,6 +287,12 @@ class ModelTable(_Table):
     declared: DeclaredEffects = ("axis_expansion", "table_offset")
 
 
+class AcceptTable(_Table):
+    """``[accept]``: what the user knows of the inputs, so that it is no doubt any more."""
+
+    doubts: Annotated[tuple[str, ...], AfterValidator(_each_once)] = ()
+
+
 class Campaign(_Table):
     """A checked campaign file. Paths are absolute; every number is in the unit that its name states."""
 
@@ -298,6 +304,7 @@ class Campaign(_Table):
     drivers: DriversTable | None = None
     record: RecordTable | None = None
     model: ModelTable = ModelTable()
+    accept: AcceptTable = AcceptTable()
 
     @property
     def folder(self) -> Path:

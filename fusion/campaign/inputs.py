@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -140,6 +141,11 @@ def read_source(campaign: Campaign) -> Source:
         for frame in frames
         if np.isnat(frame.time)
     ]
+    timed, odd = _of_one_size(timed)
+    rejected_frames += [
+        {"file": relative_name(frame.path, campaign.folder), "index": frame.index, "reason": reason}
+        for frame, reason in odd
+    ]
     source = Source(
         campaign, thermography, plan, interferometry, deviations if by_camera else compensated.deviations, environment, drivers,
         read_fiducials(campaign.resolve(plan.fiducials)), timed, rejected_frames,
@@ -148,6 +154,17 @@ def read_source(campaign: Campaign) -> Source:
     )  # fmt: skip
     source.notices[:0] = _notices(source)
     return source
+
+
+def _of_one_size(frames: list[FrameReference]) -> tuple[list[FrameReference], list[tuple[FrameReference, str]]]:
+    """Keep the frames of the size that most of them have; the others with the reason."""
+    if not frames:
+        return [], []
+    counted_shapes = Counter(frame.shape for frame in frames)
+    shape = counted_shapes.most_common(1)[0][0]
+    kept = [frame for frame in frames if frame.shape == shape]
+    reason = "{1} x {0} pixels among frames of {3} x {2}"
+    return kept, [(frame, reason.format(*frame.shape, *shape)) for frame in frames if frame.shape != shape]
 
 
 def compensate_by_camera(source: Source, fields: xr.Dataset) -> tuple[Source, list[Notice]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,8 +12,10 @@ from typing import Any
 
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import Source, compensate_by_camera, read_source
+from fusion.consistency.checks import Check, doubt_notices, inputs_part, refuse_contradictions
 from fusion.pipeline import attribution, drift_model, interferometry, thermal
 from fusion.pipeline import record as record_stage
+from fusion.pipeline.consistency import check_loop, check_source
 from fusion.pipeline.provenance import describe_run, hash_inputs, versions
 from fusion.products.progress import Report, silent
 from fusion.products.results import Notice, Outcome, Results, assemble
@@ -184,8 +186,10 @@ def run_campaign(
         record = record_stage.read_source(campaign)
         return _run_record(_open_run(campaign, folder, resume=resume, report=report), record)
     source = read_source(campaign)
+    checks = check_source(source)
+    refuse_contradictions(checks)
     run = _open_run(campaign, folder, resume=resume, report=report)
-    return _run_instruments(run, source, scheduler=scheduler)
+    return _run_instruments(run, source, checks, scheduler=scheduler)
 
 
 def _open_run(campaign: Campaign, folder: Path, *, resume: bool, report: Report) -> Run:
@@ -196,7 +200,7 @@ def _open_run(campaign: Campaign, folder: Path, *, resume: bool, report: Report)
     return Run(campaign, folder, report, StageStamps(folder), inputs, started)
 
 
-def _run_instruments(run: Run, source: Source, *, scheduler: str | None) -> Results:
+def _run_instruments(run: Run, source: Source, checks: Sequence[Check], *, scheduler: str | None) -> Results:
     """Run a campaign with both instruments, stage after stage."""
     folder, report = run.folder, run.report
     run.notices.extend(source.notices)
@@ -238,6 +242,10 @@ def _run_instruments(run: Run, source: Source, *, scheduler: str | None) -> Resu
     fusion = run.described(drift_model.join_fusion(fused, maps, model))
     write_dataset(folder / "fusion.nc", fusion)
     thermal.write_exr(folder / "maps", fields, report=report)
+    accepted = run.campaign.accept.doubts
+    checks = [*checks, *check_loop(run.parts["loop"])]
+    run.parts["inputs"] = inputs_part(checks, accepted)
+    run.notices = [*doubt_notices(checks, accepted), *run.notices]
     return _finish(run, {"fields": fields, "deviations": deviations, "fusion": fusion})
 
 

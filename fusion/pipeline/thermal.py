@@ -71,7 +71,7 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
     ContractError
         If the fields break their contract.
     """
-    override = Overrides(_campaign_constants(source))
+    override = Overrides(overridden_parameters(source))
     notices = _camera_notices(source, override, report=report)
     if source.thermography.table == "still":
         notices += pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:_PIXEL_FRAMES]]))
@@ -172,8 +172,19 @@ def _reduce(
     return reduce_frames(source.frames, registration, source.grid, bounds, **common)
 
 
-def _campaign_constants(source: Source) -> dict[str, float]:
-    """Return the camera parameters that the campaign file overrides, in the units of the parameters."""
+def overridden_parameters(source: Source) -> dict[str, float]:
+    """Return the camera parameters that the campaign file overrides.
+
+    Parameters
+    ----------
+    source : Source
+        Inputs of the campaign.
+
+    Returns
+    -------
+    dict of str to float
+        By name of the attribute of `CameraParameters`, in its unit.
+    """
     table = source.thermography
     given = {
         "emissivity": table.emissivity,

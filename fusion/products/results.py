@@ -26,6 +26,7 @@ from fusion.products.results_axis import (
     NeighboursPart,
     RegistrationPart,
 )
+from fusion.products.results_inputs import InputsPart
 from fusion.products.results_loop import (
     AxisLoop,
     Coefficient,
@@ -102,6 +103,8 @@ class Results(ResultPart):
     """Title of the campaign."""
     warnings: tuple[Notice, ...]
     """Everything that was left out, is doubtful, or was not possible."""
+    inputs: InputsPart | None = None
+    """Consistency of the inputs."""
     registration: RegistrationPart | None = None
     """Registration of the thermograms to the plan."""
     alignment: AlignmentPart | None = None

@@ -97,6 +97,7 @@ def describe_record(results: Results, provenance: Mapping[str, Any], record: xr.
         "subtitle": _start(time[0]),
         "verdict": loop.verdict,
         "headline": verdict_headline(loop),
+        "doubts": (),
         "sentences": [
             f"Measured: {len(channels)} displacements and {record.sizes['sensor']} temperatures over {duration(span_s)}"
             + (f", with {drivers} as driver." if drivers else "."),

@@ -28,6 +28,7 @@ from fusion.report.model_section import (
 )
 from fusion.report.tables import Table, Words, table
 from fusion.report.wording import (
+    conditional_headline,
     decimals_of,
     duration,
     effect_words,
@@ -37,7 +38,6 @@ from fusion.report.wording import (
     number,
     p_value,
     quantity,
-    verdict_headline,
     verdict_numbers,
 )
 from interferometry.figures import time_span
@@ -106,7 +106,8 @@ def describe_campaign(
     return {
         "subtitle": _subtitle(provenance, deviations),
         "verdict": results.loop.verdict if results.loop else "",
-        "headline": verdict_headline(results.loop) if results.loop else "Evaluated without a model of the drift.",
+        "headline": conditional_headline(results),
+        "doubts": results.inputs.doubts if results.inputs else (),
         "sentences": sentences,
         "numbers": _numbers(results, deviations, fields),
         "next": next_steps(results)[:6],

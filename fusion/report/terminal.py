@@ -27,7 +27,7 @@ from fusion.report.findings import (
     scatter_range,
 )
 from fusion.report.tables import Words, print_table, table
-from fusion.report.wording import duration, join, moment, number, p_value, print_unit, verdict_headline
+from fusion.report.wording import conditional_headline, duration, join, moment, number, p_value, print_unit
 from interferometry import iso230
 from interferometry.inspection import describe_test
 from interferometry.io.readers import read_deviations, read_environment
@@ -59,6 +59,9 @@ def summary_rows(results: Results) -> list[tuple[str, str]]:
         Results of a run.
     """
     rows: list[tuple[str, str]] = []
+    if results.inputs is not None:
+        doubts = [f"doubted: {check.evidence} {check.remedy}" for check in results.inputs.doubts]
+        rows.append(("inputs", "\n".join(doubts) or f"sound in {len(results.inputs.checks)} checks"))
     if results.registration is not None:
         rows.append(("registration", f"{number(results.registration.rms_mm, 2)} mm rms"))
     if results.iso230 is not None:
@@ -77,11 +80,11 @@ def summary_rows(results: Results) -> list[tuple[str, str]]:
         shown = [f"cause by randomised duty: {join(causes)}"] if causes else []
         rows.append(("drift and field", "\n".join([attribution_headline(results.correlation), *shown])))
     if results.loop is not None:
-        rows += _loop_rows(results.loop)
+        rows += _loop_rows(results.loop, conditional_headline(results))
     return rows + [("warning", warning.message) for warning in results.warnings]
 
 
-def _loop_rows(loop: Loop) -> list[tuple[str, str]]:
+def _loop_rows(loop: Loop, headline: str) -> list[tuple[str, str]]:
     rows = [("declared", ", ".join(loop.declared) or "nothing")]
     for step in loop.steps:
         errors = f"{number(step.rmse_before_um, 3)} -> {number(step.rmse_after_um, 3)} µm"
@@ -90,7 +93,7 @@ def _loop_rows(loop: Loop) -> list[tuple[str, str]]:
         *rows,
         ("held-out error", hold_out_errors(loop)),
         ("noise floor", f"{number(loop.noise_floor_um, 3)} µm"),
-        ("verdict", f"{loop.verdict}: {verdict_headline(loop)}"),
+        ("verdict", f"{loop.verdict}: {headline}"),
     ]
 
 

@@ -217,8 +217,24 @@ def verdict_numbers(loop: Loop) -> str:
     return f"Error on {where}: {errors}; the noise of {noise} is {number(loop.noise_floor_um, 2)} µm."
 
 
+def conditional_headline(results: Results) -> str:
+    """Return the headline of a run, conditional where an input is doubted.
+
+    Parameters
+    ----------
+    results : Results
+        Results of a run.
+    """
+    headline = verdict_headline(results.loop) if results.loop else "Evaluated without a model of the drift."
+    doubts = results.inputs.doubts if results.inputs else ()
+    if not doubts:
+        return headline
+    noun = "the doubted input is" if len(doubts) == 1 else f"the {len(doubts)} doubted inputs are"
+    return f"Only if {noun} right: {headline[0].lower()}{headline[1:]}"
+
+
 def next_steps(results: Results) -> list[str]:
-    """Return what to do next: first what the loop found, then the anomalies, then the remedies of the warnings.
+    """Return what to do next: first doubted inputs, then what the loop found, then the anomalies, then the remedies of the warnings.
 
     Parameters
     ----------
@@ -230,9 +246,9 @@ def next_steps(results: Results) -> list[str]:
     list of str
         Sentences, each once; one that says so where nothing has to be done.
     """
-    steps = []
+    steps = [check.remedy for check in results.inputs.doubts] if results.inputs else []
     if results.loop is not None:
-        steps = [effect_words(step.effect).remedy for step in results.loop.steps]
+        steps += [effect_words(step.effect).remedy for step in results.loop.steps]
         if results.loop.verdict in {"partial", "unexplained"}:
             steps.append(
                 "Log more of what happens at the machine (duty, coolant, doors, air) in the next test: what is left has no name."

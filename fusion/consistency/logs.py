@@ -1,0 +1,73 @@
+"""Checks of the logs: whether they cover the time of the readings."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from fusion.consistency.checks import Check, Severity
+
+#: Share of the readings that a log has to cover.
+_LEAST_COVERED = 0.9
+#: A gap is a stretch without a sample that is longer than this, s, and ten times the usual step.
+_GAP_S = 600.0
+
+
+def check_log(
+    log: xr.Dataset | None, times: NDArray[np.datetime64], *, name: str, file: str, endangers: str
+) -> list[Check]:
+    """Check that a log covers the time of the readings.
+
+    Parameters
+    ----------
+    log : Dataset or None
+        Along ``time`` (UTC); None where nothing was logged.
+    times : (n,) ndarray of datetime64
+        Times of the readings, UTC; NaT where a reading has no time.
+    name : str
+        ``environment`` or ``drivers``.
+    file : str
+        The file, for the message.
+    endangers : str
+        Figures that follow the log.
+
+    Returns
+    -------
+    list of Check
+        Empty where nothing was logged.
+    """
+    if log is None or log.sizes["time"] == 0:
+        return []
+    readings = times[~np.isnat(times)]
+    if readings.size == 0:
+        return []
+    covered = _covered(log["time"].values, readings)
+    passed = covered >= _LEAST_COVERED
+    first, last = (np.datetime_as_string(log["time"].values[k], unit="s") for k in (0, -1))
+    span = f"{np.datetime_as_string(readings.min(), unit='s')}Z to {np.datetime_as_string(readings.max(), unit='s')}Z"
+    return [
+        Check(
+            f"{name}_coverage",
+            covered,
+            _LEAST_COVERED,
+            passed,
+            f"{file} ({first}Z to {last}Z) covers {100.0 * covered:.0f} % of the readings ({span}).",
+            "" if passed else f"Check the date and the clock of {file}, or leave it out of the campaign file.",
+            endangers,
+            Severity.CONTRADICTION if covered == 0.0 else Severity.DOUBT,
+        )
+    ]
+
+
+def _covered(logged: NDArray[np.datetime64], readings: NDArray[np.datetime64]) -> float:
+    """Share of the readings that lie between two samples of a log that are no gap apart."""
+    seconds = (logged - logged[0]) / np.timedelta64(1, "s")
+    at = (readings - logged[0]) / np.timedelta64(1, "s")
+    if seconds.size < 2:
+        return 0.0
+    steps = np.diff(seconds)
+    place = np.searchsorted(seconds, at, side="right") - 1
+    inside = (place >= 0) & (at <= seconds[-1])
+    step = steps[np.clip(place, 0, steps.size - 1)]
+    return float(np.mean(inside & (step <= max(_GAP_S, 10.0 * float(np.median(steps))))))

@@ -1,0 +1,193 @@
+"""Checks of the readings alone: magnitude and unit, travel, copied cycles, exchanged directions of approach."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+from fusion._typing import Array
+from fusion.consistency.checks import Check, Severity
+
+#: Largest positioning deviation that a machine can have, um per metre of travel: 1 % is no deviation but another unit.
+_LARGEST_UM_PER_M = 10_000.0
+#: Smallest random part of a reading in a machine, um: refraction in still air alone makes more over 0.1 m.
+_LEAST_NOISE_UM = 0.002
+#: Smallest travel as a share of the plan's extent along the axis.
+_LEAST_TRAVEL_SHARE = 0.03
+#: Share of equal readings from which two cycles are copies, and the share that ordinary cycles may have.
+_COPIED_SHARE, _ORDINARY_SHARE = 0.8, 0.3
+#: Fewest cycles on either side of an exchange of the approaches.
+_LEAST_SIDE = 3
+#: Standard errors by which the reversal error must differ before and after, and the p-value for equal size and opposite sign.
+_EXCHANGE_SIGMAS, _OPPOSITE_P = 8.0, 1e-3
+
+
+def check_readings(deviations: xr.Dataset, *, plan_extent_mm: float) -> list[Check]:
+    """Check what readings can say of themselves.
+
+    Parameters
+    ----------
+    deviations : Dataset
+        Keeps ``interferometry.contract.DEVIATIONS``.
+    plan_extent_mm : float
+        Extent of the plan along the axis, mm.
+
+    Returns
+    -------
+    list of Check
+    """
+    values = deviations["deviation"].values
+    noise_um = random_part_um(values)
+    return [
+        _largest_deviation(deviations),
+        _least_noise(max(noise_um, _resolution_um(values) / np.sqrt(12.0))),
+        _travel(deviations, plan_extent_mm),
+        _copied_cycles(deviations),
+        _exchanged_approaches(deviations, noise_um),
+    ]
+
+
+def random_part_um(values: Array) -> float:
+    """Random part of a reading from the second differences of each site over the cycles, in which a slow drift cancels.
+
+    Parameters
+    ----------
+    values : (cycle, direction, target) ndarray, um
+        NaN where there is no reading.
+
+    Returns
+    -------
+    float
+        Standard deviation, um, robust against outliers; NaN where no site has three readings in a row.
+    """
+    if values.shape[0] < 3:
+        return float("nan")
+    second = values[2:] - 2.0 * values[1:-1] + values[:-2]
+    # The second difference of independent readings has six times their variance.
+    return float(stats.median_abs_deviation(second, axis=None, scale="normal", nan_policy="omit") / np.sqrt(6.0))
+
+
+def _resolution_um(values: Array) -> float:
+    """Smallest step between two different readings, um; 0 where all are alike."""
+    steps = np.diff(np.unique(values[np.isfinite(values)]))
+    return float(steps.min()) if steps.size else 0.0
+
+
+def _largest_deviation(deviations: xr.Dataset) -> Check:
+    """Deviations beyond 1 % of the travel are in another unit."""
+    position = deviations["position"].values
+    span_m = max(float(np.ptp(position)), 1e-9) * 1e-3
+    largest = float(np.nanquantile(np.abs(deviations["deviation"].values), 0.95)) / span_m
+    passed = largest <= _LARGEST_UM_PER_M
+    return Check(
+        "deviation_magnitude",
+        largest,
+        _LARGEST_UM_PER_M,
+        passed,
+        f"The deviations reach {largest:.3g} µm per metre of travel (limit {_LARGEST_UM_PER_M:g}).",
+        "" if passed else "Check the units: deviations are read as µm and positions as mm.",
+        "every value of the axis",
+        Severity.CONTRADICTION,
+    )
+
+
+def _least_noise(noise_um: float) -> Check:
+    """Readings that repeat to a nanometre, and are not just rounded, are in millimetres."""
+    passed = not noise_um < _LEAST_NOISE_UM
+    return Check(
+        "deviation_unit",
+        noise_um,
+        _LEAST_NOISE_UM,
+        passed,
+        f"A reading repeats from cycle to cycle within {noise_um:.3g} µm (no machine repeats within {_LEAST_NOISE_UM:g} µm).",
+        "" if passed else "Check the unit of the deviations: they look like mm and are read as µm.",
+        "every value of the axis",
+    )
+
+
+def _travel(deviations: xr.Dataset, plan_extent_mm: float) -> Check:
+    """A travel that hardly shows on the plan is in metres or inches."""
+    travel_mm = float(np.ptp(deviations["position"].values))
+    share = travel_mm / plan_extent_mm
+    passed = share >= _LEAST_TRAVEL_SHARE
+    return Check(
+        "travel",
+        share,
+        _LEAST_TRAVEL_SHARE,
+        passed,
+        f"The targets span {travel_mm:.4g} mm, {100.0 * share:.2g} % of the plan along the axis ({plan_extent_mm:.4g} mm).",
+        "" if passed else "Check the unit of the positions: they are read as mm and look like m or inch.",
+        "every value per length: expansion, pitch, index of air",
+    )
+
+
+def _copied_cycles(deviations: xr.Dataset) -> Check:
+    """Two cycles that agree digit for digit are one cycle, entered twice."""
+    values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
+    present = np.isfinite(values)
+    count, pairs = values.shape[0], []
+    shares = np.zeros((count, count))
+    for first in range(count):
+        both = present[first] & present
+        equal = (values[first] == values) & both
+        shares[first] = equal.sum(axis=1) / np.maximum(both.sum(axis=1), 1)
+    upper = shares[np.triu_indices(count, 1)]
+    # Coarsely rounded readings agree from cycle to cycle; then agreement says nothing.
+    if count > 1 and np.median(np.diagonal(shares, 1)) <= _ORDINARY_SHARE:
+        places = np.argwhere(np.triu(shares, 1) >= _COPIED_SHARE)
+        number = deviations["cycle"].values
+        pairs = [f"{number[a]} and {number[b]}" for a, b in places]
+    named = ", ".join(pairs[:5]) + (f" and {len(pairs) - 5} more" if len(pairs) > 5 else "")
+    largest = float(upper.max(initial=0.0))
+    return Check(
+        "copied_cycles",
+        largest,
+        _COPIED_SHARE,
+        not pairs,
+        f"Cycles {named} agree digit for digit." if pairs else "No two cycles agree digit for digit.",
+        "Leave one of the two cycles out of the file." if pairs else "",
+        "scatter, repeatability, p-values",
+    )
+
+
+def _exchanged_approaches(deviations: xr.Dataset, noise_um: float) -> Check:
+    """A reversal error that changes its sign and keeps its size at one cycle shows exchanged labels of approach."""
+    code, endangered = "approach_labels", "reversal error, and every effect that depends on the direction of approach"
+    sound = Check(code, 0.0, _EXCHANGE_SIGMAS, True, "The reversal error keeps its sign over the test.", "", endangered)
+    if deviations.sizes["direction"] < 2 or not noise_um > 0.0:
+        return sound
+    values = deviations["deviation"].values
+    reversal = values[:, 0] - values[:, 1]
+    known = np.isfinite(reversal).any(axis=1)
+    reversal, cycles = reversal[known], deviations["cycle"].values[known]
+    best, place = 0.0, 0
+    for k in range(_LEAST_SIDE, reversal.shape[0] - _LEAST_SIDE + 1):
+        before, after = np.nanmean(reversal[:k], axis=0), np.nanmean(reversal[k:], axis=0)
+        sigma = noise_um * np.sqrt(2.0) * np.sqrt(1.0 / k + 1.0 / (reversal.shape[0] - k))
+        shift = float(np.nanmean(after - before) / (sigma / np.sqrt(before.size)))
+        if abs(shift) > abs(best):
+            best, place = shift, k
+    if abs(best) <= _EXCHANGE_SIGMAS:
+        return sound
+    before, after = reversal[:place], reversal[place:]
+    # Standard error of the sum of both means at every target; drift between the two readings of a target adds to the noise.
+    spread = np.sqrt(np.nanvar(before, axis=0) / before.shape[0] + np.nanvar(after, axis=0) / after.shape[0])
+    total = (np.nanmean(before, axis=0) + np.nanmean(after, axis=0)) / np.maximum(spread, 1e-12)
+    total = total[np.isfinite(total)]
+    opposite = float(stats.chi2.sf(float(total @ total), total.size))
+    # An exchange happens from one cycle to the next, a reversal that drifts does not.
+    near = np.nanmean(reversal[max(0, place - _LEAST_SIDE) : place]), np.nanmean(reversal[place : place + _LEAST_SIDE])
+    sudden = abs(near[1] - near[0]) > 0.7 * abs(np.nanmean(after) - np.nanmean(before))
+    if opposite < _OPPOSITE_P or near[0] * near[1] >= 0.0 or not sudden:
+        return sound
+    return Check(
+        code,
+        abs(best),
+        _EXCHANGE_SIGMAS,
+        False,
+        f"From cycle {cycles[place]} on the reversal error has the opposite sign and the same size at every target "
+        f"({near[0]:+.2f} to {near[1]:+.2f} µm).",
+        f"Check the labels of the direction of approach from cycle {cycles[place]} on.",
+        endangered,
+    )

@@ -1,0 +1,75 @@
+"""The checks of a run: those before the long work, and those on what was fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fusion.campaign.config import CampaignError
+from fusion.campaign.inputs import Source
+from fusion.consistency.checks import CODES, Check
+from fusion.consistency.coefficients import check_expansion
+from fusion.consistency.frames import check_frames
+from fusion.consistency.logs import check_log
+from fusion.consistency.readings import check_readings
+from fusion.pipeline.thermal import overridden_parameters
+
+
+def check_source(source: Source) -> list[Check]:
+    """Check what was read, before anything is calculated.
+
+    Parameters
+    ----------
+    source : Source
+        Inputs of the campaign.
+
+    Returns
+    -------
+    list of Check
+        Of the readings, the logs and the frames.
+
+    Raises
+    ------
+    CampaignError
+        If ``[accept] doubts`` names a check that does not exist.
+    """
+    unknown = [code for code in source.campaign.accept.doubts if code not in CODES]
+    if unknown:
+        raise CampaignError(
+            f"{source.campaign.path}: accept.doubts = {unknown[0]!r}: no such check; there are: {', '.join(CODES)}"
+        )
+    x, y = source.plan.axis.direction
+    width_mm, height_mm = source.plan.size_mm
+    times = source.deviations["time"].values.ravel()
+    interferometry, drivers = source.campaign.interferometry, source.campaign.drivers
+    environment_file = interferometry.environment if interferometry is not None else None
+    return [
+        *check_readings(source.deviations, plan_extent_mm=abs(x) * width_mm + abs(y) * height_mm),
+        *check_log(
+            source.environment,
+            times,
+            name="environment",
+            file=environment_file or "the environment log",
+            endangers="index of air, dead path and material compensation",
+        ),
+        *check_log(
+            source.drivers,
+            times,
+            name="drivers",
+            file=drivers.file if drivers is not None else "the drivers' log",
+            endangers="every effect that follows a load, and the verdict that none is missing",
+        ),
+        *check_frames(source.frames, overridden=set(overridden_parameters(source))),
+    ]
+
+
+def check_loop(loop: Mapping[str, Any]) -> list[Check]:
+    """Check what the closed loop fitted against physics.
+
+    Parameters
+    ----------
+    loop : mapping
+        Part ``loop`` of results.json.
+    """
+    declared: Sequence[Mapping[str, Any]] = loop.get("declared_coefficients", [])
+    return check_expansion(declared)

@@ -1,0 +1,65 @@
+"""Campaign files that lie: each lie is one edit of a sound campaign folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+
+
+def _laser(folder: Path, edit: Callable[[pd.DataFrame], None]) -> None:
+    table = pd.read_csv(folder / "laser.csv")
+    edit(table)
+    table.to_csv(folder / "laser.csv", index=False)
+
+
+def deviations_in_mm(folder: Path) -> None:
+    """Deviations in mm where um are asked for."""
+    _laser(folder, lambda table: table.__setitem__("deviation_um", table["deviation_um"] / 1000.0))
+
+
+def deviations_in_nm(folder: Path) -> None:
+    """Deviations in nm where um are asked for."""
+    _laser(folder, lambda table: table.__setitem__("deviation_um", table["deviation_um"] * 1000.0))
+
+
+def positions_in_inch(folder: Path) -> None:
+    """Positions in inch where mm are asked for."""
+    _laser(folder, lambda table: table.__setitem__("position_mm", table["position_mm"] / 25.4))
+
+
+def inverted_signs(folder: Path) -> None:
+    """Deviations with the opposite sign."""
+    _laser(folder, lambda table: table.__setitem__("deviation_um", -table["deviation_um"]))
+
+
+def copied_cycle(folder: Path) -> None:
+    """Cycle 13 holds the deviations of cycle 12."""
+
+    def edit(table: pd.DataFrame) -> None:
+        source = table.loc[table["cycle"] == 12, "deviation_um"].to_numpy()
+        table.loc[table["cycle"] == 13, "deviation_um"] = source
+
+    _laser(folder, edit)
+
+
+def drivers_of_another_day(folder: Path) -> None:
+    """The drivers' log of the day before."""
+    table = pd.read_csv(folder / "drivers.csv", parse_dates=["time"])
+    table["time"] = table["time"] - pd.Timedelta(days=1)
+    table.to_csv(folder / "drivers.csv", index=False, date_format="%Y-%m-%dT%H:%M:%S.%f+00:00")
+
+
+def drivers_end_early(folder: Path) -> None:
+    """The drivers' log stops after half of the test."""
+    table = pd.read_csv(folder / "drivers.csv")
+    table.head(len(table) // 2).to_csv(folder / "drivers.csv", index=False)
+
+
+def aluminium(folder: Path) -> None:
+    """The expansion coefficient of aluminium for a table of steel."""
+    path = folder / "campaign.toml"
+    text = path.read_text(encoding="utf-8")
+    line = next(line for line in text.splitlines() if line.startswith("expansion_coefficient"))
+    path.write_text(text.replace(line, 'expansion_coefficient = "23.8 ppm/K"'), encoding="utf-8")

@@ -1,0 +1,58 @@
+"""Consistency checks of the logs: a log of another day, a log that ends early, a log with a long gap."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from fusion.consistency.checks import Check, Severity
+from fusion.consistency.logs import check_log
+
+START = np.datetime64("2026-03-09T06:30", "ns")
+READINGS = START + np.arange(0, 4 * 3600, 8).astype("m8[s]")
+
+
+def log(first_s: float, last_s: float, step_s: float = 60.0) -> xr.Dataset:
+    seconds = np.arange(first_s, last_s + 1.0, step_s)
+    return xr.Dataset(coords={"time": START + (seconds * 1e9).astype("m8[ns]")})
+
+
+def check(dataset: xr.Dataset) -> Check:
+    (only,) = check_log(dataset, READINGS, name="drivers", file="drivers.csv", endangers="loads")
+    return only
+
+
+def test_a_log_over_the_whole_test_passes() -> None:
+    assert check(log(-60.0, 4 * 3600.0)).passed
+
+
+def test_a_log_of_another_day_is_a_contradiction() -> None:
+    found = check(log(86400.0, 86400.0 + 4 * 3600.0))
+    assert found.severity is Severity.CONTRADICTION and found.value == 0.0
+    assert found.evidence.startswith(
+        "drivers.csv (2026-03-10T06:30:00Z to 2026-03-10T10:30:00Z) covers 0 % of the readings"
+    )
+    assert "Check the date and the clock of drivers.csv" in found.remedy
+
+
+@pytest.mark.parametrize(("last_s", "share"), [(2 * 3600.0, 0.5), (3600.0, 0.25)])
+def test_a_log_that_ends_early_is_doubted(last_s: float, share: float) -> None:
+    found = check(log(0.0, last_s))
+    assert not found.passed and found.severity is Severity.DOUBT
+    # One reading more or less at the end.
+    assert found.value == pytest.approx(share, abs=0.002)
+
+
+def test_a_log_with_a_long_gap_is_doubted() -> None:
+    whole = log(0.0, 4 * 3600.0)
+    holed = whole.sel(
+        time=(whole["time"] < START + np.timedelta64(3600, "s")) | (whole["time"] > START + np.timedelta64(7200, "s"))
+    )
+    assert check(holed).value == pytest.approx(0.75, abs=0.01)
+
+
+def test_what_was_not_logged_is_not_checked() -> None:
+    assert check_log(None, READINGS, name="drivers", file="", endangers="") == []
+    nothing = np.full(3, np.datetime64("NaT"))
+    assert check_log(log(0.0, 60.0), nothing, name="drivers", file="", endangers="") == []

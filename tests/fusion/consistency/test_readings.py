@@ -1,0 +1,112 @@
+"""Consistency checks of the readings: each lie is named, sound readings pass."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from fusion.consistency.checks import Check, Severity
+from fusion.consistency.readings import check_readings, random_part_um
+from interferometry.deviations import build_deviations
+
+CYCLES, TARGETS = 40, 12
+PLAN_MM = 700.0
+
+
+def sound(seed: int = 5, *, noise_um: float = 0.4, reversal_um: float = 1.2) -> xr.Dataset:
+    """A test of 12 targets over 330 mm with a drift of 5 um and a reversal error."""
+    rng = np.random.default_rng(seed)
+    position = 30.0 * np.arange(TARGETS)
+    profile = np.cumsum(rng.normal(0.0, 0.8, TARGETS))
+    drift = 5.0 * (1.0 - np.exp(-np.arange(CYCLES) / 15.0))
+    sign = np.array([0.5, -0.5])
+    deviation = (
+        profile
+        + drift[:, None, None] * (0.3 + position / 330.0)
+        + reversal_um * sign[:, None]
+        + noise_um * rng.standard_normal((CYCLES, 2, TARGETS))
+    )
+    order = np.concatenate([np.arange(TARGETS), TARGETS + np.arange(TARGETS)[::-1]]).reshape(2, TARGETS)
+    time = np.datetime64("2026-03-09T06:30") + (250 * np.arange(CYCLES)[:, None, None] + 8 * order).astype("m8[s]")
+    return build_deviations(range(1, CYCLES + 1), range(1, TARGETS + 1), position, deviation, time)
+
+
+def failed(deviations: xr.Dataset) -> dict[str, Check]:
+    return {check.code: check for check in check_readings(deviations, plan_extent_mm=PLAN_MM) if not check.passed}
+
+
+def with_deviation(test: xr.Dataset, values: np.ndarray) -> xr.Dataset:
+    return test.assign(deviation=test["deviation"].copy(data=values))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_sound_readings_pass_every_check(seed: int) -> None:
+    assert failed(sound(seed)) == {}
+
+
+def test_the_random_part_is_that_of_the_noise() -> None:
+    # 38 x 24 second differences, two of three independent: 3 % standard error; four of them allowed.
+    assert random_part_um(sound()["deviation"].values) == pytest.approx(0.4, rel=0.12)
+    assert np.isnan(random_part_um(np.zeros((2, 2, 3))))
+
+
+def test_deviations_in_nanometres_are_a_contradiction() -> None:
+    test = sound()
+    check = failed(with_deviation(test, 1000.0 * test["deviation"].values))["deviation_magnitude"]
+    assert check.severity is Severity.CONTRADICTION
+    assert check.remedy == "Check the units: deviations are read as µm and positions as mm."
+
+
+def test_deviations_in_millimetres_are_doubted() -> None:
+    test = sound()
+    named = failed(with_deviation(test, 0.001 * test["deviation"].values))
+    assert set(named) == {"deviation_unit"}
+    assert "they look like mm" in named["deviation_unit"].remedy
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1.0 / 25.4])
+def test_positions_in_metres_or_inches_are_doubted(factor: float) -> None:
+    test = sound()
+    named = failed(test.assign(position=test["position"].copy(data=factor * test["position"].values)))
+    assert "travel" in named
+
+
+def test_a_cycle_that_was_copied_is_named() -> None:
+    test = sound()
+    values = test["deviation"].values.copy()
+    values[20] = values[19]
+    named = failed(with_deviation(test, values))
+    assert set(named) == {"copied_cycles"}
+    assert named["copied_cycles"].evidence == "Cycles 20 and 21 agree digit for digit."
+
+
+def test_coarse_rounding_is_no_copy() -> None:
+    test = sound(noise_um=0.1)
+    assert "copied_cycles" not in failed(with_deviation(test, np.round(test["deviation"].values)))
+
+
+@pytest.mark.parametrize("first", [8, 20, 33])
+def test_exchanged_labels_of_approach_are_named_with_their_cycle(first: int) -> None:
+    test = sound()
+    values = test["deviation"].values.copy()
+    values[first:] = values[first:, ::-1]
+    check = failed(with_deviation(test, values))["approach_labels"]
+    assert f"From cycle {first + 1} on" in check.evidence
+
+
+def test_a_reversal_that_drifts_or_steps_to_another_size_is_no_exchange() -> None:
+    test = sound()
+    sign = np.array([0.5, -0.5])[None, :, None]
+    ramp = np.linspace(0.0, -2.4, CYCLES)[:, None, None] * sign
+    step = np.where(np.arange(CYCLES) >= 20, -3.0, 0.0)[:, None, None] * sign
+    for change in (ramp, step):
+        assert "approach_labels" not in failed(with_deviation(test, test["deviation"].values + change))
+
+
+def test_one_approach_alone_and_missing_readings_pass() -> None:
+    test = sound()
+    values = test["deviation"].values.copy()
+    values[:, 1] = np.nan
+    values[3, 0, 4] = np.nan
+    assert failed(with_deviation(test, values)) == {}
