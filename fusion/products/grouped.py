@@ -1,7 +1,9 @@
 """Several results on the axes of one Dataset, each behind a prefix: the parts of deviations.nc, and the closed loop in fusion.nc.
 
-They share the coordinates of the readings, so that plain arithmetic between them works. Results on axes of their own (the correlation) are
-groups of the NetCDF file instead; see `fusion.products.store.write_dataset`.
+In deviations.nc these are conventional, neighbours, comparison, chart, iso and drift; in the root of fusion.nc it is the loop. Most of
+their variables share the coordinates of the readings, so that plain arithmetic between them works. The variables are prefixed,
+dimensions and coordinates are not: they stay on the Dataset under their own names. The correlation, which has axes of its own, is a group
+of fusion.nc without a prefix; see `fusion.products.store.write_dataset`.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ def joined(base: xr.Dataset, **parts: xr.Dataset) -> xr.Dataset:
     base : Dataset
         Keeps its own names.
     **parts : Dataset
-        Results by name, on the coordinates of `base` as far as they share dims; a variable ``v`` becomes ``<name>_v``.
+        Results by name, on the coordinates of `base` as far as they share dims; a data variable ``v`` becomes ``<name>_v``, a coordinate
+        keeps its name.
 
     Returns
     -------
@@ -37,7 +40,7 @@ def joined(base: xr.Dataset, **parts: xr.Dataset) -> xr.Dataset:
 
 
 def group(dataset: xr.Dataset, name: str) -> xr.Dataset:
-    """Return the variables of one result under their own names.
+    """Return the data variables of one result under their own names, with the coordinates that they are on.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ class TestedPart(ResultPart):
     detectable_um_per_K: Number
     """Detection limit at 80 % power, um/K."""
     p_beside_leader: Number = None
-    """p-value beside the leading mode; modes only."""
+    """p-value given the leading mode; modes only."""
 
 
 class PlacePart(ResultPart):

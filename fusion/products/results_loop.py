@@ -153,7 +153,7 @@ class Nuisance(ResultPart):
 
 
 class HoldOutQuestion(ResultPart):
-    """The one question that was put to the hold-out."""
+    """Hold-out test of the strongest undecided candidate."""
 
     effect: str
     """Name of the effect."""
@@ -309,7 +309,7 @@ class AxisLoop(Loop):
     nuisance: Nuisance
     """Drift without a cause in the final model."""
     sealed_question: HoldOutQuestion | Nothing
-    """The one question that was put to the hold-out."""
+    """Hold-out test of the strongest undecided candidate."""
     search: tuple[tuple[AxisScore, ...], ...]
     """Scores of every round of the search."""
     identifiability: tuple[DetectionLimit, ...]

@@ -18,7 +18,7 @@ from fusion.report.wording import duration, join, measured, number, p_value, pla
 
 _SHORT = {"common": "common", "proportional": "growing", "reversal": "reversal", "joint": "common and growing"}
 _SENSITIVITY = "Sensitivity / (µm/K)"
-_DETECTION_LIMIT = "80 % power from / (µm/K)"
+_DETECTION_LIMIT = "Detection limit (80 % power) / (µm/K)"
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ def _place_tables(heading: str, title: str, listed: Iterable[PlacePart], maps: x
     modes = heading == "Mode"
     columns = [Words(heading), "x, y / mm", Words("Part of the drift"), "p", _SENSITIVITY, "Lag", _DETECTION_LIMIT]
     if modes:
-        columns.append("p beside the leading one")
+        columns.append("p given the leading mode")
     tested = maps.children["modes" if modes else "regions"].to_dataset()
     ratio = (tested["statistic"] / tested["threshold"]).fillna(0.0)
     strongest: list[Row] = []

@@ -104,7 +104,7 @@ def describe_model(loop: AxisLoop) -> list[tuple[str, str]]:
     rows.append(("unexplained drift", _unexplained_drift(loop.nuisance)))
     rows.append(("error of repeating the last value", f"{number(loop.rmse_persistence_um, 3)} µm"))
     if isinstance(loop.sealed_question, HoldOutQuestion):
-        rows.append(("the one question to the held-out cycles", _question(loop.sealed_question)))
+        rows.append(("hold-out test of the strongest undecided candidate", _question(loop.sealed_question)))
     return rows + refused_effects(loop)
 
 
@@ -140,7 +140,7 @@ def _unexplained_drift(left: Nuisance) -> str:
 
 
 def _question(asked: HoldOutQuestion) -> str:
-    """The one question to the held-out cycles and its answer."""
+    """Hold-out test of the strongest undecided candidate and its outcome."""
     answer = "it entered" if asked.entered else "it did not enter"
     return (
         f"{effect_words(asked.effect).name}: error {number(asked.rmse_before_um, 3)} µm without it and "
@@ -162,7 +162,7 @@ def describe_identifiability(loop: AxisLoop) -> Table:
         "best to worst / µm",
         "Visible",
         Words("Collinear with"),
-        Words("In the way"),
+        Words("Limitation"),
     ]
     rows = []
     for limit in loop.identifiability:

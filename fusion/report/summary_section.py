@@ -391,7 +391,7 @@ def _levels(results: Results) -> list[str]:
     if results.loop is not None:
         sentences.append(
             f"Closed loop: p is family-wise over all candidates of a round. An effect enters at p up to {_percent(SEARCH_LEVEL)} in the "
-            f"search, at p up to {_percent(ASKED_LEVEL)} in the one question to the held-out cycles, and at p up to "
+            f"search, at p up to {_percent(ASKED_LEVEL)} in the hold-out test of the strongest undecided candidate, and at p up to "
             f"{_percent(SECOND_LEVEL)} in the search over all cycles that follows: {_percent(ENTRY_LEVEL)} together where nothing is "
             f"missing. A pattern of positions is reported as left at p up to {_percent(REMAINDER_LEVEL)}, family-wise over its shapes."
         )

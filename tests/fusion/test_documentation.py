@@ -15,6 +15,9 @@ from fusion.diagnosis.causes import CAUSES
 from fusion.effects.effect import Effect
 from fusion.effects.library import LIBRARY
 from fusion.effects.thermal import QUASI_STATIC
+from fusion.products.results import CorrelationPart, Notice, SourcePart, assemble
+from fusion.report.terminal import summary_rows
+from tests.fusion.results_sample import PARTS
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -33,6 +36,17 @@ def test_the_campaign_file_of_the_readme_loads(tmp_path: Path) -> None:
     assert load_campaign(tmp_path / "campaign.toml").model.declared == ("axis_expansion", "table_offset")
     (tmp_path / "record.toml").write_text('[campaign]\ntitle = "Spindle"\n' + record, encoding="utf-8")
     assert load_campaign(tmp_path / "record.toml").record is not None
+
+
+def test_the_demo_of_the_readme_has_the_rows_that_a_run_prints() -> None:
+    (shown,) = re.findall(r"^Demo: (.*?)^```", README, flags=re.DOTALL | re.MULTILINE)
+    names = [name.strip() for name in re.findall(r"^│(.*?)│", shown, flags=re.MULTILINE) if name.strip()]
+    source = SourcePart.model_construct(kind="cell", name="", part="common", x_mm=355.0, y_mm=95.0, p_value=0.002)
+    correlation = CorrelationPart.model_construct(verdict="attributable", source=source, randomised_duty=None)
+    results = assemble("A", PARTS, [Notice("clock", "The clocks disagree.", "")] * 2)
+    printed = [name for name, _ in summary_rows(results.model_copy(update={"correlation": correlation}))]
+    # The sample states its window of cycles in other words.
+    assert [name.partition(" (")[0] for name in names] == [name.partition(" (")[0] for name in printed]
 
 
 def test_every_command_of_the_readme_exists() -> None:

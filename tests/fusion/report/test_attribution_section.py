@@ -30,7 +30,7 @@ def test_every_part_of_the_drift_has_its_strongest_cell(parts: tuple[xr.DataTree
     modes = next(place for place in told["places"] if place.title == "Thermal modes")
     assert len(modes.strongest.rows) == len(correlation.modes)
     assert len(modes.every.rows) == 4 * len(correlation.modes)
-    assert modes.strongest.columns[-1].title == "p beside the leading one"
+    assert modes.strongest.columns[-1].title == "p given the leading mode"
 
 
 def test_two_sessions_decide_what_is_a_cause(parts: tuple[xr.DataTree, CorrelationPart]) -> None:

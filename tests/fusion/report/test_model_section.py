@@ -27,7 +27,7 @@ def test_the_model_is_told_in_numbers() -> None:
         "random walk; rms 0.10 \u00b5m common to all positions, below 0.001 \u00b5m"
     )
     assert rows["not tried: dead path of the laser"] == "no air"
-    assert "the one question to the held-out cycles" not in rows
+    assert "hold-out test of the strongest undecided candidate" not in rows
 
 
 def test_an_effect_that_cannot_be_detected_has_no_limit() -> None:

@@ -27,7 +27,10 @@ def test_four_standard_deviations_stand_side_by_side(results_folder: Path) -> No
 
 def test_levels_are_those_of_each_test(results_folder: Path) -> None:
     page = (results_folder / "report.html").read_text(encoding="utf-8")
-    assert "at p up to 1.5 % in the search, at p up to 0.5 % in the one question to the held-out cycles" in page
+    assert (
+        "at p up to 1.5 % in the search, at p up to 0.5 % in the hold-out test of the strongest undecided candidate"
+        in page
+    )
     assert "2.5 % together where nothing is missing" in page
     assert "every shape is tested by itself, its p-value is not corrected" in page
     assert "a cause is named at p up to 2 % only" in page
