@@ -30,7 +30,7 @@ def test_without_a_source_the_detection_limit_and_a_plan_are_stated(rng):
     source = find_source(maps)
     assert source.verdict == "not attributable" and source.p_value > 0.05
     text = recommend_measurement(maps, source)
-    assert f"From {source.detectable_um_per_K:.2g} um/K on" in text
+    assert f"From {source.detectable_um_per_K:.2g} µm/K on" in text
     assert f'--noise "{float(maps["noise"].sel(channel="common")):.2g} um"' in text
 
 

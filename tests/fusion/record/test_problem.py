@@ -108,7 +108,7 @@ def test_the_spindle_heat_of_a_real_machine_is_found_and_predicts_the_next_load_
     share = np.arange(record.seconds.size) / record.seconds.size
     train, test = share < 0.6, (share >= 0.6) & (share < 0.8)
     problem, state = search_record(record, train, declared)
-    assert ("thermal_lag", Reason.NOT_CONFIRMED) in {(one.effect, one.reason) for one in state.decisions}
+    assert ("thermal_lag", Reason.NOT_PREDICTED) in {(one.effect, one.reason) for one in state.decisions}
     missed = np.abs(record.displacement - problem.predict(state.model.terms).predicted)[test].mean(axis=0)
     with capsys.disabled():
         print(
