@@ -43,7 +43,8 @@ def test_the_demo_of_the_readme_has_the_rows_that_a_run_prints() -> None:
     names = [name.strip() for name in re.findall(r"^│(.*?)│", shown, flags=re.MULTILINE) if name.strip()]
     source = SourcePart.model_construct(kind="cell", name="", part="common", x_mm=355.0, y_mm=95.0, p_value=0.002)
     correlation = CorrelationPart.model_construct(verdict="attributable", source=source, randomised_duty=None)
-    results = assemble("A", PARTS, [Notice("clock", "The clocks disagree.", "")] * 2)
+    inputs = {"state": "sound", "accepted": [], "checks": []}
+    results = assemble("A", {**PARTS, "inputs": inputs}, [Notice("clock", "The clocks disagree.", "")] * 2)
     printed = [name for name, _ in summary_rows(results.model_copy(update={"correlation": correlation}))]
     # The sample states its window of cycles in other words.
     assert [name.partition(" (")[0] for name in names] == [name.partition(" (")[0] for name in printed]
