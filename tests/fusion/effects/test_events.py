@@ -84,6 +84,8 @@ def test_a_closer_look_stays_within_half_a_line_and_within_the_search():
         near = PERIODIC_DISTURBANCE.candidates(readings, {}, chosen)
         return np.array([1.0 / candidate.parameters["period_min"] for candidate in near])[::2]
 
+    # No period is shorter than three minutes.
+    np.testing.assert_allclose(frequencies_about(3.0), 1.0 / 3.0 + np.linspace(-0.5, 0.0, 11) / span)
     near = frequencies_about(10.0)
     np.testing.assert_allclose(near, 0.1 + np.linspace(-0.5, 0.5, 21) / span)
     np.testing.assert_allclose(frequencies_about(span / 3.0), 3.0 / span + np.linspace(0.0, 0.5, 11) / span)

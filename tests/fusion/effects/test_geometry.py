@@ -120,6 +120,8 @@ def test_even_targets_hide_the_leads_that_divide_their_spacing():
         "3.33, 3.12, 2.94, 2.78, 2.63, 2.5, 2.38, 2.27, 2.17, 2.08, 2 mm"
     )
     assert hidden_leads_mm(warmed(tuple(np.arange(1, 8) * 100.0))).startswith("50, 33.3, 25, ")
+    # Leads longer than 50 mm are no screw's.
+    assert hidden_leads_mm(warmed(tuple(np.arange(1, 8) * 52.0))).startswith("26, 17.3, ")
     assert hidden_leads_mm(warmed(UNEVEN)) == ""
     # Targets closer than the shortest lead hide none.
     assert hidden_leads_mm(warmed(tuple(np.arange(1, 8) * 1.5))) == ""

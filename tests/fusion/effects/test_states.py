@@ -70,6 +70,23 @@ def test_the_search_tries_the_grid_and_a_closer_look_eleven_values_about_the_cho
     assert values_near(near(0.0), "time_constant_min", grid, ratio=2.0) == grid
 
 
+def test_neighbouring_lags_respond_alike_to_any_input():
+    """Three halves apart, as the grid says, so that a closer look by that ratio reaches from one to the next."""
+    assert (LAGS_MIN[0], LAGS_MIN[-1]) == (5.0, 195.0)
+    ratios = np.array(LAGS_MIN[1:]) / np.array(LAGS_MIN[:-1])
+    assert ratios.min() > 1.45 and ratios.max() < 1.56
+
+
+def test_a_closer_look_at_a_state_reaches_to_twice_its_time_constant():
+    readings = campaign(series={"mean_rise": logged(np.arange(60.0), "K"), "duty": STEP}, drivers=("duty",))
+    told: dict[str, list[float]] = {}
+    for _, parameters in thermal_states(readings, near(40.0)):
+        told.setdefault(str(parameters["follows"]), []).append(float(parameters["time_constant_min"]))
+    for values in told.values():
+        assert (min(values), max(values)) == (pytest.approx(20.0), pytest.approx(80.0))
+    assert list(told) == ["mean_rise", "duty", "warm_up"]
+
+
 def test_a_closer_look_ends_one_ratio_beyond_the_grid():
     grid = (0.0, 10.0, 40.0)
     low = values_near(near(5.0), "time_constant_min", grid, ratio=2.0)

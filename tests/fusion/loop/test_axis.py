@@ -554,3 +554,23 @@ def test_the_strongest_effect_that_is_undecided_is_asked_for(monkeypatch):
     blocked = problem.start([]).decide(Decision("a", Reason.COLLINEAR)).scored(Round((first, second)))
     assert problem.ask_hold_out(blocked).question.effect == "b"
     assert asked(problem, weak).question is None
+
+
+@pytest.mark.parametrize(("after", "entered"), [(0.525, True), (0.526, False)])
+def test_the_second_look_allows_the_hold_out_error_a_twentieth_more(after, entered, monkeypatch):
+    problem = problem_of(WAVE)
+    errors = iter([0.5, after])
+    monkeypatch.setattr(problem, "hold_out_error", lambda terms: next(errors))
+    wave = score("periodic_disturbance", term(WAVE).candidate)
+    assert bool(second_look(problem, monkeypatch, Round((wave,))).steps) is entered
+
+
+def test_an_event_has_two_cycles_before_it_and_one_after():
+    """Of ten used cycles of 130 s: from the start of the third to that of the ninth."""
+    problem = problem_of()
+    model = problem.start([]).model
+    instants = (259.0, 260.0, 1040.0, 1041.0)
+    offered = [term(LATE, event_s=instant).candidate for instant in instants]
+    assert [one.event_s for one in problem._inside(offered, model)] == [260.0, 1040.0]
+    lasting = term(WAVE).candidate
+    assert problem._inside([lasting], model) == [lasting]

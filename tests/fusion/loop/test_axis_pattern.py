@@ -124,3 +124,45 @@ def test_the_course_of_two_columns_is_that_of_the_larger(size):
     assert pattern_p_value(model, model.terms[0]) > LEVEL
     wrong = fitted(COURSE * BARE.share**3 * size, ("pitch_error", waves))
     assert pattern_p_value(wrong, wrong.terms[0]) < LEVEL
+
+
+def test_a_pattern_is_tested_without_its_largest_target_by_dense_algebra():
+    """The same from normal equations: sizes of smallest norm, their shares of the statistic, two degrees of freedom fewer."""
+    odd = COURSE * np.select([BARE.target == 3, BARE.target == 6], [0.12, -0.1], 0.0)
+    model = fitted(BENDING + odd, ("angular_growth", BENDING))
+    x, y = model.fit.design, model.fit.response
+    free = (BARE.site[:, None] == np.arange(14)) * COURSE[:, None]
+    free /= np.linalg.norm(free, axis=0)
+    beside = free - x @ np.linalg.lstsq(x, free, rcond=None)[0]
+    moment = beside.T @ y / model.fit.sigma
+    share = (np.linalg.pinv(beside.T @ free, rcond=1e-6) @ moment) * moment
+    by_target = share.reshape(7, 2).sum(axis=1)
+    assert by_target.argmax() == 2
+    expected = stats.chi2.sf(share.sum() - by_target.max(), 13 - 2)
+    assert 1e-12 < expected < 0.1
+    assert pattern_p_value(model, model.terms[0]) == pytest.approx(expected, rel=1e-2)
+
+
+def test_two_patterns_are_one_where_free_sizes_gain_more_than_chance():
+    """Twelve further sizes gain half a unit of log-likelihood each by chance."""
+    shared, gains = [], []
+    for seed in range(12):
+        model = fitted(
+            BENDING + REVERSAL, ("angular_growth", BENDING), ("reversal_drift", REVERSAL), seed=seed, noise_um=1.0
+        )
+        x, y = model.fit.design, model.fit.response
+        free = np.column_stack([x[:, :-2], (BARE.site[:, None] == np.arange(14)) * COURSE[:, None]])
+        squares = [((y - design @ np.linalg.lstsq(design, y, rcond=None)[0]) ** 2).sum() for design in (x, free)]
+        gains.append(0.5 * y.size * np.log(squares[0] / squares[1]))
+        wrong = wrong_patterns(model, model.terms, library())
+        shared.append(any(decision.reason is Reason.SHARED_PATTERN for decision in wrong.values()))
+    assert shared == [gain >= 6.0 for gain in gains]
+    assert 0 < sum(shared) < 12
+
+
+def test_the_course_is_that_of_the_column_that_moves_most_with_its_coefficient():
+    """The second column moves a hundred times as much, but its coefficient is next to nothing."""
+    columns = np.column_stack([COURSE * BARE.share, 100.0 * OTHER_COURSE * BARE.share])
+    model = fitted(3.0 * COURSE * BARE.share**3, ("angular_growth", columns))
+    assert abs(model.fit.coefficients[-1]) < 1e-2
+    assert pattern_p_value(model, model.terms[0]) < LEVEL

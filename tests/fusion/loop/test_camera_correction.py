@@ -112,6 +112,19 @@ def test_a_step_of_the_zero_is_taken_out_from_its_frame_on() -> None:
     }
 
 
+@pytest.mark.parametrize(("time_s", "frame", "cycle"), [(90.0, 2, 5), (91.0, 3, 5), (141.0, 4, 6)])
+def test_the_first_frame_that_is_touched_is_the_one_at_the_instant_or_after_it(
+    time_s: float, frame: int, cycle: int
+) -> None:
+    """Frames are 50 s apart and two belong to each cycle; the first reading that is there is 10 s late."""
+    (error,) = find_field_errors(camera_step(0.5, 0.1, jump=0.1, time_s=time_s), small_fields(), small_fused())
+    np.testing.assert_array_equal(error.correction[:, 0, 0], np.where(np.arange(6) < frame, 0.0, -0.5))
+    assert error.first_cycle == cycle
+    # However small the error is, it is taken out.
+    (faint,) = find_field_errors(camera_step(0.05, 0.01, jump=0.05, time_s=time_s), small_fields(), small_fused())
+    assert faint.first_cycle == cycle
+
+
 @pytest.mark.parametrize(("jump", "size"), [(0.79, 0.79), (0.81, 0.5), (0.21, 0.21), (0.19, 0.5)])
 def test_the_size_is_that_of_the_field_where_both_agree_within_three_uncertainties(jump: float, size: float) -> None:
     (error,) = find_field_errors(camera_step(0.5, 0.1, jump=jump, time_s=90.0), small_fields(), small_fused())

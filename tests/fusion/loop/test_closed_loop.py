@@ -14,6 +14,7 @@ from fusion.loop.closed_loop import (
     drop_superfluous,
     enter,
     no_progress,
+    not_confirmed,
     open_hold_out,
     search,
     verdict,
@@ -295,3 +296,14 @@ def test_the_outcome_has_one_word(added, remains, word):
 def test_progress_need_not_be_watched(capsys):
     no_progress(1, 2, "searching")
     assert capsys.readouterr().out == ""
+
+
+def test_an_effect_that_does_not_predict_later_parts_is_told_with_both_errors():
+    failed = replace(score("a", p_value=0.003), confirmation=Confirmation(False, Confirmed.LATER_PARTS, error_um=0.9))
+    evidence = {"p_value": 0.003, "before_um": 0.8, "after_um": 0.9}
+    assert not_confirmed(failed, Round((failed,), start_error_um=0.8)) == Decision("a", Reason.NOT_PREDICTED, evidence)
+    for confirmation in (None, Confirmation(False, Confirmed.LATER_CYCLES)):
+        unpredicted = replace(failed, confirmation=confirmation)
+        assert not_confirmed(unpredicted, Round((unpredicted,))) == Decision(
+            "a", Reason.NOT_CONFIRMED, {"p_value": 0.003}
+        )

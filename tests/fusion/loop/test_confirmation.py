@@ -13,6 +13,8 @@ from fusion.loop.confirmation import CandidateScorer, _judged, ask_hold_out, pri
 from fusion.loop.state import Confirmed, Score
 from fusion.model.drift_variances import SHIFT_AND_STRETCH, scaled_systems
 from fusion.model.fit import ModelFit
+from fusion.model.least_squares import by_width
+from fusion.model.profile_gain import profile_gains
 from tests.fusion.small_campaign import campaign, dense_covariance, model_of, term
 
 BARE = campaign(cycles=20)
@@ -95,6 +97,10 @@ def test_every_coefficient_beyond_the_first_costs_one_unit(rng):
     assert -1.0 <= gains.gain[1, 0] - gains.gain[0, 0] < 3.0
     assert alone < 3.0 and gains.gain[0, 0] > 20.0
     assert scorer.gains([one]).gain.shape == (1, 201)
+    bare = profile_gains(
+        scorer.systems(), scorer.fit.response[:, None], scorer.fit.design, by_width([one, two], scorer.used)
+    )
+    np.testing.assert_allclose(gains.gain, bare.gain - np.array([[0.0], [1.0]]), rtol=1e-9)
 
 
 def test_an_effect_that_lasts_is_confirmed_and_one_that_is_absent_is_not(rng):

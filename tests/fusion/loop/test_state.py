@@ -57,6 +57,7 @@ def test_terms_are_declared_first_then_one_for_every_step():
     assert [term.effect for term in state.declared] == ["axis_expansion", "table_offset"]
     assert [term.effect for term in state.added] == ["dead_path", "step_event"]
     assert state.events == 1
+    assert replace(state, steps=state.steps[:1]).events == 0
     bare = LoopState(Model(terms("axis_expansion")))
     assert [term.effect for term in bare.declared] == ["axis_expansion"] and bare.added == ()
     assert [step.effect for step in state.steps] == ["dead_path", "step_event"]
@@ -113,7 +114,7 @@ def test_a_score_is_replaced_in_the_last_round_only():
 
 
 def test_an_effect_enters_with_the_round_in_which_it_was_chosen():
-    state = searched().scored(Round((score("air_index"),)))
+    state = searched().scored(Round((score("a"),))).scored(Round((score("air_index"),)))
     chosen, model = score("air_index"), Model(terms("a", "b", "c", "d", "air_index"))
     after = state.entered(model, chosen, Confirmed.LATE_EVENT)
     assert after.steps[:2] == state.steps
@@ -188,3 +189,9 @@ def test_an_effect_without_rivals_has_no_runner_up():
 def test_a_confirmation_starts_without_evidence():
     bare = Confirmation(False, Confirmed.BY_EVIDENCE)
     assert (bare.gain, bare.p_value) == (0.0, 1.0) and np.isnan(bare.error_um)
+
+
+def test_a_score_starts_without_evidence():
+    bare = Score("constant", None)
+    assert (bare.gain, bare.excess, bare.p_value, bare.family_wise_p) == (0.0, 0.0, 1.0, 1.0)
+    assert (bare.collinear, bare.critical, bare.drift_place, bare.confirmation) == (0.0, np.inf, 0, None)

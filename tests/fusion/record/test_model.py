@@ -159,3 +159,16 @@ def test_declared_temperatures_are_columns_of_every_channel(rng):
     record = record_of(rise @ [[1.0], [-2.0]] + 0.01 * rng.standard_normal((BLOCKS, 1)), temperature)
     model = fit_record(record, declare(["quasi_static"], record), ALL)
     np.testing.assert_allclose(model.channels[0].coefficients[1:3], [1.0, -2.0], atol=0.05)
+
+
+def test_simulated_channels_drift_as_the_fit_does(rng):
+    """A random walk of 0.5 um a block beside noise of 0.1 um: after 120 blocks the draws scatter by some 5.5 um."""
+    walk = np.cumsum(0.5 * rng.standard_normal((BLOCKS, 1)), axis=0)
+    model = fit_record(record_of(walk + 0.1 * rng.standard_normal((BLOCKS, 1)), np.zeros((BLOCKS, 1))), [], ALL)
+    (draws,) = simulate_channels(model, rng, draws=400)
+    (fit,) = model.channels
+    assert fit.system.order == 1
+    expected = fit.sigma * np.sqrt(fit.system.ratios[0] * 300.0 * (BLOCKS - 1))
+    assert expected == pytest.approx(5.5, rel=0.3)
+    # The variances are drawn as the likelihood leaves them, up to ten times the estimate.
+    assert 0.7 < (draws[-1] - draws[0]).std() / expected < 2.5

@@ -177,11 +177,11 @@ def test_models_are_fitted_again_to_the_same_blocks():
 @pytest.mark.parametrize(
     ("after", "event", "passed"),
     [
-        (0.979, False, True),
-        (0.98, False, False),
-        (1.01, True, True),
-        (1.02, True, False),
-        (1.0, False, False),
+        (1.959, False, True),
+        (1.96, False, False),
+        (2.02, True, True),
+        (2.03, True, False),
+        (2.0, False, False),
         (np.nan, False, True),
     ],
 )
@@ -192,7 +192,7 @@ def test_an_effect_must_earn_its_place_on_later_parts_and_an_event_must_not_harm
     monkeypatch.setattr(problem, "_near", lambda name, chosen: near)
     nothing = np.empty(0)
     monkeypatch.setattr(problem, "predict", lambda terms: Prediction(nothing, nothing, nothing, 1.0, after))
-    state = problem.start([]).scored(Round((asked,), start_error_um=1.0))
+    state = problem.start([]).scored(Round((asked,), start_error_um=2.0))
     confirmation = problem.confirm(asked, state).confirmation
     assert confirmation.passed is passed
     assert confirmation.way is Confirmed.LATER_PARTS
