@@ -172,10 +172,11 @@ def inspect_file(path: Path) -> FlirInspection:
     if not references:
         raise FlirFormatError(rejected[0].reason)
     chosen = np.unique(np.linspace(0, len(references) - 1, _FRAMES_READ).round().astype(int))
-    frames = []
+    frames, read = [], []
     for index in chosen:
         try:
             frames.append(references[index].read())
+            read.append(references[index])
         except FlirFormatError as error:
             rejected.append(RejectedFrame(path, references[index].index, str(error)))
     lowest, highest, mean = _temperature_range(frames)
@@ -183,7 +184,7 @@ def inspect_file(path: Path) -> FlirInspection:
         *_warn_rejected(rejected),
         *_warn_times(references),
         *_warn_parameters(references[0].parameters, references),
-        *_warn_checksums([references[index] for index in chosen]),
+        *_warn_checksums(read),
         *_warn_pixels(frames),
         *_warn_transmission(frames[:1]),
     ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -203,7 +203,7 @@ def _randomised(campaign: Campaign, drivers: xr.Dataset | None) -> tuple[xr.Data
 
 def _notices(source: Source) -> list[Notice]:
     """Return a notice for everything that is left out of the input or missing from it."""
-    notices = _frames_notices(source.frames_rejected)
+    notices = [*frames_notices(source.frames_rejected), *_remark_notices(source.frames)]
     _raise_if_too_small(source)
     _raise_if_clocks_disagree(
         source.deviations,
@@ -249,21 +249,38 @@ class SourceError(FusionError):
     """The inputs of a campaign cannot be used together; the message says which and what to do."""
 
 
-def _frames_notices(rejected: list[dict[str, Any]]) -> list[Notice]:
-    """Return one notice that counts the rejected frames and lists the first of them."""
+def frames_notices(rejected: Sequence[Mapping[str, Any]], code: str = "frames_rejected") -> list[Notice]:
+    """Return one notice that counts frames that were left out and lists the first of them.
+
+    Parameters
+    ----------
+    rejected : sequence of mapping
+        ``file``, ``index`` and ``reason`` of every frame.
+    code : str
+        Code of the notice.
+    """
     if not rejected:
         return []
     named = [f"{item['file']} ({_reason(item)})" for item in rejected]
     return [
         Notice(
-            "frames_rejected",
+            code,
             f"{counted(len(rejected), 'frame')} left out: {listed(named)}.",
             "Copy damaged files again from the camera; a gap in the frames only widens the interpolation between its neighbours.",
         )
     ]
 
 
-def _reason(item: dict[str, Any]) -> str:
+def _remark_notices(frames: Sequence[FrameReference]) -> list[Notice]:
+    """Return one notice for everything that the reader corrected or skipped in frames that are used."""
+    remarks = Counter(note for frame in frames for note in frame.notes)
+    if not remarks:
+        return []
+    named = [f"{note} ({counted(count, 'frame')})" for note, count in remarks.items()]
+    return [Notice("frames_read_with_remarks", f"Remarks of the reader of the frames: {listed(named)}.", "")]
+
+
+def _reason(item: Mapping[str, Any]) -> str:
     """Return why a frame was left out without the absolute path that the reader's message starts with."""
     text = str(item["reason"])
     return text.split(f"{Path(item['file']).name}: ", 1)[-1]

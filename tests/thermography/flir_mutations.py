@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -86,6 +87,18 @@ def sequence(path: Path, encoding: str = "raw", *, frames: int = 3, padding: int
     return written
 
 
+def without_checksums(data: bytes) -> bytes:
+    """Return a file whose directories state no checksum, as many cameras write it."""
+    bare = bytearray(data)
+    start = bare.find(b"FFF\0")
+    while start >= 0:
+        offset, slots = struct.unpack_from(">2I", bare, start + 0x18)
+        for slot in range(slots):
+            struct.pack_into(">I", bare, start + offset + 32 * slot + 28, 0)
+        start = bare.find(b"FFF\0", start + 4)
+    return bytes(bare)
+
+
 def seeds(folder: Path) -> list[bytes]:
     """Return intact files of every kind, small enough that thousands of damaged copies are read per second."""
     files = []
@@ -93,6 +106,8 @@ def seeds(folder: Path) -> list[bytes]:
         jpeg(folder / "seed.jpg", encoding)
         sequence(folder / "seed.seq", encoding)
         files += [(folder / "seed.jpg").read_bytes(), (folder / "seed.seq").read_bytes()]
+    # Without checksums, damage gets as far as the decoders.
+    files += [without_checksums(file) for file in files]
     return [*files, files[1].replace(b"FFF\0", b"FFF\1", 1), b"\xff\xd8\xff\xd9", b"FFF\0"]
 
 

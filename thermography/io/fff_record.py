@@ -11,7 +11,6 @@ ExifTool (P. Harvey, "FLIR Tags").
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -117,6 +116,8 @@ class Directory:
     ----------
     records : mapping of int to (offset, length)
         Place of the first record of each type, bytes from the start of the FFF record.
+    slots : mapping of int to int
+        Slot of the directory that lists this record.
     order : {"<", ">"}
         Byte order of header and directory.
     table : bytes
@@ -128,19 +129,16 @@ class Directory:
     """
 
     records: Mapping[int, tuple[int, int]]
+    slots: Mapping[int, int]
     order: str
     table: bytes
     end: int
     declared_length: int
 
-    @property
-    def checksums(self) -> dict[int, int]:
-        """CRC-32 of every type of record as stated in the directory; 0 for none."""
-        stated: dict[int, int] = {}
-        for kind, _, _, _, _, length, _, _, checksum in struct.iter_unpack(self.order + "2H7I", self.table):
-            if kind and length:
-                stated.setdefault(kind, checksum)
-        return stated
+    def checksum(self, kind: int) -> int:
+        """CRC-32 of the first record of a type as stated in the directory; 0 for none."""
+        place = self.slots[kind] * ENTRY_SIZE + ENTRY_SIZE - 4
+        return int.from_bytes(self.table[place : place + 4], "little" if self.order == "<" else "big")
 
 
 def is_fff_header(data: bytes) -> bool:
@@ -201,9 +199,9 @@ def read_directory(source: FffSource) -> Directory:
     table = head[offset:end] if end <= len(head) else source.take(offset, slots * ENTRY_SIZE, "a directory")
     # All frames of a sequence share one layout; only the checksums of their records differ, so they are blanked for the cache.
     layout = int.from_bytes(table, "little") & _without_checksums(slots)
-    records, last = _records(order, layout.to_bytes(len(table), "little"))
+    records, used_slots, last = _records(order, layout.to_bytes(len(table), "little"))
     (declared,) = struct.unpack_from(order + "I", head, 0x34)
-    return Directory(records, order, table, max(end, last), declared)
+    return Directory(records, used_slots, order, table, max(end, last), declared)
 
 
 @lru_cache(maxsize=64)
@@ -213,15 +211,17 @@ def _without_checksums(slots: int) -> int:
 
 
 @lru_cache(maxsize=64)
-def _records(order: str, table: bytes) -> tuple[Mapping[int, tuple[int, int]], int]:
-    """Return the records of a directory and the end of the last one; cached because the frames of a sequence repeat one layout."""
+def _records(order: str, table: bytes) -> tuple[Mapping[int, tuple[int, int]], Mapping[int, int], int]:
+    """Return records, their slots and the end of the last one; cached because the frames of a sequence repeat one layout."""
     records: dict[int, tuple[int, int]] = {}
+    slots: dict[int, int] = {}
     last = 0
-    for kind, _, _, _, offset, length, *_ in struct.iter_unpack(order + "2H7I", table):
+    for slot, (kind, _, _, _, offset, length, *_) in enumerate(struct.iter_unpack(order + "2H7I", table)):
         if kind and length:
             records.setdefault(kind, (offset, length))
+            slots.setdefault(kind, slot)
             last = max(last, offset + length)
-    return MappingProxyType(records), last
+    return MappingProxyType(records), MappingProxyType(slots), last
 
 
 def _byte_order(head: bytes) -> str | None:
@@ -255,12 +255,16 @@ def damaged_records(source: FffSource, directory: Directory) -> list[int]:
     list of int
         Types whose CRC-32 differs from the one in the directory; records without a checksum are not tested.
     """
-    stated = directory.checksums
     return [
         kind
         for kind, (offset, length) in directory.records.items()
-        if stated[kind] and zlib.crc32(source.read(offset, length)) != stated[kind]
+        if _differs(source.read(offset, length), directory.checksum(kind))
     ]
+
+
+def _differs(data: bytes, checksum: int) -> bool:
+    """Return whether bytes differ from their CRC-32; never where none (0) is stored."""
+    return checksum != 0 and int(imagecodecs.deflate_crc32(data)) != checksum
 
 
 def find_camera_info(source: FffSource, directory: Directory) -> tuple[int, int]:
@@ -422,7 +426,8 @@ def locate_samples(source: FffSource, directory: Directory) -> SampleLocation:
     FlirFormatError
         Where the raw image is missing, truncated, or claims an impossible number of pixels.
     """
-    offset, length = _find_record(source, directory, RAW_RECORD, "a raw image")
+    record = _find_record(source, directory, RAW_RECORD, "a raw image")
+    offset, length = record
     if length <= RAW_HEADER_SIZE:
         raise source.error(offset, "a raw image longer than its header", f"{length} bytes")
     head = source.read(offset, RAW_HEADER_SIZE + 8)
@@ -446,7 +451,15 @@ def locate_samples(source: FffSource, directory: Directory) -> SampleLocation:
         raise source.error(offset, f"{columns} x {rows} samples of 2 bytes", f"a record with {length} bytes of samples")
     if encoding == "raw":
         length = 2 * rows * columns
-    return SampleLocation(encoding, offset + RAW_HEADER_SIZE, length, order == "<", (rows, columns))
+    return SampleLocation(
+        encoding=encoding,
+        offset=offset + RAW_HEADER_SIZE,
+        length=length,
+        little_endian=order == "<",
+        shape=(rows, columns),
+        record=record,
+        checksum=directory.checksum(RAW_RECORD),
+    )
 
 
 def read_counts(source: FffSource, samples: SampleLocation) -> NDArray[np.uint16]:
@@ -467,26 +480,46 @@ def read_counts(source: FffSource, samples: SampleLocation) -> NDArray[np.uint16
     Raises
     ------
     FlirFormatError
-        Where the samples are truncated or their PNG or JPEG-LS stream is damaged.
+        Where the samples are truncated, differ from the CRC-32 that the directory states, or do not decode as PNG or JPEG-LS.
     """
-    counts = _decode(source, samples)
+    counts = _decode(source, samples, _read_samples(source, samples))
     counts.flags.writeable = False
     return counts
 
 
-def _decode(source: FffSource, samples: SampleLocation) -> NDArray[np.uint16]:
+def _read_samples(source: FffSource, samples: SampleLocation) -> memoryview:
+    """Return the bytes of the samples, fewer at the end of the record, after comparing the record with its checksum."""
+    offset, length = samples.record
+    if not samples.checksum or length > 2 * _MAX_PIXELS:
+        return memoryview(source.read(samples.offset, min(samples.length, 2 * _MAX_PIXELS)))
+    record = source.read(offset, length)
+    # A record without its last padding bytes cannot be compared.
+    if len(record) == length and _differs(record, samples.checksum):
+        raise source.error(
+            offset, f"a raw image with the CRC-32 {samples.checksum:08X}", "another one: the samples are damaged"
+        )
+    start = samples.offset - offset
+    return memoryview(record)[start : start + samples.length]
+
+
+def _decode(source: FffSource, samples: SampleLocation, data: memoryview) -> NDArray[np.uint16]:
     """Return the samples in native byte order; the array may be read-only."""
     rows, columns = samples.shape
     if samples.encoding == "raw":
-        data = source.take(samples.offset, samples.length, f"{columns} x {rows} samples")
+        if len(data) < samples.length:
+            raise source.error(
+                samples.offset,
+                f"{columns} x {rows} samples of {samples.length} bytes",
+                f"{len(data)} bytes before the end",
+            )
         counts = np.frombuffer(data, "<u2" if samples.little_endian else ">u2").reshape(rows, columns)
         return counts if counts.dtype.isnative else counts.astype(np.uint16)
     # Writers pad the stream to a multiple of 8 bytes; after the last frame of a file the padding may be missing.
-    data = source.read(samples.offset, min(samples.length, 2 * _MAX_PIXELS))
+    packed = bytes(data)
     if samples.encoding == "jpegls":
-        return _decode_jpegls(source, samples, data)
+        return _decode_jpegls(source, samples, packed)
     try:
-        counts = decode_png(data, samples.shape)
+        counts = decode_png(packed, samples.shape)
     except PngError as error:
         raise source.error(samples.offset, *error.args) from error
     return counts.byteswap() if samples.little_endian else counts

@@ -74,7 +74,7 @@ class FrameReference(FrameHeader):
         return Frame(**header, counts=counts, source=str(self.path), index=self.index, camera_info=info)
 
     def damaged_records(self) -> list[int]:
-        """Return the types of the records that differ from their checksums, which reading does not compute because it is slow."""
+        """Return the types of all records that differ from their checksums; reading compares that of the pixels only."""
         with self.path.open("rb", buffering=0) as file:
             source = FffSource(file, self.path, self.segments)
             return damaged_records(source, read_directory(source))
@@ -210,11 +210,17 @@ def _walk(file: BinaryIO, path: Path) -> Iterator[FrameReference | RejectedFrame
     if start[:2] == b"\xff\xd8":
         source = FffSource(file, path, _jpeg_segments(file, path))
         yield _reference(source, read_directory(source), 0)
-    elif start == MAGIC:
-        yield from _walk_sequence(file, path)
-    else:
-        actual = start.hex(" ") or "an empty file"
-        raise FlirFormatError(f"{path}: at 0x0: expected a JPEG (FF D8) or an FFF record (46 46 46 00), found {actual}")
+        return
+    size = file.seek(0, os.SEEK_END)
+    # The first header of a sequence may be damaged; a file without any header is no sequence.
+    first = 0 if start == MAGIC else _find_header(file, 1, size)
+    actual = start.hex(" ") or "an empty file"
+    wrong = f"{path}: at 0x0: expected a JPEG (FF D8) or an FFF record (46 46 46 00), found {actual}"
+    if first == size:
+        raise FlirFormatError(wrong)
+    if first:
+        yield RejectedFrame(path, 0, wrong)
+    yield from _walk_sequence(file, path, first, size, index=1 if first else 0)
 
 
 def _reference(source: FffSource, directory: Directory, index: int) -> FrameReference:
@@ -240,10 +246,10 @@ def _reference(source: FffSource, directory: Directory, index: int) -> FrameRefe
     )
 
 
-def _walk_sequence(file: BinaryIO, path: Path) -> Iterator[FrameReference | RejectedFrame]:
-    """Yield the frames of consecutive FFF records; padding and damaged frames are skipped and reported."""
-    size = file.seek(0, os.SEEK_END)
-    start, index = 0, 0
+def _walk_sequence(
+    file: BinaryIO, path: Path, start: int, size: int, *, index: int
+) -> Iterator[FrameReference | RejectedFrame]:
+    """Yield the frames of consecutive FFF records from `start` on; padding and damaged frames are skipped and reported."""
     notes: tuple[str, ...] = ()
     while start < size:
         source = FffSource(file, path, ((start, size - start),))
@@ -256,16 +262,20 @@ def _walk_sequence(file: BinaryIO, path: Path) -> Iterator[FrameReference | Reje
         except FlirFormatError as error:
             yield RejectedFrame(path, index, str(error))
             end = following = _find_header(file, start + HEADER_SIZE, size)
-        notes = (f"{following - end} bytes of padding before the frame were skipped",) if following > end else ()
-        if end < following == size and _holds_data(file, end):
-            text = f"{path}: at 0x{end:X}: expected a frame or padding, found {size - end} bytes that are neither"
-            yield RejectedFrame(path, index + 1, text)
+        notes = ()
+        if end < following and _holds_data(file, end, following - end):
+            index += 1
+            text = f"{path}: at 0x{end:X}: expected a frame or padding, found {following - end} bytes that are neither"
+            yield RejectedFrame(path, index, text)
+        elif end < following:
+            notes = (f"{following - end} bytes of padding before the frame were skipped",)
         start, index = following, index + 1
 
 
-def _holds_data(file: BinaryIO, offset: int) -> bool:
+def _holds_data(file: BinaryIO, offset: int, length: int) -> bool:
+    """Return whether a gap holds anything but zeros, by its first 64 kB."""
     file.seek(offset)
-    return any(file.read(1 << 16))
+    return any(file.read(min(length, 1 << 16)))
 
 
 def _next_frame(file: BinaryIO, start: int, size: int, directory: Directory) -> tuple[int, int]:

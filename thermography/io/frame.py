@@ -167,6 +167,10 @@ class SampleLocation:
         Byte order of the samples.
     shape : tuple of int
         (rows, columns).
+    record : (offset, length)
+        Place of the raw-image record with its header in the FFF record, bytes.
+    checksum : int
+        CRC-32 of the raw-image record as stored in the directory; 0 where none is stored.
     """
 
     encoding: Encoding
@@ -174,6 +178,8 @@ class SampleLocation:
     length: int
     little_endian: bool
     shape: tuple[int, int]
+    record: tuple[int, int]
+    checksum: int
 
 
 @dataclass(frozen=True, kw_only=True)

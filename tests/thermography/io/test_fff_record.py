@@ -9,7 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.thermography.flir_mutations import CAMERA, PARAMETERS, SETTINGS, TIME, frame, jpeg, sequence
+from tests.thermography.flir_mutations import (
+    CAMERA,
+    PARAMETERS,
+    SETTINGS,
+    TIME,
+    frame,
+    jpeg,
+    sequence,
+    without_checksums,
+)
 from thermography.io.fff_record import FffSource, damaged_records, is_fff_header, read_directory
 from thermography.io.flir import index_frames, read_frame
 from thermography.io.flir_writer import write_sequence
@@ -165,7 +174,7 @@ def test_samples_of_every_encoding_are_equal_and_read_only(tmp_path: Path, encod
 def test_big_endian_samples_are_read_by_their_own_mark(tmp_path: Path) -> None:
     path = tmp_path / "a.seq"
     (written,) = sequence(path, frames=1)
-    data = bytearray(path.read_bytes())
+    data = bytearray(without_checksums(path.read_bytes()))
     raw = len(data) - written.counts.nbytes - 0x20
     data[raw : raw + 6] = struct.pack(">3H", 2, 16, 12)
     data[raw + 0x20 :] = written.counts.astype(">u2").tobytes()
@@ -231,6 +240,22 @@ def test_a_violation_is_named_with_file_and_place(tmp_path: Path, offset: int, v
         read_frame(_patched(path, offset, value))
 
 
+@pytest.mark.parametrize("encoding", ["raw", "png", "jpegls"])
+def test_samples_that_differ_from_their_checksum_are_refused(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "a.seq"
+    sequence(path, encoding, frames=1)
+    data = bytearray(path.read_bytes())
+    data[-9] ^= 0x10
+    path.write_bytes(data)
+    with pytest.raises(
+        FlirFormatError, match=r"at 0xBAC: expected a raw image with the CRC-32 [0-9A-F]{8}, found another"
+    ):
+        read_frame(path)
+    path.write_bytes(without_checksums(bytes(data)))
+    if encoding == "raw":
+        assert read_frame(path).counts.shape == (12, 16)
+
+
 def test_a_directory_that_points_to_itself_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.seq"
     sequence(path, frames=1)
@@ -260,7 +285,7 @@ def test_bombs_and_garbage_streams_are_refused(
 ) -> None:
     path = tmp_path / "a.seq"
     sequence(path, encoding, frames=1)
-    data = path.read_bytes()
+    data = without_checksums(path.read_bytes())
     start = data.index(b"\x89PNG" if encoding == "png" else b"\xff\xd8\xff\xf7")
     path.write_bytes(data[:start] + data[start:].replace(old, new))
     with pytest.raises(FlirFormatError, match=message):
@@ -270,7 +295,7 @@ def test_bombs_and_garbage_streams_are_refused(
 def test_thousands_of_damaged_frames_leave_the_interpreter_intact(tmp_path: Path) -> None:
     path = tmp_path / "a.seq"
     sequence(path, "png", frames=1)
-    data = bytearray(path.read_bytes())
+    data = bytearray(without_checksums(path.read_bytes()))
     offset = data.index(b"IDAT") + 10
     data[offset : offset + 4] = b"abcd"
     path.write_bytes(data)

@@ -147,6 +147,26 @@ def test_undeclared_padding_is_stepped_over_and_said(tmp_path: Path, padding: in
     assert rejected == []
 
 
+@pytest.mark.parametrize("damaged", [0, 1, 2])
+def test_a_frame_whose_header_is_lost_is_no_padding(tmp_path: Path, damaged: int) -> None:
+    path = tmp_path / "a.seq"
+    written = sequence(path, frames=3)
+    data = bytearray(path.read_bytes())
+    size = len(data) // 3
+    data[damaged * size : damaged * size + 64] = bytes(64)
+    path.write_bytes(data)
+    frames, rejected = index_frames([path])
+    kept = [index for index in range(3) if index != damaged]
+    assert [frame.index for frame in frames] == kept
+    for frame, index in zip(frames, kept, strict=True):
+        np.testing.assert_array_equal(frame.read().counts, written[index].counts)
+        assert frame.notes == ()
+    (lost,) = rejected
+    assert lost.index == damaged
+    expected = "a JPEG (FF D8) or an FFF record" if damaged == 0 else "a frame or padding"
+    assert f"expected {expected}" in lost.reason
+
+
 def test_declared_padding_needs_no_search(tmp_path: Path) -> None:
     path = tmp_path / "a.seq"
     sequence(path, frames=2, padding=100)
