@@ -1,0 +1,148 @@
+"""What an answer is worth: held against the truth of the twin, and searched for words that name the fault."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from fusion.products.results import AnomalyPart, AxisLoop, Results
+from fusion.twin.simulate import Truth
+from tests.soak.lies.campaigns import EXPANSION_PPM_PER_K
+from tests.soak.lies.lie import Lie
+
+#: Largest error in standard uncertainties, and largest relative error of the expansion coefficient.
+_SIGMAS, _RELATIVE = 3.0, 0.1
+#: Checks that list many possible faults as their remedy: only what their evidence says names a fault.
+_CATCH_ALL = {"expansion_coefficient"}
+
+
+class Outcome(StrEnum):
+    """What a run on a lying input led to."""
+
+    RIGHT = "right"
+    CORRECTED = "corrected"
+    DOUBTED_NAMED = "doubted, naming the fault"
+    DOUBTED = "doubted, not naming it"
+    REFUSED_NAMED = "refused, naming the fault"
+    REFUSED = "refused, not naming it"
+    SILENTLY_WRONG = "silently wrong"
+    TRACEBACK = "traceback"
+
+
+def refusal(lie: Lie, message: str) -> Outcome:
+    """The outcome of a run that was refused."""
+    return Outcome.REFUSED_NAMED if _names(lie, message) else Outcome.REFUSED
+
+
+def judge(lie: Lie, truth: Truth, results: Results, folder: Path) -> tuple[Outcome, list[str]]:
+    """The outcome of a run that gave results, and what is wrong in them."""
+    wrong = list(_faults(lie, truth, results, folder))
+    if results.inputs is not None and results.inputs.state == "doubted":
+        named = any(_names(lie, words) for words in _doubts(results))
+        return (Outcome.DOUBTED_NAMED if named else Outcome.DOUBTED), wrong
+    if wrong:
+        return Outcome.SILENTLY_WRONG, wrong
+    notices = [f"{notice.code}: {notice.message}" for notice in results.warnings]
+    return (Outcome.CORRECTED if any(_names(lie, notice) for notice in notices) else Outcome.RIGHT), wrong
+
+
+def _names(lie: Lie, words: str) -> bool:
+    return re.search(lie.family, words, flags=re.IGNORECASE | re.DOTALL) is not None
+
+
+def _doubts(results: Results) -> Iterator[str]:
+    """The words of every doubt."""
+    for check in results.inputs.doubts if results.inputs is not None else ():
+        yield f"{check.code}: {check.evidence}" + ("" if check.code in _CATCH_ALL else f" {check.remedy}")
+
+
+def _faults(lie: Lie, truth: Truth, results: Results, folder: Path) -> Iterator[str]:
+    """What is wrong in the results."""
+    loop = results.loop
+    assert isinstance(loop, AxisLoop)
+    yield from _wrong_causes(lie, truth, loop)
+    yield from _wrong_expansion(loop)
+    yield from _wrong_anomalies(lie, truth, results.anomalies or ())
+    yield from _wrong_profile(truth, results)
+    yield from _wrong_field(truth, folder / "fields.nc")
+
+
+def _wrong_causes(lie: Lie, truth: Truth, loop: AxisLoop) -> Iterator[str]:
+    """Names that are false, and a verdict that nothing is missing although something is."""
+    missing = {effect.name for effect in truth.recipe.effect}
+    named = {step.effect: set(step.tied) for step in loop.steps}
+    named |= {error.effect: set() for error in loop.field_corrections}
+    for name, tied in named.items():
+        if not ({name} | tied) & (missing | lie.describes):
+            yield f"false cause {name}"
+    told = {name for name in missing if any(name in {step} | tied for step, tied in named.items())}
+    if missing - told and loop.verdict in ("complete", "explained"):
+        yield f"{loop.verdict} without {', '.join(sorted(missing - told))}"
+
+
+def _wrong_expansion(loop: AxisLoop) -> Iterator[str]:
+    for entry in loop.declared_coefficients:
+        if entry.effect == "axis_expansion":
+            assert entry.value is not None and entry.u is not None
+            if abs(entry.value - EXPANSION_PPM_PER_K) > max(_RELATIVE * EXPANSION_PPM_PER_K, _SIGMAS * entry.u):
+                yield f"expansion {entry.value:.3g} ± {entry.u:.2g} ppm/K"
+
+
+def _wrong_anomalies(lie: Lie, truth: Truth, anomalies: tuple[AnomalyPart, ...]) -> Iterator[str]:
+    planted = {anomaly.target: anomaly.kind for anomaly in truth.recipe.anomaly}
+    for anomaly in anomalies:
+        right = {"undetermined", planted.get(anomaly.target, ""), *lie.describes}
+        if anomaly.target not in {*planted, *lie.targets}:
+            yield f"false anomaly at target {anomaly.target} ({anomaly.cause})"
+        elif anomaly.cause not in right:
+            yield f"cause {anomaly.cause} at target {anomaly.target}"
+    yield from (f"no anomaly at target {target}" for target in sorted(planted.keys() - {a.target for a in anomalies}))
+
+
+def _wrong_profile(truth: Truth, results: Results) -> Iterator[str]:
+    """The profile less its straight line, which depends on the cycles that the mean is taken over."""
+    drift = results.drift
+    assert drift is not None
+    estimate, u = (
+        np.array([part.positive, part.negative], dtype=float) for part in (drift.profile_um, drift.profile_u_um)
+    )
+    true = truth.readings["mean_profile"].values
+    if estimate.shape != true.shape:
+        # A target without readings has no place in the results.
+        return
+    error = _without_line(estimate - true)
+    ratio = _rms(error) / _rms(u)
+    if not ratio <= _SIGMAS:
+        yield f"profile off by {_rms(error):.3g} µm (u {_rms(u):.2g} µm)"
+
+
+def _without_line(error: np.ndarray) -> np.ndarray:
+    """Errors (direction, target) less the straight line through all of them; a direction without readings is left out."""
+    target = np.broadcast_to(np.arange(error.shape[1], dtype=float), error.shape)
+    known = np.isfinite(error)
+    if np.count_nonzero(known) < 3:
+        return error
+    return error[known] - np.polyval(np.polyfit(target[known], error[known], 1), target[known])
+
+
+def _wrong_field(truth: Truth, path: Path) -> Iterator[str]:
+    """Temperature and rise of every cell and cycle against the true field."""
+    with xr.open_dataset(path, engine="h5netcdf") as fields:
+        true = truth.temperature(truth.session.frame_s, fields["x"].values, fields["y"].values, cell_mm=10.0)
+        count = fields.sizes["cycle"]
+        rows = np.arange(count) if count == len(true) else fields["cycle"].values - 1
+        for name, expected in (("temperature", true[rows]), ("temperature_rise", true[rows] - true[0])):
+            error, u = fields[name].values - expected, fields[f"{name}_u"].values
+            # The rise of the reference cycle is zero by definition, with no uncertainty.
+            known = np.isfinite(error) & (u > 0.0)
+            if not known.any() or not _rms(error[known]) <= _SIGMAS * _rms(u[known]):
+                yield f"{name} off by {_rms(error[known]):.3g} K (u {_rms(u[known]):.2g} K)"
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(np.square(values, dtype=float)))) if np.isfinite(values).any() else float("nan")
