@@ -244,6 +244,7 @@ class InterferometryTable(_Table):
     dwell_s: PositiveSeconds | None = Field(default=None, alias="dwell")
     compensation: Literal["as recorded", "redo"] = "as recorded"
     material_temperature: Literal["logged", "camera"] = "logged"
+    material_sensor_mm: tuple[Millimetres, Millimetres] | None = Field(default=None, alias="material_sensor")
     environment_factor_mm: tuple[Millimetres, Millimetres] | None = Field(default=None, alias="environment_factor")
 
 

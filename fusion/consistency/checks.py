@@ -24,6 +24,11 @@ CODES = (
     "camera_settings",
     "camera_parameters",
     "camera_range",
+    "camera_clock",
+    "environment_clock",
+    "drivers_clock",
+    "material_rise",
+    "material_level",
     "expansion_coefficient",
 )
 

@@ -5,13 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import xarray as xr
+
+from fusion.alignment.readings import read_fused
 from fusion.campaign.config import CampaignError
 from fusion.campaign.inputs import Source
 from fusion.consistency.checks import CODES, Check
+from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_material_clock
 from fusion.consistency.coefficients import check_expansion
+from fusion.consistency.field_series import thin_fields
 from fusion.consistency.frames import check_frames
 from fusion.consistency.logs import check_log
 from fusion.consistency.readings import check_readings
+from fusion.consistency.temperature import check_material
 from fusion.pipeline.thermal import overridden_parameters
 
 
@@ -60,6 +66,35 @@ def check_source(source: Source) -> list[Check]:
             endangers="every effect that follows a load, and the verdict that none is missing",
         ),
         *check_frames(source.frames, overridden=set(overridden_parameters(source))),
+    ]
+
+
+def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[Check]:
+    """Check the fields against logs and drift.
+
+    Parameters
+    ----------
+    source : Source
+        Inputs of the campaign.
+    fields : Dataset
+        Keeps ``thermography.contract.FIELDS``, on the laser's clock.
+    fused : Dataset
+        Both recordings on one clock.
+
+    Returns
+    -------
+    list of Check
+        Of the clocks, and of rise and level of the camera's temperature.
+    """
+    field = thin_fields(fields)
+    interferometry, drivers = source.campaign.interferometry, source.campaign.drivers
+    environment_file = (interferometry.environment if interferometry is not None else None) or "the environment log"
+    place_mm = source.interferometry.material_sensor_mm
+    return [
+        *check_camera_clock(read_fused(fused)),
+        *check_material_clock(field, source.environment, file=environment_file, place_mm=place_mm),
+        *check_load_clock(field, source.drivers, file=drivers.file if drivers is not None else "the drivers' log"),
+        *check_material(field, source.environment, place_mm=place_mm),
     ]
 
 

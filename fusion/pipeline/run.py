@@ -15,7 +15,7 @@ from fusion.campaign.inputs import Source, compensate_by_camera, read_source
 from fusion.consistency.checks import Check, doubt_notices, inputs_part, refuse_contradictions
 from fusion.pipeline import attribution, drift_model, interferometry, thermal
 from fusion.pipeline import record as record_stage
-from fusion.pipeline.consistency import check_loop, check_source
+from fusion.pipeline.consistency import check_fields, check_loop, check_source
 from fusion.pipeline.provenance import describe_run, hash_inputs, versions
 from fusion.products.progress import Report, silent
 from fusion.products.results import Notice, Outcome, Results, assemble
@@ -247,7 +247,7 @@ def _run_instruments(run: Run, source: Source, checks: Sequence[Check], *, sched
     write_dataset(folder / "fusion.nc", fusion)
     thermal.write_exr(folder / "maps", fields, report=report)
     accepted = run.campaign.accept.doubts
-    checks = [*checks, *check_loop(run.parts["loop"])]
+    checks = [*checks, *check_fields(source, fields, fused), *check_loop(run.parts["loop"])]
     run.parts["inputs"] = inputs_part(checks, accepted)
     run.notices = [*doubt_notices(checks, accepted), *run.notices]
     return _finish(run, {"fields": fields, "deviations": deviations, "fusion": fusion})

@@ -16,7 +16,7 @@ from fusion.twin.machine.recipe import RecipeError
 from fusion.twin.machine.streams import stream
 from fusion.twin.recipe_file import read_recipe
 from fusion.twin.record import simulate_record, write_record
-from fusion.twin.simulate import Truth, driver_log, environment_log, moving_rms, simulate
+from fusion.twin.simulate import PROBE_MM, Truth, driver_log, environment_log, moving_rms, simulate
 from interferometry.io.writers import write_deviations_csv, write_environment_csv, write_rtl
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import CalibratedRange, CameraIdentity, CameraParameters, Frame
@@ -172,6 +172,7 @@ deviations = "laser.{recipe.laser.file}"
 {motion if recipe.laser.file == "rtl" else ""}environment = "environment.csv"
 dead_path = "0 mm"
 expansion_coefficient = "{recipe.laser.stated_expansion_ppm_per_K:g} ppm/K"
+material_sensor = ["{PROBE_MM[0]:g} mm", "{PROBE_MM[1]:g} mm"]
 
 [drivers]
 file = "drivers.csv"

@@ -18,7 +18,7 @@ from tests.fusion.consistency import lies
 def test_a_sound_campaign_passes_every_check(results_folder: Path) -> None:
     inputs = read_results(results_folder).inputs
     assert inputs is not None and inputs.state == "sound"
-    assert len(inputs.checks) == 11 and all(check.passed for check in inputs.checks)
+    assert len(inputs.checks) == 16 and all(check.passed for check in inputs.checks)
 
 
 @pytest.mark.parametrize(
@@ -46,6 +46,7 @@ def test_a_contradiction_is_refused_before_a_folder_is_made(
         (lies.copied_cycle, "copied_cycles"),
         (lies.drivers_end_early, "drivers_coverage"),
         (lies.aluminium, "expansion_coefficient"),
+        (lies.emissivity_of_half, "material_rise"),
     ],
 )
 def test_a_doubt_is_named_first_and_makes_the_verdict_conditional(

@@ -1,0 +1,360 @@
+"""Checks of the clocks against one another: loads and material temperature against the field, the field against the drift.
+
+Each compares two courses at many shifts of one clock. A shift is doubted only where it lies outside the delays that physics makes and
+explains far more than every delay within them; where the data cannot tell, the check is passed and says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from fusion._typing import Array
+from fusion.alignment.first_order_lag import respond
+from fusion.alignment.readings import Readings, Series
+from fusion.consistency.checks import Check
+from fusion.consistency.field_series import FieldSeries
+from fusion.consistency.temperature import LEAST_FOLLOWED, RESOLUTION_K, SENSOR_LAGS_S, compare_course
+from fusion.effects.effect import Candidate
+from fusion.model.drift_variances import SHIFT_AND_STRETCH, scaled_systems
+from fusion.model.fit import Term, fit_model
+from fusion.model.least_squares import by_width
+from fusion.model.profile_gain import profile_gains
+from interferometry.drift.state_space import DriftModelError
+
+#: Shifts of a log that are tried, s: three hours, as far as time zones of one country lie apart, in steps of two minutes.
+_LOG_SHIFTS_S = np.arange(-10_800.0, 10_801.0, 120.0)
+#: Delays of a log against the field that are no clock's: heat takes minutes from a source to the surface, a sensor follows late.
+_LOG_DELAYS_S = (-300.0, 900.0)
+#: A shift must leave this many times less of the material temperature than every delay of physics does (variance ratio of 9, which
+#: two series of eight independent values each show by chance once in 200 times).
+_MISFIT_RATIO = 3.0
+#: Share of the frames that a shifted log must still cover.
+_LEAST_COMMON = 0.5
+
+#: Time constants of source and table through which a load is seen, s: 5 and 20 min; half an hour, two and ten hours.
+_SOURCE_S, _TABLE_S = (300.0, 1200.0), (1800.0, 7200.0, 36_000.0)
+#: Leading modes of the field's rate: source and table make two, the rest is noise.
+_MODES = 2
+#: Share of the field's rate that the load must explain, and the factor by which a shift must lessen what is left.
+_LEAST_EXPLAINED, _LEFT_RATIO = 0.6, 2.0
+#: Resampled courses, none of which may gain as much, from blocks of this length, s.
+_DRAWS, _BLOCK_S = 400, 1800.0
+
+#: Shifts of the camera's clock that are tried on the drift, s.
+_CAMERA_SHIFTS_S = np.arange(-7200.0, 7201.0, 300.0)
+#: Delays between field and drift that structures out of sight make, s.
+_STRUCTURE_DELAY_S = 1800.0
+#: Log-likelihood that a shift must gain over every delay of a structure, and its share of all that the field explains.
+_LEAST_GAIN, _GAIN_SHARE = 15.0, 0.3
+#: Time constants, min, of a warm-up of laser and machine that may go beside the field.
+_WARM_UPS_MIN = (15.0, 60.0)
+
+
+@dataclass(frozen=True)
+class Shift:
+    """A shift of a clock that explains two courses better than every delay of physics.
+
+    Attributes
+    ----------
+    seconds : float, s
+        By how much the log is late.
+    left, left_within : float
+        What the shift leaves unexplained, and what the best delay of physics leaves, as shares of the standard deviation.
+    """
+
+    seconds: float
+    left: float
+    left_within: float
+
+
+def check_material_clock(
+    field: FieldSeries | None, log: xr.Dataset | None, *, file: str, place_mm: tuple[float, float] | None
+) -> list[Check]:
+    """Check the clock of the environment log: the material temperature follows the camera's.
+
+    Parameters
+    ----------
+    field : FieldSeries or None
+        Temperature of the table; None where too few frames show it.
+    log : Dataset or None
+        Environment along ``time`` (UTC) with ``material_temperature``, degC.
+    file : str
+        The file, for the message.
+    place_mm : (float, float) or None, mm
+        Plan point of the sensor; None tries every cell.
+
+    Returns
+    -------
+    list of Check
+        ``environment_clock``; empty where nothing was logged or no field is there.
+    """
+    if field is None or log is None or "material_temperature" not in log:
+        return []
+    near = field if place_mm is None else field.near(place_mm)
+    shift = _material_shift(near, field.since_start(log["time"].values), log["material_temperature"].values)
+    endangered = (
+        "index of air, dead path and material compensation; all fields, where it is the camera's clock that errs"
+    )
+    return [_log_check("environment_clock", file, "material temperature", shift, endangered)]
+
+
+def _material_shift(near: FieldSeries, at: Array, logged: Array) -> Shift | None:
+    """Shift by which the log follows a cell, None where the delays of physics do nearly as well or no shift does."""
+    courses = [near.lagged(lag_s) for lag_s in SENSOR_LAGS_S]
+    left, spread = np.full(_LOG_SHIFTS_S.size, np.inf), np.ones(_LOG_SHIFTS_S.size)
+    for k, shift in enumerate(_LOG_SHIFTS_S):
+        inside = (near.seconds + shift >= at[0]) & (near.seconds + shift <= at[-1])
+        if inside.sum() < max(12, _LEAST_COMMON * near.seconds.size):
+            continue
+        target = np.interp(near.seconds[inside] + shift, at, logged)
+        compared = [compare_course(cells[inside], target) for cells in courses]
+        left[k] = max(min(float(course.unexplained_K.min()) for course in compared), RESOLUTION_K)
+        spread[k] = max(compared[0].spread_K, RESOLUTION_K)
+    within = _within_delays()
+    if not np.isfinite(left[within]).any():
+        return None
+    share = left / spread
+    best, allowed = int(np.argmin(share)), np.flatnonzero(within)[np.argmin(share[within])]
+    if within[best] or share[best] > LEAST_FOLLOWED or left[allowed] < _MISFIT_RATIO * left[best]:
+        return None
+    return Shift(float(_LOG_SHIFTS_S[best]), float(share[best]), float(share[allowed]))
+
+
+def _within_delays() -> NDArray[np.bool_]:
+    least_s, most_s = _LOG_DELAYS_S
+    return np.asarray((least_s <= _LOG_SHIFTS_S) & (most_s >= _LOG_SHIFTS_S))
+
+
+def check_load_clock(field: FieldSeries | None, log: xr.Dataset | None, *, file: str) -> list[Check]:
+    """Check the clock of the drivers' log: the field's rate follows the load.
+
+    Parameters
+    ----------
+    field : FieldSeries or None
+        Temperature of the table; None where too few frames show it.
+    log : Dataset or None
+        Drivers along ``time`` (UTC); columns that are temperatures, and those that stay the same, tell nothing.
+    file : str
+        The file, for the message.
+
+    Returns
+    -------
+    list of Check
+        ``drivers_clock``; empty where no load was logged or no field is there.
+    """
+    loads = [] if log is None else [column for column in log.data_vars.values() if _is_load(column)]
+    if field is None or log is None or not loads:
+        return []
+    at = field.since_start(log["time"].values)
+    rate = _Rate.of(field)
+    shifts = [_load_shift(rate, at, column.values.astype(float)) for column in loads]
+    found = [shift for shift in shifts if shift is not None]
+    best = min(found, key=lambda shift: shift.left) if found else None
+    endangered = "every effect that follows a load; all fields, where it is the camera's clock that errs"
+    return [_log_check("drivers_clock", file, "load", best, endangered)]
+
+
+def _is_load(column: xr.DataArray) -> bool:
+    """Whether a column may drive the field: numbers that change and are no temperature."""
+    if column.dtype.kind not in "fiu" or str(column.attrs.get("units", "")) in ("degC", "K"):
+        return False
+    finite = np.isfinite(column.values)
+    return int(finite.sum()) >= 2 and float(np.ptp(column.values[finite])) > 0.0
+
+
+@dataclass(frozen=True)
+class _Rate:
+    """Increments of the field's leading modes from frame to frame, whitened as a random walk, without a slow trend.
+
+    Attributes
+    ----------
+    seconds : (n + 1,) ndarray, s
+        Times of the frames.
+    weight : (n,) ndarray
+        One over the square root of each step.
+    trend : (n, 3) ndarray
+        Orthonormal columns of a steady rate and of a warm-up before the log.
+    modes : (n, 2) ndarray
+        The increments.
+    """
+
+    seconds: Array
+    weight: Array
+    trend: Array
+    modes: Array
+
+    @classmethod
+    def of(cls, field: FieldSeries) -> _Rate:
+        steps = np.diff(field.seconds)
+        weight = 1.0 / np.sqrt(steps)
+        increments = np.diff(field.temperature, axis=0)
+        _, _, patterns = np.linalg.svd(increments, full_matrices=False)
+        fading = [np.diff(-np.exp(-field.seconds / time_constant_s)) for time_constant_s in _TABLE_S[:2]]
+        trend, _ = np.linalg.qr(np.column_stack([steps, *fading]) * weight[:, None])
+        modes = (increments @ patterns[:_MODES].T) * weight[:, None]
+        return cls(field.seconds, weight, trend, modes - trend @ (trend.T @ modes))
+
+    def columns(self, at: Array, load: Array) -> Array:
+        """Unit responses to a load, (shifts, shapes, n), whitened and freed of the trend; zero where a load does not change."""
+        grid = np.arange(at[0], at[-1] + 1.0, 60.0)
+        finite = np.isfinite(load)
+        steps = np.interp(grid, at[finite], load[finite])[:, None]
+        shapes = [
+            respond(respond(steps, grid, time_constant_s=source), grid, time_constant_s=table)[:, 0]
+            for source in _SOURCE_S
+            for table in _TABLE_S
+        ]
+        columns = np.array(
+            [
+                [np.diff(np.interp(self.seconds + shift, grid, shape)) * self.weight for shape in shapes]
+                for shift in _LOG_SHIFTS_S
+            ]
+        )
+        columns -= (columns @ self.trend) @ self.trend.T
+        length = np.linalg.norm(columns, axis=-1, keepdims=True)
+        return np.where(length > 1e-9 * max(float(length.max()), 1e-12), columns / np.maximum(length, 1e-12), 0.0)
+
+
+def _load_shift(rate: _Rate, at: Array, load: Array) -> Shift | None:
+    """Shift by which the field's rate follows a load, None where the delays of physics do nearly as well or chance does."""
+    columns = rate.columns(at, load)
+    shapes = columns.shape[1]
+    flat = columns.reshape(-1, columns.shape[-1])
+    within = np.repeat(_within_delays(), shapes)
+    total = float((rate.modes**2).sum())
+    left = 1.0 - ((flat @ rate.modes) ** 2).sum(axis=1) / max(total, 1e-30)
+    best, allowed = int(np.argmin(left)), int(np.flatnonzero(within)[np.argmin(left[within])])
+    if within[best] or 1.0 - left[best] < _LEAST_EXPLAINED or left[allowed] < _LEFT_RATIO * left[best]:
+        return None
+    if _chance_gain(rate, flat, within, flat[allowed]) >= np.log(left[allowed] / left[best]):
+        return None
+    return Shift(float(_LOG_SHIFTS_S[best // shapes]), float(np.sqrt(left[best])), float(np.sqrt(left[allowed])))
+
+
+def _chance_gain(rate: _Rate, columns: Array, within: NDArray[np.bool_], kept: Array) -> float:
+    """Largest gain of a shift over the delays of physics in courses that follow a kept delay, (n,), and blocks of their own remainder.
+
+    Moving-block bootstrap with random signs: Künsch 1989, Ann. Stat. 17, 1217.
+    """
+    rng = np.random.default_rng(1)
+    fitted = np.outer(kept, kept @ rate.modes)
+    remainder = rate.modes - fitted
+    count = remainder.shape[0]
+    block = max(2, round(_BLOCK_S * float(np.median(rate.weight)) ** 2))
+    blocks = -(-count // block)
+    starts = rng.integers(0, count, (_DRAWS, blocks, 1))
+    places = ((starts + np.arange(block)) % count).reshape(_DRAWS, -1)[:, :count]
+    signs = np.repeat(rng.choice([-1.0, 1.0], (_DRAWS, blocks)), block, axis=1)[:, :count]
+    largest = 0.0
+    for place, sign in zip(places, signs, strict=True):
+        drawn = fitted + remainder[place] * sign[:, None]
+        drawn -= rate.trend @ (rate.trend.T @ drawn)
+        explained = ((columns @ drawn) ** 2).sum(axis=1)
+        total = float((drawn**2).sum())
+        gain = np.log((total - explained[within].max()) / (total - explained.max()))
+        largest = max(largest, float(gain))
+    return largest
+
+
+def _log_check(code: str, file: str, what: str, shift: Shift | None, endangers: str) -> Check:
+    """The check of a log's clock, in minutes late."""
+    limit_min = _LOG_DELAYS_S[1] / 60.0
+    if shift is None:
+        told = f"No shift of {file} suits {what} and field better than the delays of heat and sensors do (or it cannot be told)."
+        return Check(code, 0.0, limit_min, True, told, "", endangers)
+    minutes = shift.seconds / 60.0
+    late = f"{abs(minutes):.0f} min {'late' if minutes > 0.0 else 'early'}"
+    return Check(
+        code,
+        minutes,
+        limit_min,
+        False,
+        f"{what[0].upper()}{what[1:]} and field agree where {file} is taken as {late} against the camera: they then leave "
+        f"{100.0 * shift.left:.0f} % of each other unexplained, as stated at least {100.0 * shift.left_within:.0f} %.",
+        f"Check the clock and the time zone of {file}; where another log is off by as much, those of the camera (clock_offset).",
+        endangers,
+    )
+
+
+def check_camera_clock(readings: Readings) -> list[Check]:
+    """Check the clock of the camera against the laser's: the drift of the readings follows the field.
+
+    Parameters
+    ----------
+    readings : Readings
+        Beside the fields at the stated clock offset.
+
+    Returns
+    -------
+    list of Check
+        ``camera_clock``; empty where no field is there.
+
+    Notes
+    -----
+    Profile likelihood of the camera's shift in the declared model of expansion and offset, with warm-ups of laser and machine and an
+    unexplained drift beside it (docs/method/consistency.md).
+    """
+    if "mean_rise" not in readings.series:
+        return []
+    endangered = "all fields at the readings, the declared coefficients, and every cause"
+    limit = _STRUCTURE_DELAY_S / 60.0
+    gain = _gain_of_shifts(readings)
+    within = np.abs(_CAMERA_SHIFTS_S) <= _STRUCTURE_DELAY_S
+    best = int(np.argmax(gain))
+    more = float(gain[best] - gain[within].max())
+    if more < _LEAST_GAIN or more < _GAIN_SHARE * gain[best]:
+        told = "No shift of the camera's clock suits field and drift better than a delay of the machine does (or it cannot be told)."
+        return [Check("camera_clock", 0.0, limit, True, told, "", endangered)]
+    near = gain >= gain[best] - 2.0
+    low, high = _CAMERA_SHIFTS_S[near].min() / 60.0, _CAMERA_SHIFTS_S[near].max() / 60.0
+    minutes = float(_CAMERA_SHIFTS_S[best]) / 60.0
+    late = f"{abs(minutes):.0f} min {'late' if minutes > 0.0 else 'early'}"
+    return [
+        Check(
+            "camera_clock",
+            minutes,
+            limit,
+            False,
+            f"The drift of the readings follows the field where the camera's clock is taken as {late} ({low:.0f} to {high:.0f} min) "
+            f"against the laser's; the likelihood gains {more:.0f} over the stated offset.",
+            "Check clock_offset, the camera's clock, and the time zone of the laser's file (time_zone).",
+            endangered,
+        )
+    ]
+
+
+def _gain_of_shifts(readings: Readings) -> Array:
+    """Gain in log-likelihood by the field at every shift of the camera's clock over no field at all, (shifts,)."""
+    fading = [np.exp(-readings.seconds / (60.0 * minutes)) for minutes in _WARM_UPS_MIN]
+    beside = np.column_stack([column * loading for column in fading for loading in readings.loadings.T])
+    terms = [Term("warm_up", _candidate(beside)), Term("field", _candidate(_field_columns(readings, 0.0)))]
+    try:
+        model = fit_model(readings, terms)
+    except DriftModelError:
+        return np.zeros(_CAMERA_SHIFTS_S.size)
+    candidates = [_candidate(_field_columns(readings, float(shift))) for shift in _CAMERA_SHIFTS_S]
+    used = np.ones(readings.seconds.size, bool)
+    gains = profile_gains(
+        scaled_systems(model.fit, SHIFT_AND_STRETCH),
+        readings.response[:, None],
+        np.column_stack([model.profile, beside]),
+        by_width(candidates, used),
+    )
+    return gains.gain[:, 0]
+
+
+def _candidate(columns: Array) -> Candidate:
+    return Candidate(columns, {}, ("um",) * columns.shape[1])
+
+
+def _field_columns(readings: Readings, late_s: float) -> Array:
+    """Expansion and offset by a field whose clock is late, (n, 2)."""
+    columns = []
+    for name, scale in (("axis_integral", 1e-3), ("mean_rise", 1.0)):
+        series = readings.series[name]
+        columns.append(scale * readings.at(Series(series.seconds - late_s, series.values, series.units)))
+    return np.column_stack(columns)
