@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 
 from pydantic import (
     AfterValidator,
@@ -159,6 +160,17 @@ Feed = Annotated[float, _quantity("mm/min"), _within(0.0, 1e6, "a feed rate in m
 Fraction = Annotated[float, BeforeValidator(_fraction), _within(0.0, 1.0, "this fraction")]
 
 
+def _zone(name: str) -> str:
+    """Accept the IANA name of a time zone."""
+    try:
+        ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        text = f'there is no such time zone; {suggest(name, available_timezones())}write an IANA name such as "Europe/Vienna", or "UTC"'
+        raise PydanticCustomError("zone", "{text}", {"text": text}) from None
+    return name
+
+
+TimeZone = Annotated[str, AfterValidator(_zone)]
 ExistingFile = Annotated[str, AfterValidator(_existing)]
 FramePatterns = Annotated[
     tuple[Annotated[str, AfterValidator(_matching)], ...],
@@ -177,6 +189,7 @@ class CampaignTable(_Table):
 
     title: str = Field(min_length=1)
     axis: str = Field(default="", max_length=20)
+    time_zone: TimeZone | None = None
 
 
 class ThermographyTable(_Table):
@@ -238,6 +251,7 @@ class InterferometryTable(_Table):
 
     deviations: ExistingFile
     environment: ExistingFile | None = None
+    time_zone: TimeZone | None = None
     dead_path_mm: Millimetres = Field(default=0.0, alias="dead_path")
     expansion_coefficient_ppm_per_K: PartsPerMillion = Field(default=11.7, alias="expansion_coefficient")
     feed_mm_per_min: Feed | None = Field(default=None, alias="feed")
@@ -252,6 +266,7 @@ class DriversTable(_Table):
     """``[drivers]``: other logged quantities, and the law by which some of them were switched at random."""
 
     file: ExistingFile
+    time_zone: TimeZone | None = None
     randomised: tuple[str, ...] = ()
     mean_dwell_s: PositiveSeconds | None = Field(default=None, alias="mean_dwell")
     least_dwell_s: Seconds = Field(default=0.0, alias="least_dwell")
@@ -277,6 +292,7 @@ class RecordTable(_Table):
     sheet: str | None = None
     time: str
     start: str | None = None
+    time_zone: TimeZone | None = None
     temperatures: tuple[str, ...] = Field(min_length=1)
     displacements: tuple[str, ...] = Field(min_length=1)
     drivers: tuple[str, ...] = ()
@@ -311,6 +327,11 @@ class Campaign(_Table):
     def folder(self) -> Path:
         """Folder that the relative paths of the campaign start from."""
         return self.path.parent
+
+    def zone_of(self, table: Literal["interferometry", "drivers", "record"]) -> str | None:
+        """Return the zone of times that the files of a table give without one; None where neither it nor ``[campaign]`` states it."""
+        stated = getattr(self, table)
+        return (stated.time_zone if stated is not None else None) or self.campaign.time_zone
 
     def resolve(self, name: str) -> Path:
         """Return the absolute path of a file named in the campaign."""

@@ -19,6 +19,7 @@ from fusion.attribution.thermal_modes import Region, read_regions
 from fusion.campaign.config import Campaign, InterferometryTable, PlanTable, ThermographyTable, relative_name
 from fusion.campaign.logged_tables import read_drivers, split_heading
 from fusion.campaign.recompensation import compensate_readings, see_material
+from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones
 from fusion.errors import FusionError
 from fusion.products.contracts import check
 from fusion.products.results import Notice
@@ -118,14 +119,25 @@ def read_source(campaign: Campaign) -> Source:
     assert thermography is not None and plan is not None and interferometry is not None
     laser = campaign.resolve(interferometry.deviations)
     deviations = read_deviations(laser, feed_mm_per_min=interferometry.feed_mm_per_min, dwell_s=interferometry.dwell_s)
+    zone = campaign.zone_of("interferometry")
+    deviations = bring_to_utc(deviations, zone, file=interferometry.deviations)
     check(deviations, DEVIATIONS, name=laser.name)
     cycle_bounds(deviations)
     environment = None
     if interferometry.environment is not None:
         environment = read_environment(campaign.resolve(interferometry.environment))
+        environment = bring_to_utc(environment, zone, file=interferometry.environment)
     compensated = compensate_readings(deviations, environment, interferometry)
     by_camera = interferometry.material_temperature == "camera"
-    drivers = read_drivers(campaign.resolve(campaign.drivers.file)) if campaign.drivers is not None else None
+    drivers = None
+    if campaign.drivers is not None:
+        drivers = read_drivers(campaign.resolve(campaign.drivers.file))
+        drivers = bring_to_utc(drivers, campaign.zone_of("drivers"), file=campaign.drivers.file)
+    files = (interferometry.deviations, interferometry.environment, campaign.drivers and campaign.drivers.file)
+    logs = {
+        str(file): log for file, log in zip(files, (deviations, environment, drivers), strict=True) if log is not None
+    }
+    refuse_mixed_zones(logs, source=str(campaign.path))
     frames, rejected = index_frames(campaign.frame_paths())
     rejected_frames = [
         {

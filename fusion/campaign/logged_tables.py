@@ -16,11 +16,13 @@ import xarray as xr
 
 from fusion.campaign.config import Campaign, CampaignError, RecordTable
 from fusion.campaign.quantities import QuantityError, conversion, unit_name
+from fusion.campaign.time_zones import bring_to_utc
 from fusion.errors import FusionError
 from interferometry.io.delimited import (
     BadReading,
     RejectedLine,
     delimiter_of,
+    describe_time_zone,
     find_header,
     parse_time,
     raise_if_mostly_invalid,
@@ -144,7 +146,7 @@ def read_record(campaign: Campaign) -> xr.Dataset:
     if record.time not in columns:
         raise TableError(f'{path}: no column is named "{record.time}"; the file has: {", ".join(columns)}')
     others = [column for column in columns if column != record.time]
-    time, left_out = _times(path, frame[record.time], record)
+    time, reference, left_out = _times(path, frame[record.time], record)
     left_out = [*misfits, *left_out]
     keep = ~np.isnat(time)
     order = np.argsort(time[keep], kind="stable")
@@ -166,7 +168,7 @@ def read_record(campaign: Campaign) -> xr.Dataset:
     sensors, _, temperature = block(record.temperatures, "degC")
     channels, _, displacement = block(record.displacements, "um")
     drivers, driver_units, driver = block(record.drivers, None)
-    return xr.Dataset(
+    table = xr.Dataset(
         {
             "temperature": (
                 ("time", "sensor"),
@@ -180,6 +182,8 @@ def read_record(campaign: Campaign) -> xr.Dataset:
         coords={"time": time[keep][order], "sensor": sensors, "channel": channels, "driver_name": drivers},
         attrs={"source": path.name, "left_out": json.dumps([asdict(line) for line in left_out])},
     )
+    table["time"].attrs["reference"] = reference
+    return bring_to_utc(table, campaign.zone_of("record"), file=path.name)
 
 
 def _read_frame(path: Path, record: RecordTable) -> tuple[pd.DataFrame, list[RejectedLine]]:
@@ -223,14 +227,18 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, list[RejectedLine]]:
     ]
 
 
-def _times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarray, list[RejectedLine]]:
-    """Return UTC times, NaT where a row has none, and the list of those rows."""
+def _times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarray, str, list[RejectedLine]]:
+    """Return times, NaT where a row has none, how they came to UTC in words, and the list of the rows without a time."""
     seconds = pd.to_numeric(column, errors="coerce")
     left_out: list[RejectedLine] = []
+    zones: dict[str, int] = {}
     if seconds.notna().mean() > 0.5:
         _, unit = split_heading(path, record.time)
         factor = _converted(path, record.time, unit, "s")(np.array([0.0, 1.0]))
-        start = np.datetime64("1970-01-01", "ns") if record.start is None else _parse(path, record.start)
+        start, zone = (
+            (np.datetime64("1970-01-01", "ns"), "+0000") if record.start is None else _parse(path, record.start)
+        )
+        zones[zone] = 0
         elapsed = seconds.to_numpy(dtype="f8") * (factor[1] - factor[0])
         time = start + np.where(np.isfinite(elapsed), np.round(elapsed * 1e9), 0).astype("m8[ns]")
         time[~np.isfinite(elapsed)] = np.datetime64("NaT")
@@ -238,18 +246,19 @@ def _times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarr
         time = np.full(len(column), np.datetime64("NaT", "ns"))
         for at, text in enumerate(column.astype(str)):
             try:
-                time[at] = parse_time(text)[0]
+                time[at], zone = parse_time(text)
             except BadReading:
                 continue
+            zones.setdefault(zone, int(column.index[at]) + 2)
     for at in np.flatnonzero(np.isnat(time)):
         left_out.append(RejectedLine(path.name, int(column.index[at]) + 2, str(column.iloc[at]), "is not a time"))
     raise_if_mostly_invalid(path, int((~np.isnat(time)).sum()), left_out)
-    return time, left_out
+    return time, describe_time_zone(path, zones), left_out
 
 
-def _parse(path: Path, text: str) -> np.datetime64:
+def _parse(path: Path, text: str) -> tuple[np.datetime64, str]:
     try:
-        return parse_time(text)[0]
+        return parse_time(text)
     except BadReading as fault:
         raise TableError(f'record.start = "{text}": {fault.reason}, needed for {path}') from None
 

@@ -129,7 +129,8 @@ class Run:
         """Return a digest of everything that the result of a stage depends on."""
         asked = self.campaign.model_dump(mode="json", include=set(tables))
         files = {file: self.inputs[file] for table in tables for file in self.campaign.files_of(table)}
-        return digest(name, PRODUCT_LAYOUT, versions(), asked, files, [self.keys[earlier] for earlier in after])
+        zone = self.campaign.campaign.time_zone
+        return digest(name, PRODUCT_LAYOUT, versions(), zone, asked, files, [self.keys[earlier] for earlier in after])
 
     def checkpoint(self, key: str) -> Path:
         """Return the folder that keeps the finished cycles of a long recording; folders of other inputs are removed."""

@@ -137,8 +137,10 @@ def _campaign_text(truth: Truth) -> str:
     recipe = truth.recipe
     camera, plan = recipe.camera, recipe.plan
     clock = f'clock_offset = "{camera.clock_offset_s:g} s"\n' if camera.state_clock_offset else ""
-    # A .rtl file holds no times of readings; they are reconstructed from feed and dwell.
-    motion = f'feed = "{recipe.test.feed_mm_per_min:g} mm/min"\ndwell = "{recipe.test.dwell_s:g} s"\n'
+    # A .rtl file holds no times of readings, which are reconstructed from feed and dwell, and no zone.
+    motion = (
+        f'time_zone = "UTC"\nfeed = "{recipe.test.feed_mm_per_min:g} mm/min"\ndwell = "{recipe.test.dwell_s:g} s"\n'
+    )
     duty = recipe.duty
     law = (
         f'randomised = ["duty [1]"]\nmean_dwell = "{duty.mean_hold_min:g} min"\nleast_dwell = "{duty.least_hold_min:g} min"\n'

@@ -18,6 +18,8 @@ from interferometry.errors import InterferometryError
 
 #: Values that instruments write for "no reading"; Renishaw's is -1e20.
 SENTINEL_MAGNITUDE = 1e19
+#: Attribute ``reference`` of times from a file that gives no zone.
+NO_ZONE = "no zone in the file: taken as UTC"
 
 
 class LaserFormatError(InterferometryError):
@@ -322,7 +324,7 @@ def describe_time_zone(path: Path, zones: dict[str, int]) -> str:
             f"{path}: the time on line {zones['']} has no zone, that on line {zones[other]} has {other}; write all of them with a zone"
         )
     if "" in zones:
-        return "no zone in the file: taken as UTC"
+        return NO_ZONE
     if set(zones) == {"+0000"}:
         return "UTC in the file"
     return "converted to UTC from " + ", ".join(sorted(zones))

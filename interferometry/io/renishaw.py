@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from interferometry.deviations import DIRECTIONS, build_deviations
-from interferometry.io.delimited import SENTINEL_MAGNITUDE, LaserFormatError, RejectedLine
+from interferometry.io.delimited import NO_ZONE, SENTINEL_MAGNITUDE, LaserFormatError, RejectedLine
 
 #: A temperature sensor that is not connected reads -10 degC.
 UNCONNECTED_DEGC = -10.0
@@ -86,7 +86,7 @@ def read_rtl(
     if start is None:
         dataset["time"].attrs.update(origin="none", reference="the file holds no start and end that can be read")
     else:
-        dataset["time"].attrs.update(origin="reconstructed", reference="no zone in the file: taken as UTC")
+        dataset["time"].attrs.update(origin="reconstructed", reference=NO_ZONE)
         named = {"units": "s", "long_name": "standard uncertainty of time"}
         dataset["time_u"] = ((), math.hypot(start_u, schedule_u), named)
     dataset = dataset.assign(_parse_environment(sections))

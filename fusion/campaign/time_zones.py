@@ -1,0 +1,99 @@
+"""Times without a zone: which zone they are in, and that no file with a zone is mixed with one without."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from zoneinfo import ZoneInfo
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from fusion.campaign.config import CampaignError
+from interferometry.io.delimited import NO_ZONE
+
+
+def bring_to_utc(table: xr.Dataset, zone: str | None, *, file: str) -> xr.Dataset:
+    """Bring times that a file gives without a zone to UTC.
+
+    Parameters
+    ----------
+    table : Dataset
+        With ``time``; its attribute ``reference`` says whether the file gives a zone.
+    zone : str or None
+        IANA name of the zone that the campaign file states; None leaves the times as they are, taken as UTC.
+    file : str
+        The file, for the message.
+
+    Returns
+    -------
+    Dataset
+        With times in UTC; times that carry their zone in the file are kept.
+
+    Raises
+    ------
+    CampaignError
+        If a time does not exist in that zone, or occurs twice, because clocks are changed for summer.
+
+    Examples
+    --------
+    >>> table = xr.Dataset(coords={"time": np.array(["2026-07-01T10:00"], "datetime64[ns]")})
+    >>> table["time"].attrs["reference"] = NO_ZONE
+    >>> str(bring_to_utc(table, "Europe/Vienna", file="laser.csv")["time"].values[0])
+    '2026-07-01T08:00:00.000000000'
+    """
+    if zone is None or not lacks_zone(table):
+        return table
+    local = table["time"].values
+    stamps = pd.DatetimeIndex(local.ravel())
+    placed = stamps.tz_localize(ZoneInfo(zone), ambiguous="NaT", nonexistent="NaT")
+    lost = np.flatnonzero(np.isnat(placed.tz_convert(None).values) & ~np.isnat(stamps.values))
+    if lost.size:
+        first = np.datetime_as_string(stamps.values[lost[0]], unit="s")
+        raise CampaignError(
+            f"{file}: {lost.size} times, the first {first}, occur twice or not at all in {zone}, where clocks are changed for summer; "
+            'export the times in UTC, and write time_zone = "UTC"'
+        )
+    utc = placed.tz_convert(None).values.astype("datetime64[ns]").reshape(local.shape)
+    attributes = {**table["time"].attrs, "reference": f"converted to UTC from {zone}"}
+    return (
+        table.assign_coords(time=("time", utc, attributes))
+        if "time" in table.dims
+        else table.assign(time=(table["time"].dims, utc, attributes))
+    )
+
+
+def lacks_zone(table: xr.Dataset) -> bool:
+    """Return whether the times of a table come from a file that gives no zone.
+
+    Parameters
+    ----------
+    table : Dataset
+        With ``time``.
+    """
+    return table["time"].attrs.get("reference") == NO_ZONE
+
+
+def refuse_mixed_zones(tables: Mapping[str, xr.Dataset], *, source: str) -> None:
+    """Refuse logs of which some give times with a zone and others without one.
+
+    Parameters
+    ----------
+    tables : mapping of str to Dataset
+        Logs by file, after `bring_to_utc`; those without any time say nothing.
+    source : str
+        Campaign file, for the message.
+
+    Raises
+    ------
+    CampaignError
+        If both kinds are there. Where no log gives a zone, all count as one clock; the frames' clock is tied to it by ``clock_offset``.
+    """
+    timed = {file: table for file, table in tables.items() if not np.isnat(table["time"].values).all()}
+    without = [file for file, table in timed.items() if lacks_zone(table)]
+    zoned = [file for file in timed if file not in without]
+    if without and zoned:
+        raise CampaignError(
+            f"{source}: {', '.join(without)} gives times without a zone, {', '.join(zoned)} with one; write the zone of the former as "
+            'time_zone, for example time_zone = "Europe/Vienna" or "UTC", under the table that names the file, or under [campaign]'
+        )

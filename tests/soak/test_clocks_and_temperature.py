@@ -1,0 +1,126 @@
+"""Checks of clocks and of the camera's rise: how often they doubt sound campaigns, and what they notice; quoted in docs/measured.md."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from fusion.alignment.align import AxisGeometry, align
+from fusion.alignment.readings import read_fused
+from fusion.consistency.checks import Check
+from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_material_clock
+from fusion.consistency.field_series import thin_fields
+from fusion.consistency.temperature import check_material
+from fusion.twin import simulate
+from fusion.twin.machine.recipe import EffectRecipe, Recipe
+from fusion.twin.simulate import PROBE_MM, driver_log, environment_log
+from fusion.twin.truth import deviations_of, fields_of
+from tests.fusion.consistency.twin_fields import late, scaled
+from tests.soak.rates import campaigns, first_seed, rate, wilson
+from tests.soak.test_sound_inputs import sound_recipe
+
+pytestmark = pytest.mark.slow
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What the instruments of one campaign recorded."""
+
+    axis: AxisGeometry
+    deviations: xr.Dataset
+    fields: xr.Dataset
+    environment: xr.Dataset
+    drivers: xr.Dataset
+
+
+def varied_recipe(seed: int) -> Recipe:
+    """A sound campaign of 14 to 60 cycles, with errors of the camera among the undeclared effects and loads of several paces."""
+    rng = np.random.default_rng([seed, 77])
+    recipe = sound_recipe(seed)
+    if rng.random() < 0.25:
+        errs = EffectRecipe("camera_offset", amplitude_K=float(rng.uniform(0.2, 1.0)))
+        reflects = EffectRecipe("reflected_source", amplitude_K=float(rng.uniform(3.0, 12.0)))
+        recipe = recipe.vary(effect=(errs if rng.random() < 0.5 else reflects,))
+    if rng.random() < 0.3:
+        recipe = recipe.vary(test={"cycles": int(rng.integers(16, 26))})
+    if rng.random() < 0.3:
+        recipe = recipe.vary(duty={"mean_hold_min": float(rng.choice([8.0, 12.0, 60.0]))})
+    return recipe
+
+
+def record(recipe: Recipe) -> Recorded:
+    """Simulate a campaign and what an ideal reduction of its frames would give."""
+    truth = simulate(recipe)
+    axis = AxisGeometry(tuple(recipe.plan.origin_mm), tuple(recipe.plan.direction))
+    return Recorded(axis, deviations_of(truth), fields_of(truth), environment_log(truth), driver_log(truth))
+
+
+def of_logs(test: Recorded, *, stated: bool) -> list[Check]:
+    """The checks of the logs and of the camera's rise."""
+    field, place_mm = thin_fields(test.fields), PROBE_MM if stated else None
+    return [
+        *check_material_clock(field, test.environment, file="environment.csv", place_mm=place_mm),
+        *check_load_clock(field, test.drivers, file="drivers.csv"),
+        *check_material(field, test.environment, place_mm=place_mm),
+    ]
+
+
+def of_camera(test: Recorded) -> list[Check]:
+    """The check of the camera's clock by the drift."""
+    fused = align(test.deviations, test.fields, test.axis)
+    return check_camera_clock(read_fused(fused))
+
+
+def test_sound_campaigns_are_not_doubted(capsys: pytest.CaptureFixture[str]) -> None:
+    runs, doubted, named = campaigns(200), 0, list[str]()
+    for seed in range(first_seed(52000), first_seed(52000) + runs):
+        test = record(varied_recipe(seed))
+        failed = [
+            check
+            for check in (*of_logs(test, stated=True), *of_logs(test, stated=False), *of_camera(test))
+            if not check.passed
+        ]
+        doubted += bool(failed)
+        named += [f"{seed} {check.code} {check.value:.3g}" for check in failed]
+    with capsys.disabled():
+        print(f"\nsound campaigns doubted by clocks or temperature: {rate(doubted, runs)}; {named}")
+    assert wilson(doubted, runs)[0] <= 0.01
+
+
+@pytest.mark.parametrize("minutes", [-120.0, -60.0, -30.0, -20.0, 20.0, 30.0, 60.0, 120.0])
+def test_late_clocks(minutes: float, capsys: pytest.CaptureFixture[str]) -> None:
+    runs, noticed, possible, errors = campaigns(40), Counter[str](), Counter[str](), list[float]()
+    for seed in range(first_seed(53000), first_seed(53000) + runs):
+        recipe = Recipe().vary(campaign={"seed": seed}, duty={"mean_hold_min": 25.0})
+        test = record(recipe)
+        logs = replace(test, environment=late(test.environment, minutes), drivers=late(test.drivers, minutes))
+        checks = of_logs(logs, stated=False) + of_camera(replace(test, fields=late(test.fields, minutes)))
+        for check in checks:
+            if check.code.endswith("_clock"):
+                possible[check.code] += 1
+                noticed[check.code] += not check.passed
+                errors += [] if check.passed else [check.value - minutes]
+    with capsys.disabled():
+        told = ", ".join(f"{code} {rate(noticed[code], possible[code])}" for code in sorted(possible))
+        middle = f"{np.median(np.abs(errors)):.0f} min" if errors else "-"
+        print(f"\n{minutes:+.0f} min: {told}; median error of the shift {middle}")
+
+
+@pytest.mark.parametrize("emissivity", [0.50, 0.80, 0.85, 0.88, 0.90, 0.92, 0.94, 1.0])
+def test_wrong_emissivities(emissivity: float, capsys: pytest.CaptureFixture[str]) -> None:
+    """The table is painted, 0.97; near the temperature of the room the rise goes with the reciprocal of the emissivity."""
+    runs, noticed = campaigns(40), Counter[bool]()
+    for seed in range(first_seed(54000), first_seed(54000) + runs):
+        test = record(Recipe().vary(campaign={"seed": seed}, duty={"mean_hold_min": 25.0}))
+        wrong = replace(test, fields=scaled(test.fields, 0.97 / emissivity))
+        for stated in (True, False):
+            noticed[stated] += not next(c for c in of_logs(wrong, stated=stated) if c.code == "material_rise").passed
+    with capsys.disabled():
+        print(
+            f"\nemissivity {emissivity:.2f} for 0.97: noticed with the sensor's place {rate(noticed[True], runs)}, without "
+            f"{rate(noticed[False], runs)}"
+        )
