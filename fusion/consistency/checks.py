@@ -111,7 +111,7 @@ def open_doubts(checks: Sequence[Check], accepted: Collection[str]) -> list[Chec
     return [check for check in checks if not check.passed and check.code not in accepted]
 
 
-def inputs_part(checks: Sequence[Check], accepted: Collection[str]) -> dict[str, object]:
+def inputs_part(checks: Sequence[Check], accepted: Collection[str], *, corrected: bool = False) -> dict[str, object]:
     """The part ``inputs`` of results.json.
 
     Parameters
@@ -120,9 +120,12 @@ def inputs_part(checks: Sequence[Check], accepted: Collection[str]) -> dict[str,
         All of a run, also those that are passed.
     accepted : collection of str
         Codes under ``[accept] doubts``.
+    corrected : bool
+        Whether inputs were corrected or left out before they were used.
     """
+    sound = "corrected" if corrected else "sound"
     return {
-        "state": "doubted" if open_doubts(checks, accepted) else "sound",
+        "state": "doubted" if open_doubts(checks, accepted) else sound,
         "accepted": sorted(accepted),
         "checks": [check.as_json() for check in checks],
     }

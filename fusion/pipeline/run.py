@@ -15,6 +15,7 @@ from fusion.campaign.inputs import Source, compensate_by_camera, read_source
 from fusion.consistency.checks import Check, doubt_notices, inputs_part, refuse_contradictions
 from fusion.pipeline import attribution, drift_model, interferometry, thermal
 from fusion.pipeline import record as record_stage
+from fusion.pipeline.camera import camera_corrected
 from fusion.pipeline.consistency import check_fields, check_loop, check_source
 from fusion.pipeline.provenance import describe_run, hash_inputs, versions
 from fusion.products.progress import Report, silent
@@ -44,7 +45,7 @@ FILES = {
 
 
 #: Number of the products' layout: stages that were kept in another one are computed again.
-PRODUCT_LAYOUT = 2
+PRODUCT_LAYOUT = 3
 
 
 @dataclass
@@ -249,7 +250,7 @@ def _run_instruments(run: Run, source: Source, checks: Sequence[Check], *, sched
     thermal.write_exr(folder / "maps", fields, report=report)
     accepted = run.campaign.accept.doubts
     checks = [*checks, *check_fields(source, fields, fused), *check_loop(run.parts["loop"])]
-    run.parts["inputs"] = inputs_part(checks, accepted)
+    run.parts["inputs"] = inputs_part(checks, accepted, corrected=camera_corrected(run.parts["camera"]))
     run.notices = [*doubt_notices(checks, accepted), *run.notices]
     return _finish(run, {"fields": fields, "deviations": deviations, "fusion": fusion})
 

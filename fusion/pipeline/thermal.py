@@ -1,4 +1,4 @@
-"""Thermal stage: check of the camera, registration of the plan, reduction to one field per cycle, notices of all omissions."""
+"""Thermal stage: camera checked and corrected, plan registered, frames reduced to one field per cycle, omissions noted."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import xarray as xr
 
 from fusion.alignment.align import camera_on_laser_clock, cycle_bounds
 from fusion.campaign.inputs import Source, counted, listed
+from fusion.pipeline.camera import CameraState, clear_frames, examine_camera, survey_campaign
 from fusion.products.contracts import check
 from fusion.products.progress import Report
 from fusion.products.results import Notice, Outcome
@@ -20,15 +21,7 @@ from thermography.contract import FIELDS
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
 from thermography.io.openexr import write_maps
-from thermography.radiometry.camera_artefacts import (
-    DEAD,
-    NOISY,
-    OFFSET,
-    find_bad_pixels,
-    find_repeats,
-    find_steps,
-    read_levels,
-)
+from thermography.radiometry.camera_artefacts import DEAD, NOISY, OFFSET, find_bad_pixels
 from thermography.radiometry.overrides import Overrides
 from thermography.radiometry.planck import calibrate
 from thermography.registration.clock_offset import estimate_clock_offset
@@ -36,8 +29,6 @@ from thermography.registration.register import Registration, register
 
 #: Number of first frames whose mean is registered: the noise falls, and the table has hardly warmed.
 _REGISTRATION_FRAMES = 5
-#: Maximum number of frames examined for steps of the camera's zero; a step persists, so a subset of a video suffices.
-_CHECKED_FRAMES = 1000
 #: Number of frames above which finished cycles are stored during the reduction; below, this costs more than it saves.
 _CHECKPOINT_FRAMES = 2000
 #: Number of frames examined for bad pixels: enough to identify a noisy pixel while the table hardly changes.
@@ -62,7 +53,7 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
     Returns
     -------
     Outcome
-        Fields on the laser's clock that keep ``thermography.contract.FIELDS``; parts ``registration`` and ``alignment``.
+        Fields on the laser's clock that keep ``thermography.contract.FIELDS``; parts ``registration``, ``alignment`` and ``camera``.
 
     Raises
     ------
@@ -72,18 +63,21 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
         If the fields break their contract.
     """
     override = Overrides(overridden_parameters(source))
-    notices = _camera_notices(source, override, report=report)
-    if source.thermography.table == "still":
-        notices += pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:_PIXEL_FRAMES]]))
+    survey = survey_campaign(source, override, report=report)
     report("registration", 0, 1)
     # A moving table is somewhere else in the next frame, so its plan is registered on one frame alone.
-    first = source.frames[: 1 if source.thermography.table == "moving" else _REGISTRATION_FRAMES]
+    first = clear_frames(survey, 1 if source.thermography.table == "moving" else _REGISTRATION_FRAMES)
     reference = np.mean([calibrate(frame.read_counts(), override(frame)) for frame in first], axis=0)
     registration = register(reference, source.fiducials, grid=source.grid)
     report("registration", 1, 1)
+    camera = examine_camera(source, survey, registration)
+    source, notices = camera.source, camera.notices
+    if source.thermography.table == "still":
+        notices += pixel_notices(np.stack([frame.read_counts() for frame in source.frames[:_PIXEL_FRAMES]]))
     fields, clock, clock_notices = _reduce_on_clock(
-        source, registration, override, checkpoint=checkpoint, scheduler=scheduler, report=report
+        camera, registration, override, checkpoint=checkpoint, scheduler=scheduler, report=report
     )
+    fields = fields.assign(camera.per_cycle(_bounds(source, clock["value"])))
     check(fields, FIELDS, name="the fields")
     notices += [*clock_notices, *_registration_notices(registration), *_frame_notices(fields)]
     fields = fields.assign_coords(cycle=source.deviations["cycle"].values)
@@ -99,12 +93,13 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
             "frames_rejected": source.frames_rejected,
         },
         "alignment": {"clock_offset_s": clock},
+        "camera": camera.part,
     }
     return Outcome(fields, parts, tuple(notices))
 
 
 def _reduce_on_clock(
-    source: Source,
+    camera: CameraState,
     registration: Registration,
     override: Overrides,
     *,
@@ -113,15 +108,16 @@ def _reduce_on_clock(
     report: Report,
 ) -> tuple[xr.Dataset, dict[str, Any], list[Notice]]:
     """Reduce the frames with the clock offset that the campaign gives, that the moving table shows, or that is assumed."""
+    source = camera.source
     given = source.thermography.clock_offset_s
     how: dict[str, Any] = {"scheduler": scheduler, "report": report}
     if given is not None:
-        fields = _reduce(source, registration, override, given, checkpoint=checkpoint, **how)
+        fields = _reduce(camera, registration, override, given, checkpoint=checkpoint, **how)
         return fields, {"value": given, "u": 0.0}, []
     if source.thermography.table == "still":
-        fields = _reduce(source, registration, override, 0.0, checkpoint=checkpoint, **how)
+        fields = _reduce(camera, registration, override, 0.0, checkpoint=checkpoint, **how)
         return fields, {"value": 0.0, "u": None}, [_ASSUMED_CLOCK]
-    fields = _reduce(source, registration, override, 0.0, checkpoint=checkpoint / "before_alignment", **how)
+    fields = _reduce(camera, registration, override, 0.0, checkpoint=checkpoint / "before_alignment", **how)
     report("clock offset", 0, 1)
     clock = estimate_clock_offset(
         fields["frame_time"].values,
@@ -133,7 +129,7 @@ def _reduce_on_clock(
     )
     report("clock offset", 1, 1)
     # Frames belong to cycles by the laser's clock, so they are sorted into them again.
-    fields = _reduce(source, registration, override, clock.offset_s, checkpoint=checkpoint, **how)
+    fields = _reduce(camera, registration, override, clock.offset_s, checkpoint=checkpoint, **how)
     return fields, {"value": clock.offset_s, "u": clock.offset_u_s}, []
 
 
@@ -145,7 +141,7 @@ _ASSUMED_CLOCK = Notice(
 
 
 def _reduce(
-    source: Source,
+    camera: CameraState,
     registration: Registration,
     override: Overrides,
     offset_s: float,
@@ -155,7 +151,8 @@ def _reduce(
     report: Report,
 ) -> xr.Dataset:
     """Reduce the frames of a still or moving table, its cycles brought to the camera's clock."""
-    bounds = cycle_bounds(source.deviations) + np.timedelta64(round(offset_s * 1e9), "ns")
+    source = camera.source
+    bounds = _bounds(source, offset_s)
     total, done = len(source.frames), 0
 
     def count(more: int) -> None:
@@ -165,11 +162,22 @@ def _reduce(
 
     report("frames", 0, total)
     kept = checkpoint if total > _CHECKPOINT_FRAMES else None
-    common: dict[str, Any] = {"override": override, "scheduler": scheduler, "checkpoint": kept, "progress": count}
+    common: dict[str, Any] = {
+        "override": override,
+        "correction_K": camera.correction_K,
+        "scheduler": scheduler,
+        "checkpoint": kept,
+        "progress": count,
+    }
     if source.thermography.table == "moving":
         direction = source.plan.axis.direction
         return reduce_moving_frames(source.frames, registration, source.grid, bounds, direction=direction, **common)
     return reduce_frames(source.frames, registration, source.grid, bounds, **common)
+
+
+def _bounds(source: Source, offset_s: float) -> np.ndarray:
+    """Start and end of every cycle on the camera's clock, (cycles, 2)."""
+    return cycle_bounds(source.deviations) + np.timedelta64(round(offset_s * 1e9), "ns")
 
 
 def overridden_parameters(source: Source) -> dict[str, float]:
@@ -198,25 +206,6 @@ def overridden_parameters(source: Source) -> dict[str, float]:
 
 def _kelvin(celsius: float | None) -> float | None:
     return None if celsius is None else celsius + _KELVIN
-
-
-def _camera_notices(source: Source, override: Overrides, *, report: Report) -> list[Notice]:
-    """Return a notice for jumps of the mean level of the thermogram and for frames that the camera wrote twice."""
-    every = -(-len(source.frames) // _CHECKED_FRAMES)
-    report("camera check", 0, 1)
-    levels = read_levels(source.frames[::every], override)
-    report("camera check", 1, 1)
-    flags = find_steps(levels) + (find_repeats(levels) if every == 1 else [])
-    if not flags:
-        return []
-    named = [f"{np.datetime_as_string(flag.time, unit='s')}Z: {flag.message}" for flag in flags]
-    return [
-        Notice(
-            "camera_artefacts",
-            f"{counted(len(flags), 'camera artefact')} found, not corrected here: {listed(named)}.",
-            "Compare with the effect camera_offset of the model; let the camera warm up before the test.",
-        )
-    ]
 
 
 def pixel_notices(counts: np.ndarray) -> list[Notice]:

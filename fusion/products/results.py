@@ -20,6 +20,7 @@ from fusion.products.results_axis import (
     CAUSES,
     AlignmentPart,
     AnomalyPart,
+    CameraPart,
     DriftPart,
     HotspotPart,
     Iso230Part,
@@ -107,6 +108,8 @@ class Results(ResultPart):
     """Consistency of the inputs."""
     registration: RegistrationPart | None = None
     """Registration of the thermograms to the plan."""
+    camera: CameraPart | None = None
+    """The thermal camera: damaged frames and corrections."""
     alignment: AlignmentPart | None = None
     """Both instruments on one clock."""
     iso230: Iso230Part | None = None

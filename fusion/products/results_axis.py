@@ -36,6 +36,32 @@ class RegistrationPart(ResultPart):
     """Thermograms that were not used."""
 
 
+class CameraStepPart(ResultPart):
+    """A step of the camera's zero that was taken out of all frames that follow."""
+
+    time: str
+    """Time of the first frame after the step, UTC."""
+    step_K: Quantity
+    """Size of the step, K."""
+
+
+class CameraPart(ResultPart):
+    """The thermal camera: damaged frames, and what was corrected before the fields were made."""
+
+    frames_checked: int
+    """Thermograms whose pixels were checked."""
+    frames_damaged: tuple[RejectedFrame, ...]
+    """Thermograms that were left out by this check; they are among those of the registration that were not used."""
+    steps: tuple[CameraStepPart, ...]
+    """Steps of the camera's zero (flat-field corrections) that were taken out."""
+    drift_K: Number
+    """Range of the drift with the temperature of the housing that was taken out, K; 0 where none is significant."""
+    largest_correction_K: Number
+    """Largest correction of a thermogram, K; 0 where nothing was corrected."""
+    largest_u_K: Number
+    """Largest standard uncertainty of the camera's zero since the first thermogram, K; null where nothing lies beside the table."""
+
+
 class AlignmentPart(ResultPart):
     """Both instruments on one clock."""
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from thermography.io.fff_record import is_fff_header
 from thermography.io.flir import index_frames, read_frame
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import (
@@ -92,8 +93,9 @@ def without_checksums(data: bytes) -> bytes:
     bare = bytearray(data)
     start = bare.find(b"FFF\0")
     while start >= 0:
+        # The magic also occurs among pixels.
         offset, slots = struct.unpack_from(">2I", bare, start + 0x18)
-        for slot in range(slots):
+        for slot in range(slots if is_fff_header(bytes(bare[start : start + 64])) else 0):
             struct.pack_into(">I", bare, start + offset + 32 * slot + 28, 0)
         start = bare.find(b"FFF\0", start + 4)
     return bytes(bare)

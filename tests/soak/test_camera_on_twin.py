@@ -1,0 +1,78 @@
+"""Steps and drift of the camera's zero on campaigns of the twin, against its truth: docs/method/radiometry.md, "The camera itself"."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fusion.campaign.config import load_campaign
+from fusion.campaign.inputs import read_source
+from fusion.pipeline.camera import camera_corrected
+from fusion.pipeline.thermal import reduce_thermography
+from fusion.products.progress import silent
+from fusion.twin import simulate
+from fusion.twin.instruments import write_campaign
+from fusion.twin.machine.recipe import Recipe
+from fusion.twin.simulate import environment_log
+from tests.soak.rates import campaigns, first_seed, rate, wilson
+from tests.soak.test_sound_inputs import sound_recipe
+from thermography.radiometry.camera_correction import LevelSeries, estimate_correction, room_temperatures
+
+pytestmark = pytest.mark.slow
+
+SMALL = {"columns": 320, "rows": 240, "focal_px": 765.0, "file": "seq"}
+#: Share of the room's temperature in what the wall beside the table sends to the camera, with emissivity 0.95 and the air's transmission.
+WALL = 0.93
+SEEDS = (11, 12, 13)
+
+
+@pytest.mark.parametrize(
+    ("ffc_step_K", "drift_K_per_K"), [(0.0, 0.0), (0.1, 0.0), (0.3, 0.1), (0.5, 0.0), (0.5, 0.3), (0.0, 0.3)]
+)
+def test_rise_with_steps_and_drift(tmp_path: Path, ffc_step_K: float, drift_K_per_K: float) -> None:
+    ratios, errors = [], []
+    for seed in SEEDS:
+        camera = {**SMALL, "ffc_step_K": ffc_step_K, "drift_K_per_K": drift_K_per_K}
+        truth = simulate(Recipe().vary(campaign={"seed": seed}, camera=camera))
+        campaign = write_campaign(truth, tmp_path / f"{seed}")
+        source = read_source(load_campaign(campaign))
+        outcome = reduce_thermography(source, checkpoint=tmp_path / f"cycles{seed}", scheduler=None, report=silent)
+        fields, part = outcome.dataset, outcome.parts["camera"]
+        true = truth.temperature(truth.session.frame_s, fields["x"].values, fields["y"].values, cell_mm=5.0)
+        error = (fields["temperature_rise"].values - (true - true[0]))[1:]
+        u = np.hypot(fields["temperature_rise_u"].values[1:], fields["camera_correction_u"].values[1:, None, None])
+        errors.append(np.sqrt(np.nanmean(error**2)))
+        ratios.append(np.sqrt(np.nanmean((error / u) ** 2)))
+        assert camera_corrected(part) == (ffc_step_K > 0 or drift_K_per_K > 0)
+    with_digits = ", ".join(f"{ratio:.2f}" for ratio in ratios)
+    print(
+        f"\nFFC {ffc_step_K} K, drift {drift_K_per_K} K/K: error of the rise {1e3 * np.mean(errors):.0f} mK, over u: {with_digits}"
+    )
+    assert max(ratios) < 2.0
+
+
+def test_sound_cameras_are_not_corrected(capsys: pytest.CaptureFixture[str]) -> None:
+    """Levels as the frames of the twin show them, without rendering them."""
+    runs, corrected = campaigns(200), {True: 0, False: 0}
+    for seed in range(first_seed(52000), first_seed(52000) + runs):
+        truth = simulate(sound_recipe(seed))
+        session, log = truth.session, environment_log(truth)
+        seconds, rng = session.frame_s, np.random.default_rng([seed, 5])
+        logged = (log["time"].values - log["time"].values[0]) / np.timedelta64(1, "s")
+        for known in corrected:
+            room = room_temperatures(seconds, logged, log["air_temperature"].values)
+            series = LevelSeries(
+                seconds=seconds,
+                background=WALL * session.at_frames(session.air_degC) + rng.normal(0, 5e-4, seconds.size),
+                table=session.at_frames(session.table_rise_K) + rng.normal(0, 5e-4, seconds.size),
+                housing=truth.frames["housing"].values[:, None] + np.array([273.15, 272.35]),
+                room=room if known else room[:, :0],
+            )
+            corrected[known] += estimate_correction(series).corrects
+    with capsys.disabled():
+        print(
+            f"\nsound cameras corrected: with a log of the air {rate(corrected[True], runs)}, without {rate(corrected[False], runs)}"
+        )
+    assert max(wilson(count, runs)[0] for count in corrected.values()) <= 0.02

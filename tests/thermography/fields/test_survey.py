@@ -1,0 +1,131 @@
+"""Survey of a series: damage is found with and without checksums, vibrations and flat-field steps are no damage, levels are true."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.thermography.flir_mutations import without_checksums
+from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene
+from thermography.fields.survey import disturbed_frames, locate_blocks, survey_frames
+from thermography.io.flir import index_frames
+from thermography.io.flir_writer import write_sequence
+from thermography.io.frame import CalibratedRange, Frame
+from thermography.radiometry.planck import counts_from_temperature
+from thermography.registration.register import register
+
+FRAMES = 8
+
+
+@pytest.fixture(scope="module")
+def image() -> np.ndarray:
+    return Scene(disc_K=-4.0).render()
+
+
+@pytest.fixture(scope="module")
+def registration(image: np.ndarray):
+    return register(image, DISCS, grid=GRID)
+
+
+def _film(path: Path, image: np.ndarray, rng: np.random.Generator, change=lambda index, image: image) -> list:
+    def frames():
+        for index in range(FRAMES):
+            shown = change(index, image) + rng.normal(0, 0.05, image.shape)
+            counts = np.round(counts_from_temperature(shown, SC660)).astype(np.uint16)
+            time = START + np.timedelta64(60 * index, "s")
+            yield Frame(counts=counts, parameters=SC660, time=time, limits=CalibratedRange(233, 393, 8812, 57240))
+
+    write_sequence(path, frames())
+    return index_frames([path])[0]
+
+
+def _disturbed(survey, registration) -> dict[int, str]:
+    return disturbed_frames(survey, locate_blocks(survey, registration, GRID, np.zeros((0, 2))))
+
+
+def test_levels_and_blocks(tmp_path: Path, image: np.ndarray, registration, rng: np.random.Generator) -> None:
+    frames = _film(tmp_path / "a.seq", image, rng, lambda index, image: image + 0.1 * index)
+    survey = survey_frames(frames)
+    edge = survey.edge_px
+    rows, columns = survey.levels.shape[1:]
+    expected = image[: rows * edge, : columns * edge].reshape(rows, edge, columns, edge).mean(axis=(1, 3))
+    smooth = image[: rows * edge, : columns * edge].reshape(rows, edge, columns, edge).std(axis=(1, 3)) < 0.2
+    # 50 mK over several hundred pixels, and the curvature of the calibration within a block.
+    np.testing.assert_allclose(survey.levels[3][smooth], expected[smooth] + 0.3, atol=0.015)
+    blocks = locate_blocks(survey, registration, GRID, np.zeros((0, 2)))
+    assert blocks.table.any() and blocks.beside.any() and not (blocks.table & blocks.beside).any()
+    wide = locate_blocks(survey, registration, GRID, np.array([[-400.0, 0.0], [400.0, 0.0]]))
+    assert (blocks.table == wide.table).all() and (wide.beside <= blocks.beside).all()
+    assert wide.beside.sum() < blocks.beside.sum()
+    assert _disturbed(survey, registration) == {} and survey.damaged == [] and not survey.repeated.any()
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory, image: np.ndarray) -> list:
+    return _film(tmp_path_factory.mktemp("film") / "a.seq", image, np.random.default_rng(4))
+
+
+@pytest.mark.parametrize("size", [2000, 80_000])
+@pytest.mark.parametrize("fill", ["zeros", "random"])
+@pytest.mark.parametrize("checksum", [True, False])
+@pytest.mark.parametrize("damaged", [0, 3, FRAMES - 1])
+def test_damage_is_found_with_and_without_a_checksum(
+    tmp_path: Path, film: list, registration, rng: np.random.Generator, size, fill, checksum, damaged
+) -> None:
+    path = tmp_path / "a.seq"
+    frame = film[damaged]
+    data = bytearray(frame.path.read_bytes())
+    row = frame.shape[0] // 2
+    place = frame.segments[0][0] + frame.samples.offset + 2 * row * frame.shape[1] - size // 2
+    data[place : place + size] = bytes(size) if fill == "zeros" else rng.bytes(size)
+    path.write_bytes(bytes(data) if checksum else without_checksums(bytes(data)))
+    survey = survey_frames(index_frames([path])[0])
+    if checksum:
+        (found,) = survey.damaged
+        assert found.index == damaged and "the samples are damaged" in found.reason
+        assert len(survey.frames) == len(survey.levels) == FRAMES - 1
+    else:
+        assert survey.damaged == []
+        (index,) = (found := _disturbed(survey, registration))
+        assert index == damaged and found[index].endswith("damaged or covered")
+
+
+def test_a_hand_over_the_table_in_one_frame_is_found(
+    tmp_path: Path, image: np.ndarray, registration, rng: np.random.Generator
+) -> None:
+    hand = np.zeros(image.shape)
+    rows, columns = image.shape
+    hand[rows // 2 - 20 : rows // 2 + 20, columns // 2 : columns // 2 + 60] = 8.0
+    frames = _film(tmp_path / "a.seq", image, rng, lambda index, image: image + hand * (index == 4))
+    (index,) = (found := _disturbed(survey_frames(frames), registration))
+    assert index == 4 and "pixels of the table differ from the frames before and after it" in found[4]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda index, image: image + 0.5 * (index == 4),
+        lambda index, image: image + 0.5 * (index >= 4),
+        lambda index, image: np.roll(image, 3 * (index == 4), axis=1),
+        lambda index, image: np.roll(image, 8 * (index >= 4), axis=1),
+        lambda index, image: image + 0.4 * index,
+    ],
+    ids=["flat-field pulse", "flat-field step", "vibration", "knock", "warming"],
+)
+def test_what_a_sound_camera_shows_is_no_damage(
+    tmp_path: Path, image: np.ndarray, registration, rng: np.random.Generator, change
+) -> None:
+    frames = _film(tmp_path / "a.seq", image, rng, change)
+    assert _disturbed(survey_frames(frames), registration) == {}
+
+
+def test_repeats_and_a_moving_scene(tmp_path: Path, image: np.ndarray, rng: np.random.Generator) -> None:
+    frames = _film(tmp_path / "a.seq", image, rng, lambda index, image: np.roll(image, 30 * index, axis=1))
+    twice = [*frames[:3], replace(frames[2], time=frames[2].time + np.timedelta64(1, "s")), *frames[3:]]
+    done = []
+    survey = survey_frames(twice, still=False, progress=done.append)
+    assert survey.repeated.tolist() == [False] * 3 + [True] + [False] * 5
+    assert survey.off == {} and sum(done) == 9

@@ -1,0 +1,136 @@
+"""Correction of the camera's zero: planted steps and drifts are taken out within the stated uncertainty; a sound camera is left alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermography.radiometry.camera_correction import LevelSeries, estimate_correction, room_temperatures
+
+FRAMES, INTERVAL_S = 60, 252.0
+
+
+def _sound(seed: int, *, logged: bool = True, frames: int = FRAMES, interval_s: float = INTERVAL_S) -> LevelSeries:
+    """A room that swings by 0.15 K and wanders, a table that warms by 3 K, and a camera that warms by 6 K with the room."""
+    rng = np.random.default_rng([seed, 17])
+    minute = np.arange(0.0, frames * interval_s + 60, 60.0)
+    walk = 0.05 * np.cumsum(rng.normal(0, np.sqrt(1 / 60), minute.size))
+    air = 23.5 + 0.15 * np.sin(2 * np.pi * (minute / 2820 + rng.random())) + walk
+    seconds = interval_s * np.arange(frames)
+    at_frames = np.interp(seconds, minute, air)
+    return LevelSeries(
+        seconds=seconds,
+        background=0.93 * at_frames + rng.normal(0, 5e-4, frames),
+        table=23 + 3 * (1 - np.exp(-seconds / 5000)) + rng.normal(0, 5e-4, frames),
+        housing=(at_frames + 273 + 6 * (1 - np.exp(-seconds / 1500)))[:, None] + [0.0, -0.8],
+        room=room_temperatures(seconds, minute, np.round(air + rng.normal(0, 0.004, minute.size), 2))
+        if logged
+        else np.zeros((frames, 0)),
+    )
+
+
+def _with_camera(series: LevelSeries, offset: np.ndarray) -> LevelSeries:
+    return replace(series, background=series.background + offset, table=series.table + offset)
+
+
+def _steps(seed: int, sigma_K: float) -> np.ndarray:
+    """A new zero every 15 minutes."""
+    number = (INTERVAL_S * np.arange(FRAMES) // 900).astype(int)
+    return sigma_K * np.random.default_rng([seed, 3]).normal(size=number.max() + 1)[number]
+
+
+def _drift(series: LevelSeries, per_K: float) -> np.ndarray:
+    return per_K * (series.housing[:, 0] - series.housing[0, 0])
+
+
+@pytest.mark.parametrize(("sigma_K", "per_K"), [(0.1, 0.0), (0.3, 0.1), (0.5, 0.3), (0.0, 0.1)])
+def test_steps_and_drift_are_taken_out_within_their_uncertainty(sigma_K: float, per_K: float) -> None:
+    ratios = []
+    for seed in range(6):
+        series = _sound(seed)
+        offset = _steps(seed, sigma_K) + _drift(series, per_K)
+        found = estimate_correction(_with_camera(series, offset))
+        error = offset - offset[0] + found.correction_K
+        assert np.sqrt(np.mean(error**2)) < 0.08 < np.ptp(offset)
+        assert bool(found.drift_K.any()) == (per_K > 0)
+        ratios.append(np.mean((error[1:] / found.u_K[1:]) ** 2))
+    # The mean over 6 campaigns, each with a few independent errors: a factor of 1.5 either way of 1, smaller where all parts are known.
+    assert np.sqrt(np.mean(ratios)) < 1.5
+
+
+def test_a_sound_camera_is_left_alone() -> None:
+    corrected = sum(estimate_correction(_sound(seed, logged=seed % 2 == 0)).corrects for seed in range(60))
+    # At two tests of one per mille each, more than one of 60 has a probability of 0.6 %.
+    assert corrected <= 1
+
+
+def test_a_step_has_its_place_size_and_uncertainty() -> None:
+    offset = np.where(np.arange(FRAMES) >= 20, 0.25, 0.0)
+    (step,) = estimate_correction(_with_camera(_sound(1), offset)).steps
+    assert step.index == 20
+    assert step.value_K == pytest.approx(0.25, abs=3 * step.u_K)
+    assert 0.001 < step.u_K < 0.03
+
+
+def test_a_step_beside_the_table_alone_is_the_rooms() -> None:
+    """A door opens: what lies beside the table changes, the table does not."""
+    series = _sound(2)
+    found = estimate_correction(
+        replace(series, background=series.background + np.where(np.arange(FRAMES) >= 30, 0.4, 0.0))
+    )
+    assert found.steps == () and not found.corrects
+
+
+def test_without_a_log_of_the_room_a_drift_is_uncertainty_and_no_correction() -> None:
+    series = _sound(3, logged=False)
+    offset = _drift(series, 0.1)
+    found = estimate_correction(_with_camera(series, offset))
+    assert not found.corrects
+    assert found.u_K[-1] > 0.5 * abs(offset[-1])
+    assert np.abs(found.unexplained_K).max() > 0.5
+
+
+def test_a_log_of_another_room_separates_nothing() -> None:
+    """The camera is warm and follows the room, as the background does; the log does not: the room must not pass for a drift."""
+    series = replace(_sound(4), room=_sound(5).room)
+    noise = np.random.default_rng(4).normal(0, 0.01, (FRAMES, 1))
+    follows = replace(series, housing=series.background[:, None] + 280.0 + noise)
+    assert not estimate_correction(follows).drift_K.any()
+
+
+def test_steps_in_a_film_are_placed_to_the_frame() -> None:
+    """3000 frames at 5 s: more than the fit takes."""
+    series = _sound(6, frames=3000, interval_s=5.0)
+    offset = np.where(np.arange(3000) >= 1234, -0.3, 0.0)
+    (step,) = estimate_correction(_with_camera(series, offset)).steps
+    assert step.index == 1234 and step.value_K == pytest.approx(-0.3, abs=0.03)
+
+
+@pytest.mark.parametrize("frames", [2, 7])
+def test_few_frames_correct_nothing(frames: int) -> None:
+    series = _sound(7, frames=frames)
+    found = estimate_correction(series)
+    assert not found.corrects and found.steps == ()
+    np.testing.assert_allclose(found.u_K, np.abs(series.background - series.background[0]) / np.sqrt(3))
+
+
+def test_a_frozen_camera_and_missing_sensors_are_no_faults() -> None:
+    series = _sound(8)
+    frozen = replace(
+        series,
+        background=np.full(FRAMES, 23.0),
+        table=np.full(FRAMES, 24.0),
+        housing=np.full((FRAMES, 1), np.nan),
+    )
+    assert not estimate_correction(frozen).corrects
+
+
+def test_walls_follow_the_air_by_their_lags() -> None:
+    logged = np.arange(0.0, 7200.0, 60.0)
+    air = np.where(logged < 1800, 20.0, 21.0)
+    room = room_temperatures(np.array([0.0, 1800.0 + 600.0]), logged, air)
+    np.testing.assert_allclose(room[0], 20.0)
+    np.testing.assert_allclose(room[1], [21.0, 21 - np.exp(-1), 21 - np.exp(-1 / 6)], atol=1e-9)
+    assert room_temperatures(np.zeros(3), logged[:1], air[:1]).shape == (3, 0)

@@ -1,0 +1,340 @@
+"""Survey of a series of frames in one pass: damaged frames, the level of every block of pixels, and frames that were written twice.
+
+Pixels are compared with their CRC-32 where one is stored. Where none is, they are held against the frames before and after: what is
+damaged, or covered for one frame, lies far off both. The levels show what the camera adds to all pixels alike, see
+`thermography.radiometry.camera_correction`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from thermography._constants import MAD_TO_SIGMA
+from thermography._typing import Array
+from thermography.fields.scheduling import in_order, open_pool
+from thermography.io.flir import FrameReference, RejectedFrame
+from thermography.io.frame import CameraParameters, FlirFormatError
+from thermography.radiometry.planck import temperature_from_counts
+from thermography.registration.plan import PlanGrid
+from thermography.registration.register import Registration
+
+#: Blocks along a row: large enough that noise averages out, small enough that many lie beside the table.
+_BLOCKS_ACROSS = 24
+#: A pixel is off where it lies beyond both neighbours in time by this multiple of the noise, ...
+_OFF_SIGMAS = 10.0
+#: ... also beyond all pixels within this distance, so that an edge that moves with a vibration is none, px.
+_EDGE_PX = 4
+#: A frame is left out from this number of pixels on, the size of 32 bytes of damage; ...
+_LEAST_PIXELS = 16
+#: ... where frames differ so in most of the series, from this multiple of the upper quartile on.
+_ORDINARY_MULTIPLE = 5.0
+#: About this number of pixels gives noise (to 3 %) and common shift of two frames.
+_SAMPLE_PX = 1200
+#: Width of the lens's blur at the table's edge, px.
+_MARGIN_PX = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """Frames of a series whose pixels are intact, and what one pass over them shows.
+
+    Attributes
+    ----------
+    frames : list of FrameReference
+        The n intact frames in the order of time.
+    levels : (n, rows, columns) ndarray of float32, degC
+        Mean temperature of every block of pixels.
+    edge_px : int, px
+        Side of a block.
+    repeated : (n,) ndarray of bool
+        True where all counts equal those of the previous frame.
+    outside : (n,) ndarray of int
+        Pixels outside the range in which the camera is calibrated.
+    off : dict of int to (rows, columns) ndarray of int
+        By index of the frame: pixels of every block that are off the frames before and after.
+    damaged : list of RejectedFrame
+        Frames whose pixels cannot be read or differ from their checksum.
+    """
+
+    frames: list[FrameReference]
+    levels: NDArray[np.float32]
+    edge_px: int
+    repeated: NDArray[np.bool_]
+    outside: NDArray[np.int64]
+    off: dict[int, NDArray[np.int64]]
+    damaged: list[RejectedFrame]
+
+
+def survey_frames(
+    references: Sequence[FrameReference],
+    override: Callable[[FrameReference], CameraParameters] = lambda frame: frame.parameters,
+    *,
+    still: bool = True,
+    progress: Callable[[int], None] | None = None,
+) -> Survey:
+    """Read every frame of a series once.
+
+    Parameters
+    ----------
+    references : sequence of FrameReference
+        Frames of one size in the order of time.
+    override : callable
+        From a frame reference to the camera parameters to calibrate the frame with; by default the frame's own.
+    still : bool
+        Whether the scene stands still, so that pixels can be compared with the frames before and after.
+    progress : callable or None
+        Called with the number of frames done since the last call.
+
+    Returns
+    -------
+    Survey
+    """
+    rows, columns = references[0].shape
+    edge_px = max(columns // _BLOCKS_ACROSS, 1)
+    frames: list[FrameReference] = []
+    damaged: list[RejectedFrame] = []
+    levels, repeated, outside = [], [], []
+    neighbours = _Neighbours(edge_px)
+    previous: NDArray[np.uint16] | None = None
+    for reference, counts in _read(references):
+        if progress is not None:
+            progress(1)
+        if isinstance(counts, str):
+            damaged.append(RejectedFrame(reference.path, reference.index, counts))
+            continue
+        frames.append(reference)
+        levels.append(temperature_from_counts(_block_means(counts, edge_px), override(reference)).astype(np.float32))
+        repeated.append(previous is not None and np.array_equal(counts, previous))
+        outside.append(_outside(counts, reference))
+        if still and not repeated[-1]:
+            neighbours.add(len(frames) - 1, counts)
+        previous = counts
+    neighbours.finish()
+    return Survey(
+        frames=frames,
+        levels=np.array(levels, np.float32).reshape(len(frames), rows // edge_px, columns // edge_px),
+        edge_px=edge_px,
+        repeated=np.array(repeated, bool),
+        outside=np.array(outside, np.int64),
+        off=neighbours.off,
+        damaged=damaged,
+    )
+
+
+def _read(references: Sequence[FrameReference]) -> Iterator[tuple[FrameReference, NDArray[np.uint16] | str]]:
+    """Counts of every frame, read ahead; the reason where they cannot be read."""
+    with open_pool() as pool:
+        yield from in_order(pool, ((reference, (_read_counts, reference)) for reference in references))
+
+
+def _read_counts(reference: FrameReference) -> NDArray[np.uint16] | str:
+    try:
+        return reference.read_counts()
+    except (FlirFormatError, OSError) as error:
+        return str(error)
+
+
+def _outside(counts: NDArray[np.uint16], reference: FrameReference) -> int:
+    """Pixels outside the range of counts in which the camera is calibrated."""
+    limits = reference.limits
+    return int(np.count_nonzero((counts < limits.raw_minimum) | (counts > (limits.raw_maximum or 65535))))
+
+
+class _Neighbours:
+    """Comparison of every frame with the nearest frames before and after that are not off themselves.
+
+    Attributes
+    ----------
+    off : dict of int to (rows, columns) ndarray of int
+        By index of the frame: pixels of every block that are off.
+    """
+
+    def __init__(self, edge_px: int) -> None:
+        self.off: dict[int, NDArray[np.int64]] = {}
+        self._edge_px = edge_px
+        self._window: list[tuple[int, NDArray[np.uint16]]] = []
+        self._first_judged = False
+
+    def add(self, index: int, counts: NDArray[np.uint16]) -> None:
+        """Add the next frame, and judge the one before it by its neighbours."""
+        self._window = [*self._window[-2:], (index, counts)]
+        if len(self._window) < 3:
+            return
+        if not self._first_judged:
+            # No frame precedes the first one: it is held against the two that follow.
+            self._first_judged = True
+            self._judge(0, (1, 2), end=True)
+        if len(self._window) == 3:
+            self._judge(1, (0, 2), end=False)
+
+    def finish(self) -> None:
+        """Judge the last frame, by the two before it."""
+        if len(self._window) == 3:
+            self._judge(2, (0, 1), end=True)
+
+    def _judge(self, place: int, others: tuple[int, int], *, end: bool) -> None:
+        """Note the pixels of a frame of the window that are off two others, and take it out of the window if there are many."""
+        index, counts = self._window[place]
+        before, after = (self._window[other][1] for other in others)
+        limit, shift = _limit_and_shift(counts, before, after)
+        # The change between the two others goes on beyond the ends of the series.
+        stretch = 2 if end else 0
+        flat = (counts.reshape(-1), before.reshape(-1), after.reshape(-1))
+        if _count_off(*flat, limit, shift, stretch) < _LEAST_PIXELS:
+            return
+        lower, upper = _surroundings(before, after)
+        beyond = stretch * (upper - lower)
+        level = counts.astype(np.int32) - shift
+        off = (level > upper + beyond + limit) | (level < lower - beyond - limit)
+        if np.count_nonzero(off) >= _LEAST_PIXELS:
+            self.off[index] = _block_sums(off.view(np.uint8), self._edge_px)
+            del self._window[place]
+
+
+def _limit_and_shift(counts: Array, before: Array, after: Array) -> tuple[int, int]:
+    """Limit in counts beyond which a pixel is off, and the shift that all pixels have in common (a flat-field correction)."""
+    stride = max(int(np.sqrt(counts.size / _SAMPLE_PX)), 1)
+    some = (slice(None, None, stride), slice(None, None, stride))
+    x, b, a = (image[some].astype(np.int32) for image in (counts, before, after))
+    shift = int(np.median(x - np.clip(x, np.minimum(a, b), np.maximum(a, b))))
+    change = x - b
+    noise = MAD_TO_SIGMA * float(np.median(np.abs(change - np.median(change)))) / np.sqrt(2.0)
+    return int(np.ceil(_OFF_SIGMAS * max(noise, 1.0))), shift
+
+
+@numba.njit(cache=True, nogil=True)
+def _count_off(counts: Array, before: Array, after: Array, limit: int, shift: int, stretch: int) -> int:
+    """Number of pixels beyond those of both other frames by more than the limit; flat images."""
+    off = np.int32(0)
+    # In 32 bits a processor handles twice as many pixels at once as in 64.
+    moved, allowed, factor = np.int32(shift), np.int32(limit), np.int32(stretch)
+    for i in range(len(counts)):
+        x, a, b = np.int32(counts[i]) - moved, np.int32(after[i]), np.int32(before[i])
+        low, high = min(a, b), max(a, b)
+        beyond = factor * (high - low) + allowed
+        off += np.int32((x > high + beyond) | (x < low - beyond))
+    return int(off)
+
+
+def _surroundings(before: Array, after: Array) -> tuple[Array, Array]:
+    """Smallest and largest count of two frames within the reach of a vibration of every pixel."""
+    reach = np.ones((2 * _EDGE_PX + 1, 2 * _EDGE_PX + 1), np.uint8)
+    lower = cv2.erode(np.minimum(before, after), reach).astype(np.int32)
+    upper = cv2.dilate(np.maximum(before, after), reach).astype(np.int32)
+    return lower, upper
+
+
+def _block_means(counts: NDArray[np.uint16], edge_px: int) -> Array:
+    """Mean count of every block of pixels."""
+    means: Array = _block_sums(counts, edge_px) / edge_px**2
+    return means
+
+
+def _block_sums(image: Array, edge_px: int) -> Array:
+    """Sum over every block of pixels; what is left at the right and lower edge takes no part."""
+    rows, columns = image.shape[0] // edge_px, image.shape[1] // edge_px
+    kept = np.ascontiguousarray(image[: rows * edge_px, : columns * edge_px])
+    return _sum_blocks(kept.reshape(rows, edge_px, columns, edge_px))
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_blocks(image: Array) -> Array:
+    """Sum over the second and fourth dimension."""
+    rows, height, columns, width = image.shape
+    sums = np.zeros((rows, columns), np.int64)
+    for row in range(rows):
+        for line in range(height):
+            for block in range(columns):
+                pixels = image[row, line, block]
+                total = np.uint32(0)
+                for i in range(width):
+                    total += np.uint32(pixels[i])
+                sums[row, block] += total
+    return sums
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Blocks of a survey by what they show.
+
+    Attributes
+    ----------
+    table : (rows, columns) ndarray of bool
+        Blocks that the plan covers.
+    beside : (rows, columns) ndarray of bool
+        Blocks that show nothing of the table in any frame.
+    """
+
+    table: NDArray[np.bool_]
+    beside: NDArray[np.bool_]
+
+
+def locate_blocks(survey: Survey, registration: Registration, grid: PlanGrid, shifts_mm: Array) -> Blocks:
+    """Tell which blocks show the table.
+
+    Parameters
+    ----------
+    survey : Survey
+    registration : Registration
+        Of the table at rest.
+    grid : PlanGrid
+        The plan.
+    shifts_mm : (m, 2) ndarray, mm
+        Displacements (x, y) at which a moving table is seen; empty for a still one.
+
+    Returns
+    -------
+    Blocks
+    """
+    rest = np.zeros(registration.shape, np.uint8)
+    outline = grid.outline_mm(25)
+
+    def fill(image: NDArray[np.uint8], points_mm: Array) -> None:
+        # A part of the plan may lie far outside the view.
+        corners = np.clip(np.rint(registration.to_sensor(points_mm)), -10_000, 10_000).astype(np.int32)
+        cv2.fillPoly(image, [corners], 1)
+
+    fill(rest, outline)
+    anywhere = rest.copy()
+    for shift in shifts_mm:
+        fill(anywhere, outline + shift)
+    margin = np.ones((2 * _MARGIN_PX + 1, 2 * _MARGIN_PX + 1), np.uint8)
+    on_table = _block_sums(cv2.erode(rest, margin), survey.edge_px)
+    touched = _block_sums(cv2.dilate(anywhere, margin), survey.edge_px)
+    return Blocks(on_table == survey.edge_px**2, touched == 0)
+
+
+def disturbed_frames(survey: Survey, blocks: Blocks) -> dict[int, str]:
+    """Frames that a part of the table alone tells from the frames before and after, or whose pixels leave the camera's range.
+
+    Parameters
+    ----------
+    survey : Survey
+    blocks : Blocks
+        Of `locate_blocks`.
+
+    Returns
+    -------
+    dict of int to str
+        Reason by index of the frame in the survey. Where most frames differ so, they are ordinary.
+    """
+    n = len(survey.frames)
+    off = np.zeros(n, np.int64)
+    for index, pixels in survey.off.items():
+        off[index] = int(pixels[blocks.table].sum())
+    found = {}
+    for numbers, text in (
+        (survey.outside, "{} pixels lie outside the range in which the camera is calibrated"),
+        (off, "{} pixels of the table differ from the frames before and after it"),
+    ):
+        limit = max(_LEAST_PIXELS, _ORDINARY_MULTIPLE * float(np.quantile(numbers, 0.75)))
+        found.update(
+            {int(i): f"{text.format(numbers[i])}: damaged or covered" for i in np.flatnonzero(numbers >= limit)}
+        )
+    return dict(sorted(found.items()))
