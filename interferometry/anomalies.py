@@ -26,6 +26,7 @@ from scipy import stats
 from interferometry._typing import Array
 from interferometry.contract import check_dataset
 from interferometry.drift.gls import von_neumann_p_value
+from interferometry.drift.memory import typical_memory
 from interferometry.errors import InterferometryError
 
 #: Share of the error probability given to each kind of anomaly (Bonferroni weights; they sum to one).
@@ -37,6 +38,9 @@ BLOCK_CYCLES = 5
 #: Shortest test and shortest series that are examined for motion over the cycles.
 SHORTEST_TEST_CYCLES = 15
 MOST_ANOMALIES = 4
+#: Levels of the tests whether a target's scatter stands out, both directions together and either alone. An
+#: anomaly must also be significant by permutation, so that their sum is not the probability of a false one.
+ESD_LEVELS = {"together": 0.05, "single": 0.015}
 #: Level at which the remainder of a step is still called slow.
 SLOW_REMAINDER_LEVEL = 0.01
 
@@ -152,8 +156,7 @@ def _scatter_anomalies(
     z = estimated["standardised"].values
     scatter = estimated["scatter_position"].values
     usable = np.flatnonzero(np.isfinite(scatter) & (scatter > 0))
-    stands_out = np.zeros(scatter.size, dtype=bool)
-    stands_out[usable] = generalised_esd(np.log(scatter[usable]), most=MOST_ANOMALIES, high_only=True)
+    stands_out = _stands_out(estimated, usable)
     anomalies: list[Anomaly] = []
     pool = usable
     while pool.size > 3 and len(anomalies) < MOST_ANOMALIES:
@@ -182,42 +185,70 @@ def _scatter_anomalies(
     return anomalies
 
 
+def _stands_out(estimated: xr.Dataset, usable: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Mark targets whose scatter exceeds the natural spread of the others, both directions together or one direction alone."""
+    marked = np.zeros(estimated.sizes["target"], dtype=bool)
+    together = np.log(estimated["scatter_position"].values[usable])
+    marked[usable] = generalised_esd(together, most=MOST_ANOMALIES, level=ESD_LEVELS["together"], high_only=True)
+    single = estimated["scatter"].values[:, usable]
+    if single.shape[0] == 2 and (single > 0).all():
+        logarithm = np.log(single)
+        relative = logarithm - np.median(logarithm, axis=1, keepdims=True)
+        outlier = generalised_esd(relative.ravel(), most=MOST_ANOMALIES, level=ESD_LEVELS["single"], high_only=True)
+        marked[usable] |= outlier.reshape(single.shape).any(axis=0)
+    return marked
+
+
 def _scatter_test(z: Array, permutations: int, rng: np.random.Generator) -> tuple[Array, Array]:
     """Return the excess of each target (target,), and the largest one of each permutation of targets within a pass (permutation,).
 
-    z (cycle, direction, target) holds standardised readings, NaN where missing.
+    z (cycle, direction, target) holds standardised readings, NaN where missing. The excess of a target is the largest of both directions
+    together and of each direction alone.
     """
     present = np.isfinite(z)
     cycle, direction, target = np.nonzero(present)
     squares = np.minimum(z[present] ** 2, WINSOR**2)
     centred = (squares - squares.mean()) / squares.std()
-    weight = 1.0 / np.sqrt(np.maximum(np.bincount(target, minlength=z.shape[2]), 1))
-    excess = np.bincount(target, centred, minlength=z.shape[2]) * weight
-    starts = np.flatnonzero(np.diff(cycle * z.shape[1] + direction, prepend=-1))
-    return excess, _largest_sums(centred, target, np.append(starts, target.size), weight, permutations, rng)
+    counts = np.zeros((z.shape[2], z.shape[1]))
+    np.add.at(counts, (target, direction), 1.0)
+    starts = np.append(np.flatnonzero(np.diff(cycle * z.shape[1] + direction, prepend=-1)), target.size)
+    excess = _excess(centred, target, direction, counts)
+    return excess, _largest_excess(centred, target, direction, counts, starts, permutations, rng)
 
 
 @njit(cache=True)
-def _largest_sums(
+def _excess(values: Array, target: NDArray[np.int64], direction: NDArray[np.int64], counts: Array) -> Array:
+    """Sum of the values of each target over the root of their number, the largest of both directions together and of either, (target,)."""
+    sums = np.zeros(counts.shape)
+    for i in range(values.size):
+        sums[target[i], direction[i]] += values[i]
+    excess = np.empty(counts.shape[0])
+    for t in range(excess.size):
+        excess[t] = sums[t].sum() / np.sqrt(max(counts[t].sum(), 1.0))
+        for d in range(counts.shape[1]):
+            excess[t] = max(excess[t], sums[t, d] / np.sqrt(max(counts[t, d], 1.0)))
+    return excess
+
+
+@njit(cache=True)
+def _largest_excess(
     values: Array,
     target: NDArray[np.int64],
+    direction: NDArray[np.int64],
+    counts: Array,
     starts: NDArray[np.int64],
-    weight: Array,
     permutations: int,
     rng: np.random.Generator,
 ) -> Array:
-    """Shuffle values within each pass (Fisher and Yates 1938) and return the largest weighted sum of a target, (permutation,)."""
+    """Shuffle values within each pass (Fisher and Yates 1938) and return the largest excess of a target, (permutation,)."""
     largest = np.empty(permutations)
     shuffled = values.copy()
     for k in range(permutations):
-        sums = np.zeros(weight.size)
         for j in range(starts.size - 1):
             for i in range(starts[j + 1] - 1, starts[j], -1):
                 other = rng.integers(starts[j], i + 1)
                 shuffled[i], shuffled[other] = shuffled[other], shuffled[i]
-        for i in range(values.size):
-            sums[target[i]] += shuffled[i]
-        largest[k] = (sums * weight).max()
+        largest[k] = _excess(shuffled, target, direction, counts).max()
     return largest
 
 
@@ -258,6 +289,9 @@ def _series_anomalies(
     labels, values = _series(estimated)
     if not labels:
         return []
+    # Permuted cycles have no memory: noise that has one would pass for a motion of its position.
+    memory = typical_memory(values[[label.direction != "both" for label in labels]])
+    values = memory.innovations(values)
     orders = np.array([rng.permutation(values.shape[1]) for _ in range(permutations)])
     periodogram = _Periodogram(_cycle_seconds(deviations))
     tests = {"periodic": (periodogram.power(values).max(axis=-1), periodogram.p_values(values))}

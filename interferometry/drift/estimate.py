@@ -25,6 +25,8 @@ from interferometry._typing import Array
 from interferometry.contract import check_dataset
 from interferometry.deviations import DIMS, OUTLIER, set_flag, sort_readings
 from interferometry.drift.gls import DriftFit, average_drift, estimate, von_neumann_p_value
+from interferometry.drift.memory import typical_memory
+from interferometry.drift.shapes import common_shape
 from interferometry.drift.state_space import Order, Smoothed
 from interferometry.errors import InterferometryError
 
@@ -41,6 +43,8 @@ COMPONENTS = {
 BASE_COMPONENTS = ("shift", "stretch")
 #: A further component is added where its contrast over the cycles is serially dependent at this level.
 COMPONENT_LEVEL = 1e-3
+#: Most shapes that the readings may add.
+MOST_SHAPES = 3
 #: Median absolute deviations from which a reading is left out before the fit.
 GROSS_LIMIT = 50.0
 #: A cell's own scatter replaces the common one in its uncertainty where it exceeds that at this level.
@@ -172,7 +176,17 @@ class JointFit:
     cells: NDArray[np.int64]
     cell: NDArray[np.int64]
     components: tuple[str, ...]
+    shapes: Array
     fit: DriftFit
+
+    def loadings(self, sign: Array, position_mm: Array) -> Array:
+        """Share of every drift component in readings (n,) at positions of the test, (n, components)."""
+        named = self.components[: len(self.components) - self.shapes.shape[1]]
+        positions = np.unique(self.readings["position"].values)
+        own = self.shapes[np.searchsorted(positions, position_mm)]
+        return np.hstack(
+            [component_loadings(sign, position_mm, components=named, span_mm=_span_mm(self.readings)), own]
+        )
 
 
 def fit_joint(
@@ -219,11 +233,13 @@ def fit_joint(
             raise DriftDataError(f"components {unknown} are not known; choose from {', '.join(COMPONENTS)}")
         return _fit(readings, cells, cell, tuple(components), robust, order)
     joint = _fit(readings, cells, cell, BASE_COMPONENTS, robust, order)
-    missing = _missing_components(joint)
-    if not missing:
-        return joint
-    # The missing components have biased the variances and the order of the others: all are estimated again.
-    return _fit(readings, cells, cell, (*BASE_COMPONENTS, *missing), robust, order)
+    # Missing components bias the variances and the order of the others: all are estimated again.
+    if missing := _missing_components(joint):
+        joint = _fit(readings, cells, cell, (*BASE_COMPONENTS, *missing), robust, order)
+    while joint.shapes.shape[1] < MOST_SHAPES and (shape := _missing_shape(joint)) is not None:
+        shapes = np.column_stack([joint.shapes, shape])
+        joint = _fit(readings, cells, cell, joint.components[: -joint.shapes.shape[1] or None], robust, order, shapes)
+    return joint
 
 
 def _check_readings(deviations: xr.Dataset, readings: xr.Dataset) -> None:
@@ -319,10 +335,15 @@ def _fit(
     components: tuple[str, ...],
     robust: bool,
     order: Order | None,
+    shapes: Array | None = None,
 ) -> JointFit:
     sign = readings["sign"].values.astype(float)
     position = readings["position"].values
     loadings = component_loadings(sign, position, components=components, span_mm=_span_mm(readings))
+    positions = np.unique(position)
+    if shapes is None:
+        shapes = np.empty((positions.size, 0))
+    loadings = np.hstack([loadings, shapes[np.searchsorted(positions, position)]])
     design = np.zeros((cell.size, len(cells)))
     design[np.arange(cell.size), cell] = 1.0
     fit = estimate(
@@ -334,7 +355,22 @@ def _fit(
         robust=robust,
         settling=True,
     )
-    return JointFit(readings, cells, cell, components, fit)
+    named = (*components, *(f"shape_{k + 1}" for k in range(shapes.shape[1])))
+    return JointFit(readings, cells, cell, named, shapes, fit)
+
+
+def _missing_shape(joint: JointFit) -> Array | None:
+    """Return the shape over the positions of a common motion that the components leave, or None."""
+    readings = joint.readings
+    positions, place = np.unique(readings["position"].values, return_inverse=True)
+    cycles, cycle = np.unique(readings["cycle"].values, return_inverse=True)
+    cell = cycle.ravel() * positions.size + place.ravel()
+    weight = 1.0 / joint.fit.system.variance
+    total = np.bincount(cell, weight, minlength=cycles.size * positions.size)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.bincount(cell, weight * joint.fit.residual(), minlength=total.size) / total
+    known = joint.loadings(np.zeros(positions.size), positions)
+    return common_shape(mean.reshape(cycles.size, -1), known[:, (known != 0).any(axis=0)])
 
 
 def _missing_components(joint: JointFit) -> tuple[str, ...]:
@@ -461,10 +497,11 @@ def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr
     standardised = grid.per_reading(deletion)
     standardised[grid.is_left_out(deviations)] = np.inf
     noise = fit.system.variance * _smoothing_errors(joint, smoothed)
+    excess = _excess_variance(scatter, freedom, joint) + _memory_variance(grid.per_reading(noise), joint)
     by_component = _component_variables(grid, joint, drift, covariance)
     result = xr.Dataset(
         {
-            **_profile_variables(grid, joint, deviations, at_state, _excess_variance(scatter, freedom, joint)),
+            **_profile_variables(grid, joint, deviations, at_state, excess),
             **_scatter_variables(grid, joint, scatter, freedom),
             **_drift_variables(grid, joint, drift, covariance),
             "noise": (DIMS, grid.per_reading(noise), {"units": "um", "long_name": "random part of the reading"}),
@@ -484,7 +521,7 @@ def _profile_variables(
     fit, cells = joint.fit, len(joint.cells)
     sign = np.where(joint.cells[:, 0] == 0, 1.0, -1.0)
     position = deviations["position"].values[joint.cells[:, 1]]
-    loadings = component_loadings(sign, position, components=joint.components, span_mm=_span_mm(joint.readings))
+    loadings = joint.loadings(sign, position)
     to_profile = np.eye(cells, fit.coefficients.size) + loadings @ at_state.per_coefficient
     profile = fit.coefficients[:cells] + loadings @ at_state.drift
     covariance = to_profile @ fit.covariance @ to_profile.T
@@ -563,6 +600,15 @@ def _excess_variance(scatter: Array, freedom: Array, joint: JointFit) -> Array:
     clear = stats.chi2.sf(ratio * freedom, np.maximum(freedom, 1.0)) < EXCESS_LEVEL
     readings = np.bincount(joint.cell, minlength=len(joint.cells))
     return np.where(clear, (ratio - 1.0) * joint.fit.sigma**2 / readings, 0.0)
+
+
+def _memory_variance(noise: Array, joint: JointFit) -> Array:
+    """Return what noise with memory over the cycles adds to the variance of each profile value, um2; noise (cycle, direction, target)."""
+    series = noise.reshape(noise.shape[0], -1).T
+    series = series[np.isfinite(series).any(axis=1)]
+    centred = np.nan_to_num(series - np.nanmean(series, axis=1, keepdims=True))
+    readings = np.bincount(joint.cell, minlength=len(joint.cells))
+    return np.asarray(max(typical_memory(centred).long_run - 1.0, 0.0) * joint.fit.sigma**2 / readings)
 
 
 def _scatter_variables(grid: _Grid, joint: JointFit, scatter: Array, freedom: Array) -> Variables:
