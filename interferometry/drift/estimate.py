@@ -24,6 +24,8 @@ from scipy import stats
 from interferometry._typing import Array
 from interferometry.contract import check_dataset
 from interferometry.deviations import DIMS, OUTLIER, set_flag, sort_readings
+from interferometry.drift.air import drift_covariance, estimate_air_noise
+from interferometry.drift.components import BASE_COMPONENTS, COMPONENTS, component_loadings
 from interferometry.drift.gls import DriftFit, average_drift, estimate, von_neumann_p_value
 from interferometry.drift.memory import typical_memory
 from interferometry.drift.shapes import common_shape
@@ -33,14 +35,6 @@ from interferometry.errors import InterferometryError
 #: Deletion residual, in standard deviations, from which a reading is flagged as an outlier: among 10,000 normal
 #: readings the chance of one is 0.07.
 OUTLIER_LIMIT = 4.5
-#: Share of a drift component in a reading, by its sign of approach (+1, -1) and its place (0 first position, 1 last).
-COMPONENTS = {
-    "shift": lambda sign, place: np.ones(place.size),
-    "stretch": lambda sign, place: place,
-    "reversal": lambda sign, place: sign / 2.0,
-    "bend": lambda sign, place: 4.0 * place * (1.0 - place),
-}
-BASE_COMPONENTS = ("shift", "stretch")
 #: A further component is added where its contrast over the cycles is serially dependent at this level.
 COMPONENT_LEVEL = 1e-3
 #: Most shapes that the readings may add.
@@ -95,7 +89,8 @@ def estimate_drift(
           freedom; ``scatter_position`` (target): both directions together; ``sigma``: of an ordinary reading.
         - ``drift`` (cycle, direction, target) from the stated thermal state at every reading, with u, and every component as
           ``drift_<component>``, with u: profile plus drift is the expected reading. ``drift_size`` (component): standard
-          deviation over the test; ``drift_rate`` (component): standard deviation of the increments of one hour.
+          deviation over the test; ``drift_rate`` (component): standard deviation of the increments of one hour;
+          ``drift_share`` (component, direction, target; 1): its share in a reading.
         - ``noise`` (cycle, direction, target): estimated random part of each reading. ``standardised`` (1): its deletion
           residual in standard deviations, infinite for a gross outlier.
         - ``attrs``: ``state``, ``order``, ``log_likelihood`` (restricted).
@@ -167,7 +162,9 @@ class JointFit:
     cell : (n_readings,) ndarray of int
         Profile column of each reading.
     components : tuple of str
-        Names of the drift components, in the order of the loadings.
+        Names of the drift components, in the order of the loadings; shapes from the readings are the last of them.
+    shapes : (n_positions, k) ndarray
+        Shapes from the readings, over the positions in ascending order.
     fit : DriftFit
         In um; its first n_cells coefficients are the profile at the start of the drift.
     """
@@ -297,31 +294,6 @@ def _index_of(labels: NDArray[np.int64], values: NDArray[np.int64]) -> NDArray[n
     """Return the index of each value among the labels, which may stand in any order."""
     order = np.argsort(labels, kind="stable")
     return np.asarray(order[np.searchsorted(labels, values, sorter=order)])
-
-
-def component_loadings(
-    sign: Array, position_mm: Array, *, components: Sequence[str], span_mm: tuple[float, float]
-) -> Array:
-    """Return the share of each drift component in readings of a direction at a position.
-
-    Parameters
-    ----------
-    sign : (n,) ndarray
-        +1 positive, -1 negative approach.
-    position_mm : (n,) ndarray
-        Target positions, mm.
-    components : sequence of str
-        Names out of COMPONENTS.
-    span_mm : (float, float)
-        First and last position of the test, mm: a stretch is 0 at the first and 1 at the last.
-
-    Returns
-    -------
-    (n, components) ndarray
-        Shares (1): shift 1, stretch 0 to 1, reversal +1/2 and -1/2, bend a parabola of height 1 in the middle.
-    """
-    place = (np.asarray(position_mm, float) - span_mm[0]) / (span_mm[1] - span_mm[0])
-    return np.column_stack([COMPONENTS[name](np.asarray(sign, float), place) for name in components])
 
 
 def _span_mm(readings: xr.Dataset) -> tuple[float, float]:
@@ -492,6 +464,16 @@ def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr
     weights = state_weights(fit.system.seconds, joint.readings["cycle"].values, state)
     at_state = _drift_at_state(joint, columns, weights)
     drift, covariance = _drift_from_state(joint, smoothed, at_state)
+    readings = joint.readings
+    air = estimate_air_noise(
+        fit.residual(),
+        fit.system.seconds,
+        fit.system.loadings,
+        number=readings["cycle"].values * 2 + (readings["sign"].values > 0),
+        position=readings["position"].values,
+    )
+    if air is not None:
+        covariance = covariance + drift_covariance(fit.system, air, fit.sigma)
     deletion = fit.deletion_residuals()
     scatter, freedom = _scatter(joint, smoothed, deletion)
     standardised = grid.per_reading(deletion)
@@ -653,6 +635,11 @@ def _component_variables(grid: _Grid, joint: JointFit, drift: Array, covariance:
             {"units": "um", "long_name": "random change within an hour"},
         ),
     }
+    sign = np.where(joint.cells[:, 0] == 0, 1.0, -1.0)
+    position = np.full(len(joint.cells), np.nan)
+    position[joint.cell] = joint.readings["position"].values
+    shares = [grid.per_cell(share) for share in joint.loadings(sign, position).T]
+    variables["drift_share"] = (("component", *DIMS[1:]), np.array(shares), {"units": "1"})
     for column, name in enumerate(joint.components):
         variables[f"drift_{name}"] = (DIMS, grid.per_reading(drift[:, column]), {"units": "um"})
         variables[f"drift_{name}_u"] = (DIMS, grid.per_reading(component_u[:, column]), {"units": "um"})

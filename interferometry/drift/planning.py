@@ -10,7 +10,7 @@ import xarray as xr
 from scipy import optimize, stats
 
 from interferometry._typing import Array
-from interferometry.drift.estimate import component_loadings
+from interferometry.drift.components import component_loadings
 from interferometry.errors import InterferometryError
 
 #: Shares of the final drift whose times are named t63 and t95.

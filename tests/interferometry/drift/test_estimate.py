@@ -255,3 +255,26 @@ def test_sorted_readings_hold_the_real_time(rng: np.random.Generator) -> None:
 def test_an_unknown_order_is_refused(order: object, rng: np.random.Generator) -> None:
     with pytest.raises(DriftDataError, match=f"order={order!r} is neither 1 "):
         estimate_drift(simulate(rng, cycles=2)[0], order=order)  # type: ignore[arg-type]
+
+
+def test_a_hot_zone_of_the_screw_gets_a_shape_of_its_own(rng: np.random.Generator) -> None:
+    deviations, truth = simulate(rng, kind="warmup")
+    zone = 10.0 * (1.0 - np.exp(-truth.seconds / 5400.0)) * np.minimum(truth.position, 0.55) / 0.55
+    deviations["deviation"] = deviations["deviation"] + zone
+    estimated = estimate_drift(deviations)
+    assert "shape_1" in estimated["component"].values
+    assert estimated["drift_share"].sel(component="shape_1").max() <= 1.0
+    error = estimated["drift"].values - (truth.drift + zone - (truth.drift + zone).mean())
+    # Without the shape the drift is off by up to 1 um; one pass knows it to 0.4 um / sqrt(16).
+    assert np.sqrt(np.mean((error - error.mean(axis=0)) ** 2)) < 0.15
+
+
+def test_noise_with_memory_over_the_cycles_widens_the_profile(rng: np.random.Generator) -> None:
+    noise = rng.standard_normal((100, 2, 16))
+    for k in range(1, 100):
+        noise[k] = 0.5 * noise[k - 1] + np.sqrt(0.75) * noise[k]
+    plain, _ = simulate(np.random.default_rng(1))
+    with_memory, _ = simulate(np.random.default_rng(1), noise=SIGMA_UM * noise)
+    ratio = estimate_drift(with_memory)["profile_relative_u"] / estimate_drift(plain)["profile_relative_u"]
+    # The variance of a mean grows by (1 + 0.5) / (1 - 0.5) = 3; the fit takes a part of the memory for drift.
+    assert 1.4 < float(ratio[:, 1:].mean()) < 2.0
