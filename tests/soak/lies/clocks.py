@@ -44,6 +44,15 @@ def stepped(shift_s: float) -> Callable[[Seconds], Seconds]:
     return lambda seconds: seconds + np.where(seconds >= _MIDDLE_S, shift_s, 0.0)
 
 
+def whole_day(table: pd.DataFrame) -> pd.DataFrame:
+    """A log that begins two hours before the test and ends two hours after it; what it shows there is that of the test, mirrored."""
+    times = pd.to_datetime(table["time"], utc=True, format="ISO8601")
+    before, after = table.iloc[120:0:-1], table.iloc[-2:-122:-1]
+    longer = pd.concat([before, table, after], ignore_index=True)
+    minutes = times.iloc[0] + pd.to_timedelta(np.arange(-120, len(table) + 120), unit="min")
+    return longer.assign(time=minutes.strftime("%Y-%m-%dT%H:%M:%S+00:00"))
+
+
 def half_without_zone(table: pd.DataFrame) -> pd.DataFrame:
     bare = table["time"].str.removesuffix("+00:00")
     return table.assign(time=bare.where(table["cycle"] >= HALF, table["time"]))
@@ -83,10 +92,25 @@ LIES = (
         edit_times("laser.csv", lambda seconds: 60.0 * np.floor(seconds / 60.0)),
     ),
     Lie("environment log 1 h late", ENVIRONMENT, edit_times("environment.csv", late(HOUR_S))),
+    Lie(
+        "environment log of the whole day, 1 h late",
+        ENVIRONMENT,
+        in_turn(edit_table("environment.csv", whole_day), edit_times("environment.csv", late(HOUR_S))),
+    ),
     Lie("environment of another day", ENVIRONMENT, edit_times("environment.csv", late(-86400.0))),
     Lie("drivers log 1 h late", DRIVERS, edit_times("drivers.csv", late(HOUR_S))),
     Lie("drivers log 1 h early", DRIVERS, edit_times("drivers.csv", late(-HOUR_S))),
     Lie("drivers log 20 min late", DRIVERS, edit_times("drivers.csv", late(1200.0))),
     Lie("drivers log gains 10 min/h", DRIVERS, edit_times("drivers.csv", fast(600.0 / HOUR_S))),
+    Lie(
+        "drivers log of the whole day, 1 h late",
+        DRIVERS,
+        in_turn(edit_table("drivers.csv", whole_day), edit_times("drivers.csv", late(HOUR_S))),
+    ),
+    Lie(
+        "drivers log of the whole day, 20 min early",
+        DRIVERS,
+        in_turn(edit_table("drivers.csv", whole_day), edit_times("drivers.csv", late(-1200.0))),
+    ),
     Lie("drivers of another day", DRIVERS, edit_times("drivers.csv", late(-86400.0))),
 )

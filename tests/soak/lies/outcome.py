@@ -74,15 +74,20 @@ def _faults(lie: Lie, truth: Truth, results: Results, folder: Path) -> Iterator[
 
 def _wrong_causes(lie: Lie, truth: Truth, loop: AxisLoop) -> Iterator[str]:
     """Names that are false, and a verdict that nothing is missing although something is."""
+    named = [(step.effect, set(step.tied)) for step in loop.steps]
+    named += [(error.effect, set()) for error in loop.field_corrections]
     missing = {effect.name for effect in truth.recipe.effect}
-    named = {step.effect: set(step.tied) for step in loop.steps}
-    named |= {error.effect: set() for error in loop.field_corrections}
-    for name, tied in named.items():
-        if not ({name} | tied) & (missing | lie.describes):
+    untold = missing - {name for name, _ in named}
+    for name, tied in named:
+        if name in missing | lie.describes:
+            continue
+        # Of effects that the data cannot tell apart, one name stands for the others; each missing effect is told once.
+        if tied & untold:
+            untold -= {sorted(tied & untold)[0]}
+        else:
             yield f"false cause {name}"
-    told = {name for name in missing if any(name in {step} | tied for step, tied in named.items())}
-    if missing - told and loop.verdict in ("complete", "explained"):
-        yield f"{loop.verdict} without {', '.join(sorted(missing - told))}"
+    if untold and loop.verdict in ("complete", "explained"):
+        yield f"{loop.verdict} without {', '.join(sorted(untold))}"
 
 
 def _wrong_expansion(loop: AxisLoop) -> Iterator[str]:
@@ -131,8 +136,10 @@ def _without_line(error: np.ndarray) -> np.ndarray:
 
 
 def _wrong_field(truth: Truth, path: Path) -> Iterator[str]:
-    """Temperature and rise of every cell and cycle against the true field."""
-    with xr.open_dataset(path, engine="h5netcdf") as fields:
+    """Temperature and rise of every cell on the table and every cycle against the true field."""
+    plan = truth.recipe.plan
+    with xr.open_dataset(path, engine="h5netcdf") as whole:
+        fields = whole.sel(x=slice(0.0, plan.width_mm), y=slice(0.0, plan.height_mm))
         true = truth.temperature(truth.session.frame_s, fields["x"].values, fields["y"].values, cell_mm=10.0)
         count = fields.sizes["cycle"]
         rows = np.arange(count) if count == len(true) else fields["cycle"].values - 1
