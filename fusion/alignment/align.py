@@ -56,7 +56,8 @@ def cycle_bounds(deviations: xr.Dataset) -> NDArray[np.datetime64]:
     """Return start and end of every cycle on the laser's clock.
 
     A cycle lasts from its first reading to the first reading of the next one, so that a frame taken on the way back to the start
-    belongs to the cycle that has just been measured. The last cycle is as long as the median of the others.
+    belongs to the cycle that has just been measured. The last cycle, and a cycle after which numbers are missing, is as long as the
+    median of the others: frames of the gap belong to no cycle.
 
     Parameters
     ----------
@@ -88,8 +89,11 @@ def cycle_bounds(deviations: xr.Dataset) -> NDArray[np.datetime64]:
         raise AlignmentError(
             f"cycle {after} starts before cycle {before} has ended; check the cycle numbers and times of the laser file"
         )
-    length = np.median(np.diff(first)) if first.size > 1 else last[0] - first[0]
-    end = np.append(first[1:], max(first[-1] + int(length), last[-1] + 1))
+    steps = np.diff(deviations["cycle"].values)
+    followed = steps == steps.min(initial=np.iinfo(np.int64).max)
+    length = int(np.median(np.diff(first)[followed])) if first.size > 1 else int(last[0] - first[0])
+    alone = np.maximum(first + length, last + 1)
+    end = np.append(np.where(followed, first[1:], np.minimum(first[1:], alone[:-1])), alone[-1])
     return np.stack([first, end], axis=1).astype("datetime64[ns]")
 
 

@@ -335,13 +335,13 @@ def read_environment(path: str | Path) -> xr.Dataset:
     }
 
     def parse(fields: dict[str, str]) -> list[float]:
-        return [_plausible(table, fields[column], low, high) for column, _, _, low, high in ENVIRONMENT_COLUMNS]
+        return [_plausible(table, column, fields[column], low, high) for column, _, _, low, high in ENVIRONMENT_COLUMNS]
 
     return read_timed_rows(table, variables, parse)
 
 
-def _plausible(table: DelimitedTable, text: str, low: float, high: float) -> float:
+def _plausible(table: DelimitedTable, column: str, text: str, low: float, high: float) -> float:
     value = table.number(text)
     if not low <= value <= high:
-        raise BadReading(text, f"lies outside {low:g} .. {high:g}, the range of this column's unit")
+        raise BadReading(text, f"lies outside {low:g} .. {high:g}, the range of {column} in its unit")
     return value

@@ -84,6 +84,15 @@ def test_a_frame_at_the_end_of_a_cycle_belongs_to_that_cycle():
     assert (bounds[1:, 0] == bounds[:-1, 1]).all()
 
 
+def test_frames_taken_while_cycles_are_missing_belong_to_no_cycle():
+    bounds = cycle_bounds(deviations(cycles=9).sel(cycle=[1, 2, 3, 7, 8, 9]))
+    length = bounds[:, 1] - bounds[:, 0]
+    assert (length == np.timedelta64(252, "s")).all()
+    # Tests that count their cycles by twos lack none of them.
+    even = cycle_bounds(deviations(cycles=9).sel(cycle=[2, 4, 6, 8]))
+    assert (even[1:, 0] == even[:-1, 1]).all()
+
+
 def test_the_clock_offset_is_camera_minus_laser():
     camera = np.array([START + np.timedelta64(37, "s")])
     assert camera_on_laser_clock(camera, 37.0)[0] == START

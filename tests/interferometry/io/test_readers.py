@@ -221,7 +221,7 @@ def test_environment_is_sorted_and_its_faults_are_listed(tmp_path: Path) -> None
     environment = read_environment(path)
     assert environment["air_temperature"].values.tolist() == [23.5, 23.7, 23.6, 23.6]
     reasons = {one["line"]: one["reason"] for one in left_out(environment)}
-    assert "lies outside 500 .. 1200" in str(reasons[4])
+    assert "lies outside 500 .. 1200, the range of air_pressure_hPa in its unit" in str(reasons[4])
     assert "occurs on an earlier line too" in str(reasons[5])
     assert "lies outside -9 .. 80" in str(reasons[6])
 

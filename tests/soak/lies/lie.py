@@ -38,6 +38,8 @@ class Lie:
         Effects and causes whose naming describes the fault itself, so that it is no false name.
     targets : frozenset of int
         Targets that the fault makes stand out, so that flagging them without a cause is right.
+    renumbered : int
+        What has to be added to a cycle's number to get the true one.
     limit : str
         Why nothing in the data can tell; empty where something can.
     """
@@ -48,6 +50,7 @@ class Lie:
     world: Callable[[Recipe], Recipe] = _unchanged
     describes: frozenset[str] = frozenset()
     targets: frozenset[int] = frozenset()
+    renumbered: int = 0
     limit: str = ""
 
 

@@ -69,7 +69,7 @@ def _faults(lie: Lie, truth: Truth, results: Results, folder: Path) -> Iterator[
     yield from _wrong_expansion(loop)
     yield from _wrong_anomalies(lie, truth, results.anomalies or ())
     yield from _wrong_profile(truth, results)
-    yield from _wrong_field(truth, folder / "fields.nc")
+    yield from _wrong_field(lie, truth, folder / "fields.nc")
 
 
 def _wrong_causes(lie: Lie, truth: Truth, loop: AxisLoop) -> Iterator[str]:
@@ -135,15 +135,16 @@ def _without_line(error: np.ndarray) -> np.ndarray:
     return error[known] - np.polyval(np.polyfit(target[known], error[known], 1), target[known])
 
 
-def _wrong_field(truth: Truth, path: Path) -> Iterator[str]:
+def _wrong_field(lie: Lie, truth: Truth, path: Path) -> Iterator[str]:
     """Temperature and rise of every cell on the table and every cycle against the true field."""
     plan = truth.recipe.plan
     with xr.open_dataset(path, engine="h5netcdf") as whole:
         fields = whole.sel(x=slice(0.0, plan.width_mm), y=slice(0.0, plan.height_mm))
         true = truth.temperature(truth.session.frame_s, fields["x"].values, fields["y"].values, cell_mm=10.0)
-        count = fields.sizes["cycle"]
-        rows = np.arange(count) if count == len(true) else fields["cycle"].values - 1
-        for name, expected in (("temperature", true[rows]), ("temperature_rise", true[rows] - true[0])):
+        rows = fields["cycle"].values + lie.renumbered - 1
+        # A cycle entered twice, as one more at the end, was measured in no time of its own.
+        rows = np.minimum(rows, len(true) - 1)
+        for name, expected in (("temperature", true[rows]), ("temperature_rise", true[rows] - true[rows[0]])):
             error, u = fields[name].values - expected, fields[f"{name}_u"].values
             # The rise of the reference cycle is zero by definition, with no uncertainty.
             known = np.isfinite(error) & (u > 0.0)

@@ -118,7 +118,7 @@ LIES = (
     Lie("targets numbered from the other end", TARGETS_NAMED, laser(positions_reversed)),
     Lie("target list shifted by one", TARGETS_NAMED, laser(positions_shifted)),
     Lie("places of targets 2 and 7 exchanged", TARGETS_NAMED, laser(exchanged_targets)),
-    Lie("cycles numbered from 0", NUMBERS, laser(lambda t: t.assign(cycle=t["cycle"] - 1))),
+    Lie("cycles numbered from 0", NUMBERS, laser(lambda t: t.assign(cycle=t["cycle"] - 1)), renumbered=1),
     Lie("cycle 15 twice, same number", COPIED, laser(copied_cycle(_COPIED))),
     Lie("cycle 15 twice, as a new number at the end", COPIED, laser(copied_cycle(CYCLES + 1))),
     Lie("cycle 16 holds the values of cycle 15", COPIED, laser(values_of_the_cycle_before)),
