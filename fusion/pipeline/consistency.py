@@ -7,9 +7,11 @@ from typing import Any
 
 import xarray as xr
 
+from fusion.alignment.align import camera_on_laser_clock
 from fusion.alignment.readings import read_fused
 from fusion.campaign.config import CampaignError
 from fusion.campaign.inputs import Source
+from fusion.consistency.camera_stamps import check_order, check_phase
 from fusion.consistency.checks import CODES, Check
 from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_material_clock
 from fusion.consistency.coefficients import check_expansion
@@ -65,8 +67,18 @@ def check_source(source: Source) -> list[Check]:
             file=drivers.file if drivers is not None else "the drivers' log",
             endangers="every effect that follows a load, and the verdict that none is missing",
         ),
+        *check_order(source.frames),
+        *_phase(source),
         *check_frames(source.frames, overridden=set(overridden_parameters(source))),
     ]
+
+
+def _phase(source: Source) -> list[Check]:
+    """Frames of a still table against the motion of the axis; those of a moving table estimate the offset of the clocks themselves."""
+    if source.thermography.table == "moving":
+        return []
+    stated_s = source.thermography.clock_offset_s or 0.0
+    return check_phase(camera_on_laser_clock(source.frame_times, stated_s), source.deviations)
 
 
 def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[Check]:

@@ -18,7 +18,7 @@ from tests.fusion.consistency import lies
 def test_a_sound_campaign_passes_every_check(results_folder: Path) -> None:
     inputs = read_results(results_folder).inputs
     assert inputs is not None and inputs.state == "sound"
-    assert len(inputs.checks) == 16 and all(check.passed for check in inputs.checks)
+    assert len(inputs.checks) == 19 and all(check.passed for check in inputs.checks)
 
 
 @pytest.mark.parametrize(
