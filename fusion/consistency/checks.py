@@ -33,6 +33,8 @@ CODES = (
     "material_rise",
     "material_level",
     "expansion_coefficient",
+    "sensitivity",
+    "axis_line",
 )
 
 

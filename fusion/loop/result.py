@@ -14,6 +14,7 @@ from fusion.diagnosis.remainder import Remainder
 from fusion.loop.parameter_ranges import Range
 from fusion.loop.state import Confirmation, Confirmed, LoopState, Score, Step, rivals
 from fusion.model.fit import ModelFit, Term, unexplained_drift
+from fusion.model.jackknife import coefficient_spread
 
 
 @dataclass(frozen=True)
@@ -182,15 +183,18 @@ def _added_effect(model: ModelFit, term: Term, step: Step, before_um: float, aft
 
 
 def declared_coefficients(model: ModelFit, declared: int) -> list[dict[str, float | str]]:
-    """Coefficients of the declared effects with unit and standard uncertainty.
+    """Coefficients of the declared effects with unit, standard uncertainty, and how far they move when parts of the readings are left out.
 
     Parameters
     ----------
     model : whose first terms are the declared ones
     declared : their number
     """
+    spread = coefficient_spread(model)
     return [
-        {"effect": term.effect, **entry} for term in model.terms[:declared] for entry in coefficients_of(model, term)
+        {"effect": term.effect, **entry, "jackknife_u": float(moved)}
+        for term in model.terms[:declared]
+        for entry, moved in zip(coefficients_of(model, term), spread[model.place(term)], strict=True)
     ]
 
 

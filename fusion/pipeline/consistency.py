@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from fusion.alignment.align import camera_on_laser_clock
@@ -14,7 +15,7 @@ from fusion.campaign.inputs import Source
 from fusion.consistency.camera_stamps import check_order, check_phase
 from fusion.consistency.checks import CODES, Check
 from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_material_clock
-from fusion.consistency.coefficients import check_expansion
+from fusion.consistency.coefficients import check_coefficients
 from fusion.consistency.field_series import thin_fields
 from fusion.consistency.frames import check_frames
 from fusion.consistency.logs import check_log
@@ -110,13 +111,14 @@ def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[
     ]
 
 
-def check_loop(loop: Mapping[str, Any]) -> list[Check]:
+def check_loop(loop: Mapping[str, Any], source: Source) -> list[Check]:
     """Check what the closed loop fitted against physics.
 
     Parameters
     ----------
     loop : mapping
         Part ``loop`` of results.json.
+    source : Source
+        Inputs of the campaign.
     """
-    declared: Sequence[Mapping[str, Any]] = loop.get("declared_coefficients", [])
-    return check_expansion(declared)
+    return check_coefficients(loop, travel_mm=float(np.abs(source.deviations["position"]).max()))

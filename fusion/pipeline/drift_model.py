@@ -11,6 +11,7 @@ import xarray as xr
 from fusion.alignment.align import align
 from fusion.alignment.readings import Readings, read_fused
 from fusion.campaign.inputs import Source, counted
+from fusion.consistency.axis_line import compare_lines
 from fusion.diagnosis.residual_tests import ResidualTests, examine_residual
 from fusion.effects.effect import Effect, Prior
 from fusion.effects.library import library
@@ -74,12 +75,14 @@ def model_drift(
     positions = judge_positions(fused, deviations, variables["contribution"].sum("effect", skipna=False))
     result = set_aside_sites(result, sites_of(positions, deviations.sizes["target"]))
     report("anomalies", 1, 1)
+    line = compare_lines(result.after, len(result.declared), correct_fields(fields, errors), source.axis)
     parts = {
         "anomalies": [position.as_json() for position in positions],
         "loop": {
             **result.as_json(),
             "field_corrections": [error.as_json() for error in errors],
             "residual_tests": {name: examined.as_json() for name, examined in tests.items()},
+            "axis_line": None if line is None else line.as_json(),
         },
     }
     return Outcome(variables, parts, (*gap_notices(readings), *field_notices(errors)))

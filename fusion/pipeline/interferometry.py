@@ -9,7 +9,8 @@ import xarray as xr
 
 from fusion.alignment.align import align
 from fusion.campaign.inputs import Source, counted, listed
-from fusion.products.grouped import joined
+from fusion.consistency.readings import find_gross_readings
+from fusion.products.grouped import group, joined
 from fusion.products.results import Notice, Outcome
 from interferometry import iso230, neighbours
 from interferometry.deviations import OUTLIER
@@ -86,12 +87,9 @@ def _reading_notices(deviations: xr.Dataset, drift: xr.Dataset) -> list[Notice]:
                 effect_um=wider,
             )
         )
-    outliers = (deviations["quality_flag"].values & OUTLIER.mask) > 0
+    outliers = (deviations["quality_flag"] & OUTLIER.mask) > 0
     if outliers.any():
-        named = [
-            f"cycle {deviations['cycle'].values[c]} {deviations['direction'].values[d]} target {deviations['target'].values[t]}"
-            for c, d, t in np.argwhere(outliers)
-        ]
+        named = _names(outliers)
         notices.append(
             Notice(
                 "outliers",
@@ -135,12 +133,35 @@ def align_recordings(source: Source, fields: xr.Dataset, deviations: xr.Dataset)
     Returns
     -------
     Dataset
-        Result of `fusion.alignment.align.align`.
+        Result of `fusion.alignment.align.align`, without the readings that are errors of reading.
     list of Notice
-        Readings that lie outside the frames.
+        Readings that were left out, or lie outside the frames.
     """
-    fused = align(deviations, fields, source.axis, environment=source.environment, drivers=source.drivers)
-    return fused, _outside_notices(fused)
+    gross = find_gross_readings(group(deviations, "drift")["standardised"])
+    used = deviations.assign(deviation=deviations["deviation"].where(~gross))
+    fused = align(used, fields, source.axis, environment=source.environment, drivers=source.drivers)
+    return fused, [*_gross_notices(deviations["deviation"], gross), *_outside_notices(fused)]
+
+
+def _gross_notices(deviation: xr.DataArray, gross: xr.DataArray) -> list[Notice]:
+    """Return a notice for the readings that are errors of reading."""
+    if not gross.any():
+        return []
+    largest = float(np.abs(deviation.where(gross) - deviation.median("cycle")).max())
+    return [
+        Notice(
+            "gross_readings",
+            f"{counted(int(gross.sum()), 'reading')} more than ten standard deviations of their position off, by up to {largest:.3g} µm: "
+            f"{listed(_names(gross))}; left out where drift and field are compared and modelled.",
+            "Check what happened at these readings (beam, unit, typing error), and correct or remove them in the file.",
+        )
+    ]
+
+
+def _names(marked: xr.DataArray) -> list[str]:
+    """Return cycle, approach and target of every reading that is marked (cycle, direction, target)."""
+    cycle, direction, target = (marked[name].values for name in marked.dims)
+    return [f"cycle {cycle[c]} {direction[d]} target {target[t]}" for c, d, t in np.argwhere(marked.values)]
 
 
 def _outside_notices(fused: xr.Dataset) -> list[Notice]:

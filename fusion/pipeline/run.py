@@ -249,7 +249,7 @@ def _run_instruments(run: Run, source: Source, checks: Sequence[Check], *, sched
     write_dataset(folder / "fusion.nc", fusion)
     thermal.write_exr(folder / "maps", fields, report=report)
     accepted = run.campaign.accept.doubts
-    checks = [*checks, *check_fields(source, fields, fused), *check_loop(run.parts["loop"])]
+    checks = [*checks, *check_fields(source, fields, fused), *check_loop(run.parts["loop"], source)]
     run.parts["inputs"] = inputs_part(checks, accepted, corrected=camera_corrected(run.parts["camera"]))
     run.notices = [*doubt_notices(checks, accepted), *run.notices]
     return _finish(run, {"fields": fields, "deviations": deviations, "fusion": fusion})

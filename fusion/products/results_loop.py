@@ -49,6 +49,8 @@ class DeclaredCoefficient(Coefficient):
 
     effect: str
     """Name of the effect."""
+    jackknife_u: Number = None
+    """Standard deviation by which it moves when a target or a part of the test is left out; null where it rests on one of them alone."""
 
 
 class StepPart(ResultPart):
@@ -244,6 +246,21 @@ class FieldCorrection(ResultPart):
     """First cycle whose field it touches."""
 
 
+class AxisLine(ResultPart):
+    """The declared line on the plan against its best alternative."""
+
+    alternative: str
+    """The alternative in words."""
+    gain: Number
+    """What it gains in log-likelihood, less a penalty for added effects, nats; negative where the declared line is better."""
+    expansion_ppm_per_K: Number
+    """Expansion that the readings alone ask for beside it, ppm/K."""
+    expansion_u_ppm_per_K: Number
+    """Its standard uncertainty, ppm/K."""
+    superfluous: tuple[str, ...]
+    """Added effects that are not needed beside it."""
+
+
 class ResidualPart(ResultPart):
     """Tests of the residual of one model."""
 
@@ -318,6 +335,8 @@ class AxisLoop(Loop):
     """Errors of the camera that were taken out of the fields."""
     residual_tests: ResidualTestsPart
     """Tests of the residual."""
+    axis_line: AxisLine | None = None
+    """Other lines, orders of the targets and signs; null where the expansion of the axis is not declared."""
 
 
 class ChannelErrors(ResultPart):

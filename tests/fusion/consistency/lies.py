@@ -57,6 +57,15 @@ def drivers_end_early(folder: Path) -> None:
     table.head(len(table) // 2).to_csv(folder / "drivers.csv", index=False)
 
 
+def axis_the_other_way_round(folder: Path) -> None:
+    """The same stretch of the plan with its direction reversed."""
+    path = folder / "campaign.toml"
+    text = path.read_text(encoding="utf-8")
+    assert 'origin = ["500 mm", "90 mm"]' in text and "direction = [-1, 0]" in text
+    text = text.replace('origin = ["500 mm", "90 mm"]', 'origin = ["250 mm", "90 mm"]')
+    path.write_text(text.replace("direction = [-1, 0]", "direction = [1, 0]"), encoding="utf-8")
+
+
 def aluminium(folder: Path) -> None:
     """The expansion coefficient of aluminium for a table of steel."""
     path = folder / "campaign.toml"

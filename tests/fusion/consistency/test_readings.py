@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from fusion.consistency.checks import Check, Severity
-from fusion.consistency.readings import check_readings, random_part_um
+from fusion.consistency.readings import check_readings, find_gross_readings, random_part_um
 from interferometry.deviations import build_deviations
 
 CYCLES, TARGETS = 40, 12
@@ -110,3 +110,13 @@ def test_one_approach_alone_and_missing_readings_pass() -> None:
     values[:, 1] = np.nan
     values[3, 0, 4] = np.nan
     assert failed(with_deviation(test, values)) == {}
+
+
+def test_only_what_lies_far_beyond_the_scatter_of_its_own_position_is_an_error_of_reading() -> None:
+    rng = np.random.default_rng(2)
+    values = rng.standard_normal((200, 2, 3))
+    values[:, :, 2] *= 4.0
+    values[5, 0, 0], values[6, 1, 2], values[7, 1, 1], values[8, 0, 1] = 11.5, 30.0, np.inf, np.nan
+    found = find_gross_readings(xr.DataArray(values, dims=("cycle", "direction", "target")))
+    # 30 standard deviations of an ordinary reading are 7.5 of that position.
+    assert np.argwhere(found.values).tolist() == [[5, 0, 0], [7, 1, 1]]

@@ -23,6 +23,7 @@ from fusion.loop.result import (
 )
 from fusion.loop.state import Confirmation, Confirmed, DetectionLimit, HoldOutQuestion, LoopState, Round, Score, Step
 from fusion.model.fit import ModelFit, unexplained_drift
+from fusion.model.jackknife import coefficient_spread
 from tests.fusion.small_campaign import RATIOS, campaign, model_of, term
 
 BARE = campaign(cycles=12)
@@ -126,6 +127,7 @@ def test_coefficients_are_told_with_their_prior():
             "unit": "ppm/K",
             "prior": 11.7,
             "prior_u": 2.0,
+            "jackknife_u": coefficient_spread(model)[place],
         }
     ]
     two = term(np.column_stack([WAVE, WAVE**2]), "b", units=("um", "um/K"), prior=Prior(1.0, 0.1))

@@ -39,6 +39,26 @@ def test_parts_agree_with_the_product(campaign_folder: Path) -> None:
 def test_readings_outside_the_frames_are_counted(campaign_folder: Path, results_folder: Path) -> None:
     source = read_source(load_campaign(campaign_folder / "campaign.toml"))
     fields = read_dataset(results_folder / "fields.nc")
-    fused, (notice,) = align_recordings(source, fields, source.deviations)
+    fused, (notice,) = align_recordings(source, fields, read_dataset(results_folder / "deviations.nc"))
     outside = int(np.count_nonzero(~fused["inside_frames"].values))
     assert notice.message.startswith(f"{outside} readings outside the frames' time, in 1 cycle (1)")
+
+
+def test_an_error_of_reading_is_left_out_of_the_comparison_with_the_field_and_named(
+    campaign_folder: Path, results_folder: Path
+) -> None:
+    source = read_source(load_campaign(campaign_folder / "campaign.toml"))
+    fields, deviations = (read_dataset(results_folder / f"{name}.nc") for name in ("fields", "deviations"))
+    sound, _ = align_recordings(source, fields, deviations)
+    spoilt = deviations.copy(deep=True)
+    spoilt["deviation"][10, 1, 3] = 1e6
+    spoilt["drift_standardised"][10, 1, 3] = np.inf
+    fused, notices = align_recordings(source, fields, spoilt)
+    message = next(notice.message for notice in notices if notice.code == "gross_readings")
+    assert message.startswith(
+        "1 reading more than ten standard deviations of their position off, by up to 1e+06 µm: cycle 11 negative target 4;"
+    )
+    # Everything else is what it was: what follows cannot change by the size of the error.
+    assert np.isnan(fused["deviation"].values[10, 1, 3])
+    sound["deviation"][10, 1, 3] = np.nan
+    np.testing.assert_array_equal(fused["deviation"], sound["deviation"])
