@@ -19,6 +19,8 @@ CODES = (
     "travel",
     "copied_cycles",
     "approach_labels",
+    "datum",
+    "zeroed_cycles",
     "environment_coverage",
     "drivers_coverage",
     "camera_settings",

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
+
 import numpy as np
 import xarray as xr
 from scipy import stats
@@ -20,6 +23,13 @@ _COPIED_SHARE, _ORDINARY_SHARE = 0.8, 0.3
 #: Standard deviations of its own position and approach beyond which a reading is an error of reading: no process of a machine that repeats
 #: scatters as far, and Student's t with 4 degrees of freedom, heavier than any laser's noise, does so once in some 2,000 readings.
 _GROSS_SIGMAS = 10.0
+#: A jump of all readings is doubted from this multiple of the drift's range on either side of it, and from this size, um: a clamped mount
+#: slips by no more without being noticed, and such a slip is a cause (step_event); a new datum is anywhere.
+_DATUM_RANGES, _LEAST_DATUM_UM = 3.0, 5.0
+#: The jump is the same everywhere where targets and approaches differ by less than this share of it.
+_COMMON_SHARE = 0.1
+#: Share of the cycles with one and the same reading from which on a reading is the zero of its cycle.
+_ZEROED_SHARE = 0.9
 #: Fewest cycles on either side of an exchange of the approaches.
 _LEAST_SIDE = 3
 #: Standard errors by which the reversal error must differ before and after, and the p-value for equal size and opposite sign.
@@ -48,6 +58,8 @@ def check_readings(deviations: xr.Dataset, *, plan_extent_mm: float) -> list[Che
         _travel(deviations, plan_extent_mm),
         _copied_cycles(deviations),
         _exchanged_approaches(deviations, noise_um),
+        _datum(deviations, noise_um),
+        _zeroed_cycles(deviations),
     ]
 
 
@@ -213,4 +225,74 @@ def _exchanged_approaches(deviations: xr.Dataset, noise_um: float) -> Check:
         f"({near[0]:+.2f} to {near[1]:+.2f} µm).",
         f"Check the labels of the direction of approach from cycle {cycles[place]} on.",
         endangered,
+    )
+
+
+def _datum(deviations: xr.Dataset, noise_um: float) -> Check:
+    """A sudden shift of all targets and approaches alike, far larger than the drift beside it, is a new datum or a slip."""
+    endangered = "drift, accuracy and repeatability over the whole test, and every cause that acts from that cycle on"
+    values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
+    level, cycles = _levels(values), deviations["cycle"].values
+    sound = Check("datum", 0.0, _DATUM_RANGES, True, "The readings do not jump together at any cycle.", "", endangered)
+    if level.size < 2 * _LEAST_SIDE or not noise_um > 0.0:
+        return sound
+    # Over two cycles, so that a jump within a cycle counts whole; the cycle between belongs to neither side.
+    places = np.arange(_LEAST_SIDE - 1, level.size - _LEAST_SIDE + 1)
+    jumps = level[places + 1] - level[places - 1]
+    place = int(places[np.argmax(np.abs(jumps))])
+    jump = values[place + 1] - values[place - 1]
+    size = float(np.nanmedian(jump))
+    beside = max(float(np.ptp(level[:place])), float(np.ptp(level[place + 1 :])), noise_um)
+    spread = float(stats.median_abs_deviation(jump, scale="normal", nan_policy="omit"))
+    common = spread <= _COMMON_SHARE * abs(size) + 2.0 * noise_um
+    multiple = abs(size) / beside
+    if multiple <= _DATUM_RANGES or abs(size) <= _LEAST_DATUM_UM or not common:
+        return replace(sound, value=multiple if common else 0.0)
+    # The cycle between belongs to the level that it is nearer to.
+    first = cycles[place] if 2.0 * abs(level[place] - level[place - 1]) > abs(size) else cycles[place + 1]
+    return Check(
+        "datum",
+        multiple,
+        _DATUM_RANGES,
+        False,
+        f"From cycle {first} on all targets read {size:+.3g} µm in both approaches, {multiple:.2g} times the drift on either side: the "
+        "datum of the laser changed (beam broken, zeroed or set up anew), or a mount slipped.",
+        f"If the laser was zeroed or set up anew before cycle {first}, evaluate the two parts as two campaigns; if not, look at the "
+        "clamping of optics and laser head.",
+        endangered,
+    )
+
+
+def _levels(values: Array) -> Array:
+    """Level of every cycle (cycles,), um: sum of the median changes of the sites (cycle, site) from cycle to cycle."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        changes = np.nanmedian(np.diff(values, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(np.nan_to_num(changes))])
+
+
+def _zeroed_cycles(deviations: xr.Dataset) -> Check:
+    """A reading that is the same in every cycle, where all others scatter, was set to that value."""
+    values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
+    shares = np.zeros(values.shape[1])
+    for site, column in enumerate(values.T):
+        present = column[np.isfinite(column)]
+        if present.size >= _LEAST_SIDE:
+            shares[site] = np.unique(present, return_counts=True)[1].max() / present.size
+    site = int(np.argmax(shares))
+    passed = shares[site] < _ZEROED_SHARE or float(np.median(shares)) > _ORDINARY_SHARE
+    direction, target = np.unravel_index(site, deviations["deviation"].shape[1:])
+    return Check(
+        "zeroed_cycles",
+        float(shares[site]),
+        _ZEROED_SHARE,
+        passed,
+        "No reading is the same in every cycle."
+        if passed
+        else f"Target {deviations['target'].values[target]} in {deviations['direction'].values[direction]} approach reads the same in "
+        f"{100.0 * shares[site]:.0f} % of the cycles: the laser was set to zero there each time, so that a shift of all targets is lost.",
+        ""
+        if passed
+        else "Zero the laser once, at the start of the test; from this one only what happens along the axis can be concluded.",
+        "the common drift, table_offset, and every cause that shifts all targets alike",
     )

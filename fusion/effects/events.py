@@ -89,12 +89,12 @@ def _close_periods(readings: Readings, chosen_min: float) -> Array:
 
 STEP_EVENT = Effect(
     name="step_event",
-    physics="A mount, clamp or optic slips once: all readings after that instant are shifted.",
+    physics="A mount, clamp or optic slips once, or the laser gets a new zero: all readings after that instant are shifted.",
     source="level shift at one instant",
     candidates=_step_event,
     repeats=True,
     label="sudden step",
-    remedy="Look at the clamping of optics and laser head, and at what happened at that time.",
+    remedy="Ask whether the laser was zeroed or its beam broken at that time; if not, look at the clamping of optics and laser head.",
 )
 PERIODIC_DISTURBANCE = Effect(
     name="periodic_disturbance",

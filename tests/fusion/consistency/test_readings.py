@@ -120,3 +120,30 @@ def test_only_what_lies_far_beyond_the_scatter_of_its_own_position_is_an_error_o
     found = find_gross_readings(xr.DataArray(values, dims=("cycle", "direction", "target")))
     # 30 standard deviations of an ordinary reading are 7.5 of that position.
     assert np.argwhere(found.values).tolist() == [[5, 0, 0], [7, 1, 1]]
+
+
+@pytest.mark.parametrize("first", [4, 20, 37])
+@pytest.mark.parametrize("size_um", [-20.0, 500.0])
+def test_a_new_datum_is_named_with_its_cycle_and_size(first: int, size_um: float) -> None:
+    deviations = sound()
+    deviations["deviation"][first:] += size_um
+    check = failed(deviations)["datum"]
+    assert check.evidence.startswith(f"From cycle {first + 1} on all targets read {np.sign(size_um):+.0f}"[:-1])
+    assert "two campaigns" in check.remedy and "clamping" in check.remedy
+
+
+def test_a_jump_of_some_targets_or_a_small_slip_is_no_new_datum() -> None:
+    some, small = sound(), sound()
+    some["deviation"][20:, :, 6:] += 20.0
+    small["deviation"][20:] += 3.0
+    assert not failed(some) and not failed(small)
+
+
+def test_a_laser_that_is_zeroed_in_every_cycle_is_named() -> None:
+    deviations = sound()
+    zeroed = deviations["deviation"] - deviations["deviation"].isel(direction=0, target=0, drop=True)
+    check = failed(deviations.assign(deviation=zeroed))["zeroed_cycles"]
+    assert "Target 1 in positive approach" in check.evidence
+    # Coarse digits make every reading repeat; that says nothing of the zero.
+    coarse = deviations["deviation"].copy(data=10.0 * np.round(deviations["deviation"].values / 10.0))
+    assert "zeroed_cycles" not in failed(deviations.assign(deviation=coarse))
