@@ -176,7 +176,8 @@ def reduce_block(
         mean = MeanTemperature(1, temperature, np.zeros_like(temperature), np.zeros_like(temperature))
     else:
         mean = mean_temperature(statistics, parameters, used=weights.used)
-        varying = (mean.bound_K > AVERAGING_LIMIT_K) & weights.used
+        # Also where there is no bound: a pixel without a temperature in one of the frames.
+        varying = ~(mean.bound_K <= AVERAGING_LIMIT_K) & weights.used
         if varying.any():
             _calibrate_per_frame(mean, varying, frames, parameters, weights.window)
     cells = weights.resample(mean.mean)
@@ -190,16 +191,22 @@ def _calibrate_per_frame(
     parameters: CameraParameters,
     window: tuple[slice, slice],
 ) -> None:
-    """Replace mean and variance of the varying pixels by those of their calibrated frames, which are read a second time."""
+    """Replace mean and variance of the varying pixels by those of their calibrated frames, which are read a second time.
+
+    A frame in which a pixel has no temperature takes no part in that pixel.
+    """
     pixels = int(varying.sum())
-    total, squares = np.zeros(pixels), np.zeros(pixels)
-    reference = mean.mean[varying]
+    total, squares, count = np.zeros(pixels), np.zeros(pixels), np.zeros(pixels)
+    reference = np.nan_to_num(mean.mean[varying])
     buffer = np.empty((min(CHUNK_FRAMES, len(frames)), *varying.shape), np.uint16)
     with WindowReader(window) as reader:
         for start in range(0, len(frames), CHUNK_FRAMES):
             counts = reader.read(frames[start : start + CHUNK_FRAMES], buffer)
             deviation = calibrate(counts[:, varying], parameters).astype(float) - reference
-            total += deviation.sum(axis=0)
-            squares += (deviation**2).sum(axis=0)
-    mean.mean[varying] = reference + total / len(frames)
-    mean.variance[varying] = np.maximum(squares / len(frames) - (total / len(frames)) ** 2, 0.0)
+            total += np.nansum(deviation, axis=0)
+            squares += np.nansum(deviation**2, axis=0)
+            count += np.isfinite(deviation).sum(axis=0)
+    with np.errstate(invalid="ignore"):
+        offset = total / count
+        mean.variance[varying] = np.maximum(squares / count - offset**2, 0.0)
+    mean.mean[varying] = reference + offset

@@ -155,7 +155,7 @@ class CyclePart:
         sample = pixels.frames / (pixels.frames - 1) if pixels.frames > 1 else np.nan
         self.spread = np.sqrt(weights.average(pixels.variance) * sample)
         self.noise_variance = weights.noise_factor * noise_of_differences(pixels.mean, weights.interior) ** 2
-        varying = pixels.bound_K > AVERAGING_LIMIT_K
+        varying = ~(pixels.bound_K <= AVERAGING_LIMIT_K)
         self.fell_back = (
             weights.average(varying.astype(float)) > 0 if varying.any() else np.zeros(self.mean.shape, bool)
         )

@@ -73,9 +73,22 @@ class PlanWeights:
         return self._on_plan(variance)
 
     def resample(self, values: Array) -> Array:
-        """Average window pixels, (row, column), over every cell and move partly seen cells to their centre; (y, x), NaN where unseen."""
+        """Average window pixels, (row, column), over every cell and move partly seen cells to their centre; (y, x), NaN where unseen.
+
+        A pixel without a value takes no part, as long as half of its cell has values.
+        """
         cells = self.areas @ values.ravel()
+        if np.isnan(cells).any():
+            cells = self._without_missing(values.ravel())
         return self._on_plan(cells + self.centring @ cells)
+
+    def _without_missing(self, pixels: Array) -> Array:
+        """Average over every cell of the pixels that have a value; NaN where they cover less than half of it."""
+        present = np.isfinite(pixels)
+        share = self.areas @ present.astype(float)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean: Array = np.where(share >= LEAST_COVERAGE, self.areas @ np.where(present, pixels, 0.0) / share, np.nan)
+        return mean
 
     def average(self, values: Array) -> Array:
         """As `resample`, by area alone: for quantities that must not be extrapolated (variances)."""

@@ -228,7 +228,7 @@ class MeanTemperature:
     frames : int
         Number of frames.
     mean : ndarray of float64
-        Mean temperature, degC; NaN where a count was below that of any temperature.
+        Mean temperature, degC, over the frames in which the pixel had one; NaN where a count was below that of any temperature in all.
     variance : ndarray of float64
         Mean squared deviation from the mean (divided by the number of frames), K^2.
     bound_K : ndarray of float64
@@ -249,12 +249,14 @@ class MeanTemperature:
         frames = self.frames + other.frames
         difference = other.mean - self.mean
         share = other.frames / frames
-        return MeanTemperature(
-            frames,
-            self.mean + difference * share,
-            (1 - share) * self.variance + share * other.variance + share * (1 - share) * difference**2,
-            np.maximum(self.bound_K, other.bound_K),
-        )
+        mean = self.mean + difference * share
+        variance = (1 - share) * self.variance + share * other.variance + share * (1 - share) * difference**2
+        if np.isnan(mean.sum()):
+            # A pixel without a temperature in one of both sets keeps that of the other.
+            for lost, kept in ((self, other), (other, self)):
+                replaced = np.isnan(lost.mean)
+                mean[replaced], variance[replaced] = kept.mean[replaced], kept.variance[replaced]
+        return MeanTemperature(frames, mean, variance, np.maximum(self.bound_K, other.bound_K))
 
 
 def mean_temperature(
