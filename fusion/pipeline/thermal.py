@@ -24,7 +24,7 @@ from thermography.io.openexr import write_maps
 from thermography.radiometry.camera_artefacts import DEAD, NOISY, OFFSET, find_bad_pixels
 from thermography.radiometry.overrides import Overrides
 from thermography.radiometry.planck import calibrate
-from thermography.registration.clock_offset import estimate_clock_offset
+from thermography.registration.clock_offset import ClockOffset, estimate_clock_offset
 from thermography.registration.register import Registration, register
 
 #: Number of first frames whose mean is registered: the noise falls, and the table has hardly warmed.
@@ -130,7 +130,28 @@ def _reduce_on_clock(
     report("clock offset", 1, 1)
     # Frames belong to cycles by the laser's clock, so they are sorted into them again.
     fields = _reduce(camera, registration, override, clock.offset_s, checkpoint=checkpoint, **how)
-    return fields, {"value": clock.offset_s, "u": clock.offset_u_s}, []
+    return fields, {"value": clock.offset_s, "u": clock.offset_u_s}, clock_notices(clock)
+
+
+def clock_notices(clock: ClockOffset) -> list[Notice]:
+    """Return a notice where the offset of the clocks is one of several that a periodic test shows.
+
+    Parameters
+    ----------
+    clock : ClockOffset
+        Estimated from the motion of the table.
+    """
+    if not clock.rivals_s:
+        return []
+    others = listed(f"{offset:.1f} s" for offset in clock.rivals_s)
+    return [
+        Notice(
+            "clock_offset_periodic",
+            f"The motion repeats: clock offsets of {others} fit about as well as {clock.offset_s:.1f} s, which is the smallest and was "
+            "taken as an assumption.",
+            "Write thermography.clock_offset if the clocks may be further apart, or film from before the first reading to after the last.",
+        )
+    ]
 
 
 _ASSUMED_CLOCK = Notice(

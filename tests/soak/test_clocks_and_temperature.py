@@ -11,6 +11,7 @@ import xarray as xr
 
 from fusion.alignment.align import AxisGeometry, align
 from fusion.alignment.readings import read_fused
+from fusion.consistency.camera_stamps import check_phase
 from fusion.consistency.checks import Check
 from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_material_clock
 from fusion.consistency.field_series import thin_fields
@@ -70,9 +71,9 @@ def of_logs(test: Recorded, *, stated: bool) -> list[Check]:
 
 
 def of_camera(test: Recorded) -> list[Check]:
-    """The check of the camera's clock by the drift."""
+    """The checks of the camera's clock by the drift and by the motion of the axis."""
     fused = align(test.deviations, test.fields, test.axis)
-    return check_camera_clock(read_fused(fused))
+    return check_camera_clock(read_fused(fused)) + check_phase(test.fields["time"].values, test.deviations)
 
 
 def test_sound_campaigns_are_not_doubted(capsys: pytest.CaptureFixture[str]) -> None:
@@ -100,14 +101,26 @@ def test_late_clocks(minutes: float, capsys: pytest.CaptureFixture[str]) -> None
         logs = replace(test, environment=late(test.environment, minutes), drivers=late(test.drivers, minutes))
         checks = of_logs(logs, stated=False) + of_camera(replace(test, fields=late(test.fields, minutes)))
         for check in checks:
-            if check.code.endswith("_clock"):
+            if check.code.endswith("_clock") or check.code == "camera_phase":
                 possible[check.code] += 1
                 noticed[check.code] += not check.passed
-                errors += [] if check.passed else [check.value - minutes]
+                errors += [check.value - minutes] if check.code.endswith("_clock") and not check.passed else []
     with capsys.disabled():
         told = ", ".join(f"{code} {rate(noticed[code], possible[code])}" for code in sorted(possible))
         middle = f"{np.median(np.abs(errors)):.0f} min" if errors else "-"
         print(f"\n{minutes:+.0f} min: {told}; median error of the shift {middle}")
+
+
+@pytest.mark.parametrize("gain_s_per_h", [3.0, 6.0, 10.0, 60.0, 600.0])
+def test_clock_rates(gain_s_per_h: float, capsys: pytest.CaptureFixture[str]) -> None:
+    runs, noticed = campaigns(40), 0
+    for seed in range(first_seed(55000), first_seed(55000) + runs):
+        test = record(Recipe().vary(campaign={"seed": seed}))
+        true = test.fields["time"].values
+        gained = (true - true[0]) * (gain_s_per_h / 3600.0)
+        noticed += not check_phase(true + gained, test.deviations)[0].passed
+    with capsys.disabled():
+        print(f"\ncamera clock gains {gain_s_per_h:g} s/h over 4.2 h: noticed {rate(noticed, runs)}")
 
 
 @pytest.mark.parametrize("emissivity", [0.50, 0.80, 0.85, 0.88, 0.90, 0.92, 0.94, 1.0])

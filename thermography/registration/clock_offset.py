@@ -1,8 +1,9 @@
 """Offset of the camera's clock against the machine's: the observed motion of the table fitted to its commanded motion.
 
 The commanded motion follows from the readings of a positioning test (time and target position) and the feed between them. A coarse
-search finds the offset whose misfit is smallest and refuses ambiguous ones; least squares then fit offset, zero of the observed
-position, feed and clock rate; the uncertainty is the largest of several estimates, because each of them fails in some campaigns.
+search finds the offset whose misfit is smallest, of several alike the one nearest to what is expected; least squares then fit offset,
+zero of the observed position, feed and clock rate; the uncertainty is the largest of several estimates, because each of them fails in
+some campaigns.
 """
 
 from __future__ import annotations
@@ -40,6 +41,8 @@ _GRID_MM = 1.0
 _PROFILE_S, _PROFILE_STEPS = 4.0, 30
 #: Feeds tried, as multiples of the median feed that the readings require at least.
 _FEEDS = np.geomspace(1.0, 20.0, 40)
+#: Feeds are fitted from this one on, mm/s.
+_LEAST_FEED_MM_S = 1e-3
 #: Slowest feed, mm/s: the table arrives at the very time of the next reading.
 _SLOWEST_MM_S = 1e-9
 
@@ -66,6 +69,8 @@ class ClockOffset:
         Root mean square of observed minus commanded position.
     frames : int
         Number of frames used.
+    rivals_s : tuple of float, s
+        Other offsets that the motion fits about equally well: a periodic test, of which the offset nearest to the expected one was taken.
     """
 
     offset_s: float
@@ -76,6 +81,7 @@ class ClockOffset:
     feed_mm_per_min: float
     rms_mm: float
     frames: int
+    rivals_s: tuple[float, ...] = ()
 
 
 def estimate_clock_offset(
@@ -119,7 +125,8 @@ def estimate_clock_offset(
     Raises
     ------
     ClockError
-        The table is not observed to travel, too few frames overlap with the readings, or two offsets fit about equally well.
+        The table is not observed to travel, too few frames overlap with the readings, or two offsets fit about equally well of which none
+        lies within half a period of the expected one.
 
     Notes
     -----
@@ -135,7 +142,8 @@ def estimate_clock_offset(
     _check_travel(table[located], np.nan_to_num(table_u[located], nan=1.0), target[order])
     feed = None if feed_mm_per_min is None else feed_mm_per_min / 60
     motion = _Motion(frame_s[located], table[located], reading_s[order], target[order], feed, reading_phase)
-    best, u = _fit(motion, _search(motion, expected_s, search_s))
+    coarse_s, rivals_s = _search(motion, expected_s, search_s)
+    best, u = _fit(motion, coarse_s)
     residual = motion.residual(best)
     inside = np.isfinite(residual)
     return ClockOffset(
@@ -147,6 +155,7 @@ def estimate_clock_offset(
         feed_mm_per_min=float(60 * best[2]),
         rms_mm=float(np.sqrt(np.mean(residual[inside] ** 2))),
         frames=int(inside.sum()),
+        rivals_s=rivals_s,
     )
 
 
@@ -286,7 +295,7 @@ class _Motion:
         def residuals(values: Array) -> Array:
             parameters = start.copy()
             parameters[free] = values * scale[free]
-            parameters[2] = max(parameters[2], 1e-3)
+            parameters[2] = max(parameters[2], _LEAST_FEED_MM_S)
             return np.nan_to_num(self.residual(parameters), nan=0.0)
 
         solution = least_squares(
@@ -300,11 +309,12 @@ class _Motion:
         )
         best = start.copy()
         best[free] = solution.x * scale[free]
+        best[2] = max(best[2], _LEAST_FEED_MM_S)
         return best
 
 
-def _search(motion: _Motion, expected_s: float, search_s: float) -> float:
-    """Offset of the smallest misfit on a grid, s; refused where another one fits about equally well."""
+def _search(motion: _Motion, expected_s: float, search_s: float) -> tuple[float, tuple[float, ...]]:
+    """Offset of the smallest misfit on a grid, s, and others that fit as well; of several alike the nearest to the expected one."""
     # Until the feed is known, the table is taken to move all the time between readings: wrong by less than _FAR_MM.
     feed = motion.feed_mm_s if motion.feed_mm_s is not None else _SLOWEST_MM_S
     offsets = expected_s + np.arange(-search_s, search_s + _SEARCH_STEP_S / 2, _SEARCH_STEP_S)
@@ -321,13 +331,15 @@ def _search(motion: _Motion, expected_s: float, search_s: float) -> float:
     similar = misfits < _AMBIGUITY * misfits[best] + 0.02 * _FAR_MM
     undecided = (misfits - misfits[best]) * len(motion.table_mm) < _DECIDING_FRAMES * _FAR_MM
     rivals = np.flatnonzero(apart & minimum & similar & undecided)
-    if rivals.size:
-        named = ", ".join(f"{offsets[i]:.1f}" for i in rivals[:4])
+    alike = np.sort(offsets[np.append(rivals, best)])
+    nearest = float(alike[np.argmin(np.abs(alike - expected_s))])
+    if alike.size > 1 and abs(nearest - expected_s) > 0.5 * float(np.diff(alike).min()):
+        named = ", ".join(f"{offset:.1f}" for offset in alike[:5])
         raise ClockError(
-            f"the motion fits clock offsets of {offsets[best]:.1f} s and {named} s about equally well (a periodic test); give "
-            "clock_offset, or frames from before the first reading to after the last"
+            f"the motion fits clock offsets of {named} s about equally well (a periodic test), none of them within half a period of the "
+            f"expected {expected_s:g} s; give clock_offset, or frames from before the first reading to after the last"
         )
-    return float(offsets[best])
+    return nearest, tuple(float(offset) for offset in alike if offset != nearest)
 
 
 def _search_misfit(motion: _Motion, offset: float, feed_mm_s: float) -> float:

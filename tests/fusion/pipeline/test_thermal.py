@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,11 @@ from compliance_checker.runner import CheckSuite
 
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import read_source
-from fusion.pipeline.thermal import pixel_notices, reduce_thermography
+from fusion.pipeline.thermal import clock_notices, pixel_notices, reduce_thermography
 from fusion.products.progress import silent
 from fusion.products.store import read_dataset
 from fusion.twin.instruments import simulate_campaign
+from thermography.registration.clock_offset import ClockOffset
 
 
 def test_bad_pixels_are_counted_by_kind(rng: np.random.Generator) -> None:
@@ -28,6 +30,16 @@ def test_bad_pixels_are_counted_by_kind(rng: np.random.Generator) -> None:
     assert notice.message.startswith("3 pixels do not follow their neighbours (1 dead, ")
     assert "off its neighbours" in notice.message
     assert notice.message.endswith("1 noisy); they are included in the cell averages.")
+
+
+def test_the_offset_of_a_periodic_test_is_said_as_an_assumption() -> None:
+    clock = ClockOffset(37.0, 0.1, 0.0, 0.0, 0.0, 300.0, 0.1, 60)
+    assert clock_notices(clock) == []
+    (notice,) = clock_notices(replace(clock, rivals_s=(-215.0, 289.0)))
+    assert notice.code == "clock_offset_periodic"
+    assert notice.message.startswith(
+        "The motion repeats: clock offsets of -215.0 s; 289.0 s fit about as well as 37.0 s"
+    )
 
 
 def test_fields_pass_the_cf_checker(results_folder: Path) -> None:

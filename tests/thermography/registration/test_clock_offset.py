@@ -64,15 +64,34 @@ def test_a_still_table_determines_nothing(rng):
         estimate_clock_offset(frames, rng.normal(0, 0.1, seen.size), u, readings, targets)
 
 
-def test_a_periodic_test_filmed_from_long_before_to_long_after_is_ambiguous(rng):
-    """Nobody knows what the table did outside the readings, so that any whole cycle fits as well."""
+def filmed_from_long_before_to_long_after() -> tuple[tuple, float]:
+    """Arguments of a periodic test of which the middle half was measured, and its period, s."""
     reading_s, reading_mm, way_s, way_mm = positioning_test(12)
     middle = (reading_s >= way_s[3 * 64]) & (reading_s < way_s[9 * 64])
     frame_s = np.arange(0, way_s[-1], 10.0)
     seen = np.interp(frame_s, way_s, way_mm)
     stamps = [T0 + (1e9 * s).astype("m8[ns]") for s in (frame_s, reading_s[middle])]
-    with pytest.raises(ClockError, match=r"fits clock offsets of .* s and .* s about equally well \(a periodic test\)"):
-        estimate_clock_offset(stamps[0], seen, np.full(seen.size, 0.1), stamps[1], reading_mm[middle])
+    return (stamps[0], seen, np.full(seen.size, 0.1), stamps[1], reading_mm[middle]), float(way_s[64] - way_s[0])
+
+
+def test_of_the_offsets_of_a_periodic_test_the_smallest_is_taken_and_the_others_are_named():
+    """Nobody knows what the table did outside the readings, so that any whole cycle fits as well."""
+    arguments, period_s = filmed_from_long_before_to_long_after()
+    found = estimate_clock_offset(*arguments)
+    assert found.offset_s == pytest.approx(0.0, abs=0.2)
+    assert found.rivals_s
+    # The search goes in steps of 0.5 s.
+    cycles = np.array(found.rivals_s) / period_s
+    np.testing.assert_allclose(cycles, np.round(cycles), atol=1.0 / period_s)
+    assert estimate_clock_offset(*campaign(np.random.default_rng(1), cycles=3)).rivals_s == ()
+
+
+def test_offsets_of_a_periodic_test_that_are_all_far_from_the_expected_one_are_refused():
+    arguments, period_s = filmed_from_long_before_to_long_after()
+    with pytest.raises(
+        ClockError, match=r"fits clock offsets of .* s about equally well \(a periodic test\), none of them within half"
+    ):
+        estimate_clock_offset(*arguments, expected_s=-800.0 - period_s, search_s=820.0 + period_s)
 
 
 def test_another_time_zone_is_refused(rng):
