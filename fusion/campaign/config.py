@@ -16,6 +16,8 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    NonNegativeInt,
+    PositiveInt,
     ValidationError,
     ValidationInfo,
     WithJsonSchema,
@@ -192,6 +194,10 @@ class CampaignTable(_Table):
     time_zone: TimeZone | None = None
 
 
+#: First column and row, number of columns and rows.
+PixelPatch = tuple[NonNegativeInt, NonNegativeInt, PositiveInt, PositiveInt]
+
+
 class ThermographyTable(_Table):
     """``[thermography]``: the frames, and the camera parameters that override the stored ones."""
 
@@ -203,6 +209,7 @@ class ThermographyTable(_Table):
     object_distance_m: Metres | None = Field(default=None, alias="object_distance")
     clock_offset_s: Seconds | None = Field(default=None, alias="clock_offset")
     table: Literal["still", "moving"] = "still"
+    reference_patch_px: PixelPatch | None = Field(default=None, alias="reference_patch")
 
 
 class AxisTable(_Table):

@@ -217,6 +217,7 @@ def _notices(source: Source) -> list[Notice]:
     """Return a notice for everything that is left out of the input or missing from it."""
     notices = [*frames_notices(source.frames_rejected), *_remark_notices(source.frames)]
     _raise_if_too_small(source)
+    _raise_if_patch_outside(source)
     _raise_if_clocks_disagree(
         source.deviations,
         source.frame_times,
@@ -254,6 +255,20 @@ def _raise_if_too_small(source: Source) -> None:
         raise SourceError(
             f"{source.campaign.path}: {counted(len(source.frames), 'usable frame')}, at least {_LEAST_FRAMES} are needed "
             f"({reasons}); check thermography.frames"
+        )
+
+
+def _raise_if_patch_outside(source: Source) -> None:
+    """Raise if the reference patch leaves the frames."""
+    patch = source.thermography.reference_patch_px
+    if patch is None:
+        return
+    column, row, columns, rows = patch
+    height, width = source.frames[0].shape
+    if column + columns > width or row + rows > height:
+        raise SourceError(
+            f"{source.campaign.path}: thermography.reference_patch = {list(patch)}: leaves the frames of {width} x {height} pixels; "
+            "write first column, first row, number of columns and of rows"
         )
 
 

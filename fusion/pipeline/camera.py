@@ -24,6 +24,7 @@ from thermography.radiometry.camera_correction import (
     CameraCorrection,
     LevelSeries,
     estimate_correction,
+    hold_constant,
     room_temperatures,
 )
 from thermography.radiometry.overrides import Overrides
@@ -131,7 +132,14 @@ def survey_campaign(source: Source, override: Overrides, *, report: Report) -> S
         report("camera check", done, total)
 
     report("camera check", 0, total)
-    survey = survey_frames(source.frames, override, still=source.thermography.table == "still", progress=count)
+    patch = source.thermography.reference_patch_px
+    survey = survey_frames(
+        source.frames,
+        override,
+        still=source.thermography.table == "still",
+        patch=None if patch is None else (slice(patch[1], patch[1] + patch[3]), slice(patch[0], patch[0] + patch[2])),
+        progress=count,
+    )
     if not survey.frames:
         raise ThermographyError(
             f"the pixels of all {total} frames are damaged ({survey.damaged[0].reason}); copy the files again from the camera"
@@ -189,7 +197,11 @@ def examine_camera(source: Source, survey: Survey, registration: Registration) -
         part |= {"drift_K": 0.0, "largest_correction_K": 0.0, "largest_u_K": None}
         return CameraState(usable, None, np.zeros(len(frames)), part, [*notices, _NOTHING_BESIDE])
     background, table, spread = levels
-    correction = estimate_correction(_series(usable, background, table))
+    if survey.patch is not None:
+        background = survey.patch[kept]
+        correction = hold_constant(background)
+    else:
+        correction = estimate_correction(_series(usable, background, table))
     # The camera errs in counts: by less kelvin where the table is warmer than what lies beside it.
     parameters = frames[0].parameters
     at_table = signal_slope(table + ZERO_CELSIUS_K, parameters)
@@ -305,7 +317,8 @@ def _correction_notices(correction: CameraCorrection, frames: Sequence[FrameRefe
         notices.append(
             Notice(
                 "camera_drift_corrected",
-                f"A drift of the camera's zero with the temperature of its housing of {np.ptp(correction.drift_K):.2f} K was taken out.",
+                f"A drift of the camera's zero of {np.ptp(correction.drift_K):.2f} K, as the reference patch or the temperature of the "
+                "housing shows it, was taken out.",
                 "Switch the camera on an hour before the test.",
             )
         )

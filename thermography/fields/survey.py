@@ -52,6 +52,8 @@ class Survey:
         Mean temperature of every block of pixels.
     edge_px : int, px
         Side of a block.
+    patch : (n,) ndarray, degC, or None
+        Mean temperature of the patch; None where none was asked for.
     repeated : (n,) ndarray of bool
         True where all counts equal those of the previous frame.
     outside : (n,) ndarray of int
@@ -65,6 +67,7 @@ class Survey:
     frames: list[FrameReference]
     levels: NDArray[np.float32]
     edge_px: int
+    patch: Array | None
     repeated: NDArray[np.bool_]
     outside: NDArray[np.int64]
     off: dict[int, NDArray[np.int64]]
@@ -76,6 +79,7 @@ def survey_frames(
     override: Callable[[FrameReference], CameraParameters] = lambda frame: frame.parameters,
     *,
     still: bool = True,
+    patch: tuple[slice, slice] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Survey:
     """Read every frame of a series once.
@@ -88,6 +92,8 @@ def survey_frames(
         From a frame reference to the camera parameters to calibrate the frame with; by default the frame's own.
     still : bool
         Whether the scene stands still, so that pixels can be compared with the frames before and after.
+    patch : tuple of slice, or None
+        Rows and columns of pixels whose mean is wanted.
     progress : callable or None
         Called with the number of frames done since the last call.
 
@@ -99,7 +105,7 @@ def survey_frames(
     edge_px = max(columns // _BLOCKS_ACROSS, 1)
     frames: list[FrameReference] = []
     damaged: list[RejectedFrame] = []
-    levels, repeated, outside = [], [], []
+    levels, patches, repeated, outside = [], [], [], []
     neighbours = _Neighbours(edge_px)
     previous: NDArray[np.uint16] | None = None
     for reference, counts in _read(references):
@@ -109,7 +115,10 @@ def survey_frames(
             damaged.append(RejectedFrame(reference.path, reference.index, counts))
             continue
         frames.append(reference)
-        levels.append(temperature_from_counts(_block_means(counts, edge_px), override(reference)).astype(np.float32))
+        parameters = override(reference)
+        levels.append(temperature_from_counts(_block_means(counts, edge_px), parameters).astype(np.float32))
+        if patch is not None:
+            patches.append(float(temperature_from_counts(counts[patch].mean(), parameters)))
         repeated.append(previous is not None and np.array_equal(counts, previous))
         outside.append(_outside(counts, reference))
         if still and not repeated[-1]:
@@ -120,6 +129,7 @@ def survey_frames(
         frames=frames,
         levels=np.array(levels, np.float32).reshape(len(frames), rows // edge_px, columns // edge_px),
         edge_px=edge_px,
+        patch=None if patch is None else np.array(patches),
         repeated=np.array(repeated, bool),
         outside=np.array(outside, np.int64),
         off=neighbours.off,

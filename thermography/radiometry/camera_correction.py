@@ -193,6 +193,39 @@ def estimate_correction(series: LevelSeries) -> CameraCorrection:
     return CameraCorrection(correction + 0.0, u_K, steps, full(drift), full(unexplained))
 
 
+def hold_constant(level: Array) -> CameraCorrection:
+    """Correct the camera so that a surface of constant temperature stays constant.
+
+    Parameters
+    ----------
+    level : (n,) ndarray, degC
+        Level of the surface in n frames.
+
+    Returns
+    -------
+    CameraCorrection
+        Every change of the level, as drift, where it is more than the scatter from frame to frame.
+
+    Notes
+    -----
+    Half the mean squared successive difference s2 is the variance of the scatter, and its ratio to the variance tells whether the level
+    changes besides: it is normal with mean 1 and variance (n - 2) / (n^2 - 1) where it does not (J. von Neumann, Ann. Math. Stat. 12
+    (1941) 367-395). The correction of a frame relative to the first has twice the variance s2, taken from the median difference, which
+    steps do not raise.
+    """
+    n, change = len(level), level - level[0]
+    nothing = np.zeros(n)
+    if n < _LEAST_FRAMES or not change.any():
+        return CameraCorrection(nothing, nothing, (), nothing, change)
+    ratio = float(np.mean(np.diff(level) ** 2) / 2.0 / np.var(level, ddof=1))
+    limit = 1.0 + stats.norm.ppf(_SIGNIFICANCE) * np.sqrt((n - 2) / (n**2 - 1))
+    scatter = MAD_TO_SIGMA * float(np.median(np.abs(np.diff(level))))
+    u_K = np.where(np.arange(n) == 0, 0.0, scatter)
+    if ratio >= limit:
+        return CameraCorrection(nothing, nothing, (), nothing, nothing)
+    return CameraCorrection(-change, u_K, (), change, nothing)
+
+
 @dataclass(frozen=True, eq=False)
 class _Fit:
     """Generalised least squares on the changes of the level.

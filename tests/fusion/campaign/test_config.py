@@ -103,7 +103,7 @@ def test_a_record_stands_instead_of_the_instruments(folder: Path) -> None:
 BAD = [
     ("emissivity", "emisivity",
      ", line 7: unknown key thermography.emisivity; did you mean emissivity? known here: atmospheric_temperature, clock_offset, "
-     "emissivity, frames, object_distance, reflected_temperature, relative_humidity, table"),
+     "emissivity, frames, object_distance, reference_patch, reflected_temperature, relative_humidity, table"),
     ('"5 mm"', "5", ', line 15: plan.cell_size = 5: a length needs its unit in the value; write for example "5 mm"'),
     ('"5 mm"', '"5"', ', line 15: plan.cell_size = "5": a length needs its unit in the value; write for example "5 mm"'),
     ('"5 mm"', '"five mm"',

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fusion.campaign.config import load_campaign
-from fusion.campaign.inputs import read_source
+from fusion.campaign.inputs import SourceError, read_source
 from fusion.pipeline.camera import camera_corrected
 from fusion.pipeline.thermal import reduce_thermography
 from fusion.products.progress import silent
@@ -24,9 +24,10 @@ from thermography.io.flir import index_frames
 CYCLES = 24
 
 
-def _campaign(folder: Path, **camera: float) -> tuple[Truth, Path]:
+def _campaign(folder: Path, *, room: dict[str, float] | None = None, **camera: float) -> tuple[Truth, Path]:
     small = {"columns": 320, "rows": 240, "focal_px": 765.0, "file": "seq", **camera}
-    truth = simulate(Recipe().vary(campaign={"seed": 8}, test={"cycles": CYCLES, "targets": 5}, camera=small))
+    test = {"cycles": CYCLES, "targets": 5}
+    truth = simulate(Recipe().vary(campaign={"seed": 8}, test=test, room=room or {}, camera=small))
     campaign = write_campaign(truth, folder)
     campaign.write_text(campaign.read_text().replace('cell_size = "5 mm"', 'cell_size = "20 mm"'))
     return truth, campaign
@@ -73,6 +74,22 @@ def test_steps_and_drift_are_taken_out_before_the_fields_are_made(tmp_path: Path
     assert np.sqrt(np.mean((error[1:] / fields["camera_correction_u"].values[1:]) ** 2)) < 3.0
     assert fields["camera_correction"].values == pytest.approx(-(planted - planted[0]) / 0.963, abs=0.12)
     assert fields["camera_correction_u"].values[0] == 0.0
+
+
+def test_a_reference_patch_carries_the_correction(tmp_path: Path) -> None:
+    """The wall of a room that keeps its temperature serves as the patch; no log of the air is needed."""
+    truth, campaign = _campaign(tmp_path / "campaign", room={"swing_K": 0.0, "trend_K_per_h": 0.0}, ffc_step_K=0.3)
+    text = campaign.read_text().replace('environment = "environment.csv"\n', "")
+    campaign.write_text(text.replace("[thermography]\n", "[thermography]\nreference_patch = [10, 10, 60, 20]\n"))
+    outcome = _reduce(campaign)
+    planted = truth.frames["camera_offset_K"].values
+    # The room still wanders by some hundredths of a kelvin.
+    assert outcome.dataset["camera_correction"].values == pytest.approx(-(planted - planted[0]) / 0.963, abs=0.15)
+    campaign.write_text(campaign.read_text().replace("[10, 10, 60, 20]", "[300, 10, 60, 20]"))
+    with pytest.raises(
+        SourceError, match=r"reference_patch = \[300, 10, 60, 20\]: leaves the frames of 320 x 240 pixels"
+    ):
+        _reduce(campaign)
 
 
 def test_a_sound_camera_is_left_alone(sound: tuple[Truth, Path]) -> None:

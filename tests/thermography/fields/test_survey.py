@@ -48,7 +48,8 @@ def _disturbed(survey, registration) -> dict[int, str]:
 
 def test_levels_and_blocks(tmp_path: Path, image: np.ndarray, registration, rng: np.random.Generator) -> None:
     frames = _film(tmp_path / "a.seq", image, rng, lambda index, image: image + 0.1 * index)
-    survey = survey_frames(frames)
+    survey = survey_frames(frames, patch=(slice(10, 30), slice(20, 60)))
+    np.testing.assert_allclose(survey.patch, image[10:30, 20:60].mean() + 0.1 * np.arange(FRAMES), atol=0.01)
     edge = survey.edge_px
     rows, columns = survey.levels.shape[1:]
     expected = image[: rows * edge, : columns * edge].reshape(rows, edge, columns, edge).mean(axis=(1, 3))

@@ -7,7 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermography.radiometry.camera_correction import LevelSeries, estimate_correction, room_temperatures
+from thermography.radiometry.camera_correction import (
+    LevelSeries,
+    estimate_correction,
+    hold_constant,
+    room_temperatures,
+)
 
 FRAMES, INTERVAL_S = 60, 252.0
 
@@ -134,3 +139,21 @@ def test_walls_follow_the_air_by_their_lags() -> None:
     np.testing.assert_allclose(room[0], 20.0)
     np.testing.assert_allclose(room[1], [21.0, 21 - np.exp(-1), 21 - np.exp(-1 / 6)], atol=1e-9)
     assert room_temperatures(np.zeros(3), logged[:1], air[:1]).shape == (3, 0)
+
+
+def test_a_surface_of_constant_temperature_is_held_constant() -> None:
+    rng = np.random.default_rng(9)
+    offset = _steps(9, 0.3) + 0.002 * np.arange(FRAMES)
+    found = hold_constant(24.0 + offset + rng.normal(0, 0.004, FRAMES))
+    error = offset - offset[0] + found.correction_K
+    assert np.sqrt(np.mean(error[1:] ** 2)) < 0.01
+    # The first frame's scatter is common to all: about one draw of it, and steps raise the median difference a little.
+    assert np.sqrt(np.mean((error[1:] / found.u_K[1:]) ** 2)) < 2.0
+    assert found.u_K[0] == 0.0 and np.ptp(found.drift_K) == pytest.approx(np.ptp(offset), abs=0.03)
+
+
+def test_the_scatter_of_a_constant_surface_is_not_corrected() -> None:
+    rng = np.random.default_rng(10)
+    # At one per mille, 4 or more of 300 have a probability of 0.03 %.
+    assert sum(hold_constant(rng.normal(24.0, 0.004, FRAMES)).corrects for _ in range(300)) < 4
+    assert not hold_constant(np.full(FRAMES, 24.0)).corrects and not hold_constant(np.arange(3.0)).corrects
