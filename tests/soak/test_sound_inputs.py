@@ -10,6 +10,7 @@ import pytest
 
 from fusion.alignment.align import AxisGeometry, align
 from fusion.alignment.readings import read_fused
+from fusion.consistency.axis_line import compare_lines
 from fusion.consistency.coefficients import check_coefficients
 from fusion.consistency.logs import check_log
 from fusion.consistency.readings import check_readings
@@ -60,14 +61,17 @@ def test_sound_campaigns_are_not_doubted(capsys: pytest.CaptureFixture[str]) -> 
         truth = simulate(sound_recipe(seed))
         deviations, environment, drivers = deviations_of(truth), environment_log(truth), driver_log(truth)
         axis = AxisGeometry(tuple(truth.recipe.plan.origin_mm), tuple(truth.recipe.plan.direction))
-        fused = align(deviations, fields_of(truth), axis, environment=environment, drivers=drivers)
+        fields = fields_of(truth)
+        fused = align(deviations, fields, axis, environment=environment, drivers=drivers)
         result = close_loop(read_fused(fused), ["axis_expansion", "table_offset"])
+        line = compare_lines(result.after, len(result.declared), fields, axis)
+        loop = {**result.as_json(), "axis_line": None if line is None else line.as_json()}
         times = deviations["time"].values.ravel()
         checks = [
             *check_readings(deviations, plan_extent_mm=truth.recipe.plan.width_mm),
             *check_log(environment, times, name="environment", file="environment.csv", endangers=""),
             *check_log(drivers, times, name="drivers", file="drivers.csv", endangers=""),
-            *check_coefficients(result.as_json(), travel_mm=result.after.readings.span_mm),
+            *check_coefficients(loop, travel_mm=result.after.readings.span_mm),
         ]
         failed = [check for check in checks if not check.passed]
         doubted += bool(failed)
