@@ -82,6 +82,11 @@ class Source:
         return self.interferometry.material_temperature == "camera"
 
     @property
+    def is_recompensated(self) -> bool:
+        """Whether the environment log entered the readings: compensated again, or corrected for a dead path."""
+        return self.interferometry.compensation == "redo" or self.interferometry.dead_path_mm != 0.0
+
+    @property
     def grid(self) -> PlanGrid:
         """The plan's cells."""
         return PlanGrid(*self.plan.size_mm, self.plan.cell_size_mm)

@@ -9,6 +9,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from fusion.consistency.conditions import condition_of
 from fusion.errors import FusionError
 from fusion.products.results import Notice
 
@@ -82,9 +83,11 @@ class Check:
     endangers: str
     severity: Severity = Severity.DOUBT
 
-    def as_json(self) -> dict[str, object]:
-        """One entry of ``inputs.checks`` in results.json."""
-        return {name: value for name, value in vars(self).items() if name != "severity"}
+    def as_json(self, *, recompensated: bool = False) -> dict[str, object]:
+        """One entry of ``inputs.checks`` in results.json; `recompensated` as for `fusion.consistency.conditions.condition_of`."""
+        condition = condition_of(self.code, recompensated=recompensated)
+        entries = {name: value for name, value in vars(self).items() if name != "severity"}
+        return {**entries, "premise": condition.premise, "conditional": condition.figures}
 
 
 def refuse_contradictions(checks: Sequence[Check]) -> None:
@@ -118,7 +121,9 @@ def open_doubts(checks: Sequence[Check], accepted: Collection[str]) -> list[Chec
     return [check for check in checks if not check.passed and check.code not in accepted]
 
 
-def inputs_part(checks: Sequence[Check], accepted: Collection[str], *, corrected: bool = False) -> dict[str, object]:
+def inputs_part(
+    checks: Sequence[Check], accepted: Collection[str], *, corrected: bool = False, recompensated: bool = False
+) -> dict[str, object]:
     """The part ``inputs`` of results.json.
 
     Parameters
@@ -129,12 +134,14 @@ def inputs_part(checks: Sequence[Check], accepted: Collection[str], *, corrected
         Codes under ``[accept] doubts``.
     corrected : bool
         Whether inputs were corrected or left out before they were used.
+    recompensated : bool
+        Whether the readings were compensated with the environment log.
     """
     sound = "corrected" if corrected else "sound"
     return {
         "state": "doubted" if open_doubts(checks, accepted) else sound,
         "accepted": sorted(accepted),
-        "checks": [check.as_json() for check in checks],
+        "checks": [check.as_json(recompensated=recompensated) for check in checks],
     }
 
 

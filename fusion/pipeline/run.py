@@ -250,7 +250,9 @@ def _run_instruments(run: Run, source: Source, checks: Sequence[Check], *, sched
     thermal.write_exr(folder / "maps", fields, report=report)
     accepted = run.campaign.accept.doubts
     checks = [*checks, *check_fields(source, fields, fused), *check_loop(run.parts["loop"], source)]
-    run.parts["inputs"] = inputs_part(checks, accepted, corrected=camera_corrected(run.parts["camera"]))
+    run.parts["inputs"] = inputs_part(
+        checks, accepted, corrected=camera_corrected(run.parts["camera"]), recompensated=source.is_recompensated
+    )
     run.notices = [*doubt_notices(checks, accepted), *run.notices]
     return _finish(run, {"fields": fields, "deviations": deviations, "fusion": fusion})
 

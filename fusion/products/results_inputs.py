@@ -6,6 +6,10 @@ from typing import Literal
 
 from fusion.products.results_part import Number, ResultPart
 
+#: What a run concludes, by what it rests on: ``positions`` on the laser alone (deviations, drift, ISO 230-2 values, positions that stand
+#: out), ``field`` on the camera alone, ``attribution`` (which part of the field goes with the drift) and ``causes`` (the model) on both.
+Figures = Literal["positions", "field", "attribution", "causes"]
+
 
 class CheckPart(ResultPart):
     """One consistency check of the inputs."""
@@ -24,6 +28,10 @@ class CheckPart(ResultPart):
     """What to correct; empty where the check is passed."""
     endangers: str
     """Figures that are wrong if the doubt is right."""
+    premise: str
+    """What has to be right where the check is not passed, as it follows "only if"."""
+    conditional: tuple[Figures, ...]
+    """What holds only then."""
 
 
 class InputsPart(ResultPart):
@@ -40,3 +48,13 @@ class InputsPart(ResultPart):
     def doubts(self) -> tuple[CheckPart, ...]:
         """Checks that are not passed and not accepted."""
         return tuple(check for check in self.checks if not check.passed and check.code not in self.accepted)
+
+    def premises(self, *figures: Figures) -> tuple[str, ...]:
+        """Return what has to be right for some figures to hold; nothing where no doubt touches them.
+
+        Parameters
+        ----------
+        *figures : Figures
+            What is concluded.
+        """
+        return tuple(dict.fromkeys(check.premise for check in self.doubts if set(check.conditional) & set(figures)))

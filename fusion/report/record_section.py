@@ -98,6 +98,7 @@ def describe_record(results: Results, provenance: Mapping[str, Any], record: xr.
         "verdict": loop.verdict,
         "headline": verdict_headline(loop),
         "doubts": (),
+        "untouched": "",
         "sentences": [
             f"Measured: {len(channels)} displacements and {record.sizes['sensor']} temperatures over {duration(span_s)}"
             + (f", with {drivers} as driver." if drivers else "."),

@@ -14,6 +14,7 @@ from fusion.loop.axis import ASKED_LEVEL, ENTRY_LEVEL, SEARCH_LEVEL, SECOND_LEVE
 from fusion.products.grouped import group, has
 from fusion.products.results import Results
 from fusion.products.results_axis import NeighboursPart
+from fusion.products.results_inputs import Figures
 from fusion.products.results_loop import AxisLoop, Loop
 from fusion.products.results_part import Quantity
 from fusion.report.attribution_section import describe_correlation
@@ -28,6 +29,8 @@ from fusion.report.model_section import (
 )
 from fusion.report.tables import Table, Words, table
 from fusion.report.wording import (
+    condition,
+    conditional,
     conditional_headline,
     decimals_of,
     duration,
@@ -38,6 +41,7 @@ from fusion.report.wording import (
     number,
     p_value,
     quantity,
+    untouched,
     verdict_numbers,
 )
 from interferometry.figures import time_span
@@ -102,12 +106,14 @@ def describe_campaign(
     correlation = None if fused is None else describe_correlation(fused, results.correlation, joint)
     sentences = _sentences(results, deviations)
     if correlation is not None:
+        correlation["headline"] = conditional(correlation["headline"], results.inputs, "attribution")
         sentences.append(correlation["headline"])
     return {
         "subtitle": _subtitle(provenance, deviations),
         "verdict": results.loop.verdict if results.loop else "",
         "headline": conditional_headline(results),
         "doubts": results.inputs.doubts if results.inputs else (),
+        "untouched": untouched(results.inputs),
         "sentences": sentences,
         "numbers": _numbers(results, deviations, fields),
         "next": next_steps(results)[:6],
@@ -155,7 +161,9 @@ def _sentences(results: Results, deviations: xr.Dataset | None) -> list[str]:
     if results.loop is not None:
         sentences.append(verdict_numbers(results.loop))
     if results.anomalies is not None:
-        sentences.append(standing_out(results.anomalies))
+        local = any(anomaly.cause == "local_temperature" for anomaly in results.anomalies)
+        rests_on: tuple[Figures, ...] = ("positions", "field") if local else ("positions",)
+        sentences.append(conditional(standing_out(results.anomalies), results.inputs, *rests_on))
     return sentences
 
 
@@ -176,14 +184,18 @@ def _numbers(results: Results, deviations: xr.Dataset | None, fields: xr.Dataset
     if results.iso230 is not None:
         values = iso230_values(results.iso230)
         for symbol in _KEY_VALUES:
-            add(ISO230_TERMS[symbol], values[symbol], results.iso230.window)
+            add(
+                ISO230_TERMS[symbol],
+                values[symbol],
+                f"{results.iso230.window} {condition(results.inputs, 'positions')}".rstrip(),
+            )
     if fields is not None:
         rise = fields["temperature_rise"].isel(cycle=-1)
         u = float(fields["temperature_rise_u"].isel(cycle=-1).mean())
         add(
             "Rise of the table",
             measured(float(rise.mean()), u, "K"),
-            f"mean of the last cycle; warmest cell {number(float(rise.max()))} K",
+            f"mean of the last cycle; warmest cell {number(float(rise.max()))} K {condition(results.inputs, 'field')}".rstrip(),
         )
     if results.loop is not None:
         declared, floor = number(results.loop.rmse_declared_um, 2), number(results.loop.noise_floor_um, 2)

@@ -27,7 +27,18 @@ from fusion.report.findings import (
     scatter_range,
 )
 from fusion.report.tables import Words, print_table, table
-from fusion.report.wording import conditional_headline, duration, join, moment, number, p_value, print_unit
+from fusion.report.wording import (
+    condition,
+    conditional,
+    conditional_headline,
+    duration,
+    join,
+    moment,
+    number,
+    p_value,
+    print_unit,
+    untouched,
+)
 from interferometry import iso230
 from interferometry.inspection import describe_test
 from interferometry.io.readers import read_deviations, read_environment
@@ -61,12 +72,16 @@ def summary_rows(results: Results) -> list[tuple[str, str]]:
     rows: list[tuple[str, str]] = []
     if results.inputs is not None:
         doubts = [f"doubted: {check.evidence} {check.remedy}" for check in results.inputs.doubts]
-        rows.append(("inputs", "\n".join(doubts) or f"sound in {len(results.inputs.checks)} checks"))
+        lines = [line for line in (*doubts, untouched(results.inputs)) if line]
+        rows.append(("inputs", "\n".join(lines) or f"sound in {len(results.inputs.checks)} checks"))
     if results.registration is not None:
         rows.append(("registration", f"{number(results.registration.rms_mm, 2)} mm rms"))
     if results.iso230 is not None:
         values = iso230_values(results.iso230)
-        rows += [(f"{symbol} ({results.iso230.window})", values[symbol]) for symbol in ("A", "R", "B")]
+        where = condition(results.inputs, "positions")
+        rows += [
+            (f"{symbol} ({results.iso230.window})", f"{values[symbol]} {where}".rstrip()) for symbol in ("A", "R", "B")
+        ]
     if results.drift is not None:
         rows.append(("scatter per position", scatter_range(results.drift)))
     if results.anomalies is not None:
@@ -77,8 +92,19 @@ def summary_rows(results: Results) -> list[tuple[str, str]]:
         rows.append(("anomalies", "\n".join(named) or "none"))
     if results.correlation is not None:
         causes = randomised_causes(results.correlation)
-        shown = [f"cause by randomised duty: {join(causes)}"] if causes else []
-        rows.append(("drift and field", "\n".join([attribution_headline(results.correlation), *shown])))
+        shown = (
+            [f"cause by randomised duty: {join(causes)} {condition(results.inputs, 'causes')}".rstrip()]
+            if causes
+            else []
+        )
+        rows.append(
+            (
+                "drift and field",
+                "\n".join(
+                    [conditional(attribution_headline(results.correlation), results.inputs, "attribution"), *shown]
+                ),
+            )
+        )
     if results.loop is not None:
         rows += _loop_rows(results.loop, conditional_headline(results))
     return rows + [("warning", warning.message) for warning in results.warnings]

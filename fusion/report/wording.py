@@ -11,8 +11,15 @@ import numpy as np
 
 from fusion.effects.library import describe_effect
 from fusion.products.results import Results
+from fusion.products.results_inputs import Figures, InputsPart
 from fusion.products.results_loop import Loop, RecordLoop
 from fusion.products.results_part import Quantity
+
+_FIGURE_WORDS: dict[Figures, str] = {
+    "positions": "what the laser shows alone (deviations, drift, ISO 230-2 values, positions that stand out)",
+    "field": "what the camera shows alone (temperatures and their rise)",
+    "attribution": "which part of the field goes with the drift",
+}
 
 
 class EffectWords(NamedTuple):
@@ -226,11 +233,56 @@ def conditional_headline(results: Results) -> str:
         Results of a run.
     """
     headline = verdict_headline(results.loop) if results.loop else "Evaluated without a model of the drift."
-    doubts = results.inputs.doubts if results.inputs else ()
-    if not doubts:
-        return headline
-    noun = "the doubted input is" if len(doubts) == 1 else f"the {len(doubts)} doubted inputs are"
-    return f"Only if {noun} right: {headline[0].lower()}{headline[1:]}"
+    return conditional(headline, results.inputs, "causes")
+
+
+def conditional(sentence: str, inputs: InputsPart | None, *figures: Figures) -> str:
+    """Return a sentence with the conditions under which it holds.
+
+    Parameters
+    ----------
+    sentence : str
+        What is concluded.
+    inputs : InputsPart or None
+        The part ``inputs`` of the results.
+    *figures : Figures
+        What the sentence rests on.
+    """
+    premise = _premise(inputs, figures)
+    return f"Only if {premise}: {sentence[0].lower()}{sentence[1:]}" if premise else sentence
+
+
+def condition(inputs: InputsPart | None, *figures: Figures) -> str:
+    """Return the conditions of a number in brackets, empty where there are none.
+
+    Parameters
+    ----------
+    inputs : InputsPart or None
+        The part ``inputs`` of the results.
+    *figures : Figures
+        What the number rests on.
+    """
+    premise = _premise(inputs, figures)
+    return f"(only if {premise})" if premise else ""
+
+
+def _premise(inputs: InputsPart | None, figures: tuple[Figures, ...]) -> str:
+    premises = inputs.premises(*figures) if inputs else ()
+    return join(premises) if len(premises) <= 2 else f"{len(premises)} doubted inputs are right"
+
+
+def untouched(inputs: InputsPart | None) -> str:
+    """Return one sentence on what holds whatever becomes of the doubts, empty where nothing is doubted or nothing is left.
+
+    Parameters
+    ----------
+    inputs : InputsPart or None
+        The part ``inputs`` of the results.
+    """
+    if inputs is None or not inputs.doubts:
+        return ""
+    held = [words for figure, words in _FIGURE_WORDS.items() if not inputs.premises(figure)]
+    return f"Not touched by that: {join(held)}." if held else ""
 
 
 def next_steps(results: Results) -> list[str]:

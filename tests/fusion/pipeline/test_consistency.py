@@ -61,7 +61,11 @@ def test_a_doubt_is_named_first_and_makes_the_verdict_conditional(
     name, text = summary_rows(results)[0]
     assert name == "inputs" and text.startswith("doubted: ")
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert "Doubted input." in page and "Only if the" in page
+    assert "Doubted input." in page and "Only if " in page
+    conditional = {figure for check in results.inputs.doubts for figure in check.conditional}
+    assert "causes" in conditional
+    iso = next(text for name, text in summary_rows(results) if name.startswith("A ("))
+    assert ("only if" in iso) is ("positions" in conditional)
 
 
 def test_a_doubt_can_be_accepted_and_an_unknown_one_is_refused(copied: Path, tmp_path: Path) -> None:

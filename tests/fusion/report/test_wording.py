@@ -6,8 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fusion.consistency.checks import Check, inputs_part
 from fusion.products.results import AnomalyPart, Loop, Notice, RecordLoop, Results, StepPart, Unexplained, Verdict
 from fusion.products.results_axis import Evidence
+from fusion.products.results_inputs import InputsPart
 from fusion.report import wording
 
 
@@ -99,3 +101,32 @@ def test_errors_are_those_of_what_was_held_out() -> None:
     assert (
         wording.verdict_numbers(record) == "Error on the held-out part: 1.9 µm; the noise of a block mean is 0.42 µm."
     )
+
+
+def doubted(*codes: str) -> InputsPart:
+    """The part on the inputs with some checks that are not passed."""
+    checks = [Check(code, 1.0, 0.5, False, "It is off.", "Check it.", "figures") for code in codes]
+    return InputsPart.model_validate(inputs_part(checks, ()))
+
+
+def test_what_a_doubt_touches_is_conditional_and_nothing_else() -> None:
+    inputs = doubted("material_rise")
+    said = "The drift goes with the table."
+    assert (
+        wording.conditional(said, inputs, "causes") == "Only if the emissivity is right: the drift goes with the table."
+    )
+    assert wording.conditional(said, inputs, "positions") == said == wording.conditional(said, None, "causes")
+    assert wording.condition(inputs, "field") == "(only if the emissivity is right)"
+    assert wording.condition(inputs, "positions") == ""
+    assert wording.untouched(inputs).startswith(
+        "Not touched by that: what the laser shows alone (deviations, drift, ISO 230-2 values"
+    )
+
+
+def test_several_doubts_are_named_or_counted() -> None:
+    two, three = doubted("material_rise", "datum"), doubted("material_rise", "datum", "camera_clock")
+    both = "the emissivity is right and the datum of the laser stayed the same"
+    assert wording.condition(two, "causes") == f"(only if {both})"
+    assert wording.condition(two, "positions") == "(only if the datum of the laser stayed the same)"
+    assert wording.condition(three, "causes") == "(only if 3 doubted inputs are right)"
+    assert wording.untouched(two) == "" == wording.untouched(None)

@@ -1,0 +1,77 @@
+"""What has to be right where a check is not passed, and which figures hold only then; what the other instrument shows holds anyway."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fusion.products.results_inputs import Figures
+
+_POSITIONS: Figures = "positions"
+_FIELD: Figures = "field"
+_ATTRIBUTION: Figures = "attribution"
+_CAUSES: Figures = "causes"
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What a doubt makes conditional.
+
+    Attributes
+    ----------
+    premise : str
+        What has to be right, as it follows "only if".
+    figures : tuple of Figures
+        What holds only then.
+    """
+
+    premise: str
+    figures: tuple[Figures, ...]
+
+
+_LASER = (_POSITIONS, _ATTRIBUTION, _CAUSES)
+_CAMERA = (_FIELD, _ATTRIBUTION, _CAUSES)
+_CLOCK = (_ATTRIBUTION, _CAUSES)
+_ANY = Condition("the doubted input is right", (_POSITIONS, _FIELD, _ATTRIBUTION, _CAUSES))
+_CONDITIONS = {
+    "deviation_magnitude": Condition("the deviations are in µm", _LASER),
+    "deviation_unit": Condition("the deviations are in µm", _LASER),
+    "travel": Condition("the positions are in mm", _LASER),
+    "copied_cycles": Condition("every cycle was measured", _LASER),
+    "approach_labels": Condition("the labels of the approaches are right", _LASER),
+    "datum": Condition("the datum of the laser stayed the same", _LASER),
+    "zeroed_cycles": Condition("the laser was not set to zero in every cycle", _LASER),
+    "environment_coverage": Condition("the environment log belongs to this test", (_CAUSES,)),
+    "drivers_coverage": Condition("the drivers' log belongs to this test", (_CAUSES,)),
+    "camera_settings": Condition("the camera's settings stayed the same", _CAMERA),
+    "camera_parameters": Condition("the stored camera parameters are right", _CAMERA),
+    "camera_range": Condition("the camera is right outside its range", _CAMERA),
+    "camera_stamps": Condition("the times of the frames are right", _CAMERA),
+    "camera_rate": Condition("the camera's clock keeps its rate", _CLOCK),
+    "camera_phase": Condition("the table was in place when the frames were taken", _CAMERA),
+    "camera_clock": Condition("the clocks of camera and laser agree as stated", _CLOCK),
+    "environment_clock": Condition("the clock of the environment log is right", (_CAUSES,)),
+    "drivers_clock": Condition("the clock of the drivers' log is right", (_CAUSES,)),
+    "material_rise": Condition("the emissivity is right", _CAMERA),
+    "material_level": Condition("the level of the camera's temperature is right", _CAMERA),
+    "expansion_coefficient": Condition(
+        "the emissivity, the expansion coefficient and the axis on the plan are right", (_CAUSES,)
+    ),
+    "sensitivity": Condition("the scales of temperature and deviation are right", (_CAUSES,)),
+    "axis_line": Condition("the axis on the plan, the order of the targets and the signs are right", _CLOCK),
+}
+
+
+def condition_of(code: str, *, recompensated: bool = False) -> Condition:
+    """Return what a doubt makes conditional.
+
+    Parameters
+    ----------
+    code : str
+        Code of the check; one without an entry makes everything conditional.
+    recompensated : bool
+        Whether the readings were compensated with the environment log, so that it touches them as well.
+    """
+    condition = _CONDITIONS.get(code, _ANY)
+    if recompensated and code.startswith("environment"):
+        return Condition(condition.premise, (_POSITIONS, *condition.figures))
+    return condition
