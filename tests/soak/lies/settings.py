@@ -36,7 +36,7 @@ LIES = (
     Lie("expansion coefficient of aluminium (23.8)", EXPANSION, laser("expansion_coefficient", '"23.8 ppm/K"')),
     Lie("expansion coefficient of granite (6)", EXPANSION, laser("expansion_coefficient", '"6 ppm/K"')),
     Lie("expansion coefficient 1000 x too small", EXPANSION, laser("expansion_coefficient", '"0.0117 ppm/K"')),
-    Lie("dead path 1000 mm for 0", DEAD_PATH, laser("dead_path", '"1000 mm"')),
+    Lie("dead path 1000 mm for 0", DEAD_PATH, laser("dead_path", '"1000 mm"'), describes=frozenset({"dead_path"})),
     Lie(
         "dead path 1000 mm for 0, pressure in mmHg",
         r"dead.?path|pressure",
@@ -44,6 +44,7 @@ LIES = (
             laser("dead_path", '"1000 mm"'),
             edit_column("environment.csv", "air_pressure_hPa", lambda p: p / 1.33322),
         ),
+        describes=frozenset({"dead_path"}),
     ),
     Lie("compensation redone although none was logged", r"compensation", laser("compensation", '"redo"')),
     Lie(
