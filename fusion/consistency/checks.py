@@ -22,6 +22,8 @@ CODES = (
     "approach_labels",
     "datum",
     "zeroed_cycles",
+    "travel_order",
+    "mirrored_readings",
     "environment_coverage",
     "drivers_coverage",
     "camera_settings",

@@ -20,6 +20,7 @@ from fusion.consistency.field_series import thin_fields
 from fusion.consistency.frames import check_frames
 from fusion.consistency.logs import check_log
 from fusion.consistency.readings import check_readings
+from fusion.consistency.signs import check_signs
 from fusion.consistency.temperature import check_material
 from fusion.pipeline.thermal import overridden_parameters
 
@@ -54,6 +55,7 @@ def check_source(source: Source) -> list[Check]:
     environment_file = interferometry.environment if interferometry is not None else None
     return [
         *check_readings(source.deviations, plan_extent_mm=abs(x) * width_mm + abs(y) * height_mm),
+        *check_signs(source.deviations),
         *check_log(
             source.environment,
             times,

@@ -14,6 +14,7 @@ from fusion.consistency.axis_line import compare_lines
 from fusion.consistency.coefficients import check_coefficients
 from fusion.consistency.logs import check_log
 from fusion.consistency.readings import check_readings
+from fusion.consistency.signs import check_signs
 from fusion.loop.axis import close_loop
 from fusion.twin import simulate
 from fusion.twin.machine.recipe import AnomalyRecipe, EffectRecipe, Recipe
@@ -69,6 +70,7 @@ def test_sound_campaigns_are_not_doubted(capsys: pytest.CaptureFixture[str]) -> 
         times = deviations["time"].values.ravel()
         checks = [
             *check_readings(deviations, plan_extent_mm=truth.recipe.plan.width_mm),
+            *check_signs(deviations),
             *check_log(environment, times, name="environment", file="environment.csv", endangers=""),
             *check_log(drivers, times, name="drivers", file="drivers.csv", endangers=""),
             *check_coefficients(loop, travel_mm=result.after.readings.span_mm),
