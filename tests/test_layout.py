@@ -21,6 +21,7 @@ TESTED_TOGETHER = {
     "results_inputs",
     "results_loop",
     "results_part",
+    "results_radiometry",
     "results_record",
 }
 

@@ -9,8 +9,11 @@ Contract = dict[str, tuple[tuple[str, ...], str, str]]
 FIELDS: Contract = {
     "temperature": (("cycle", "y", "x"), "degC", "f"),
     "temperature_u": (("cycle", "y", "x"), "K", "f"),
+    "temperature_noise_u": (("cycle", "y", "x"), "K", "f"),
     "temperature_rise": (("cycle", "y", "x"), "K", "f"),
     "temperature_rise_u": (("cycle", "y", "x"), "K", "f"),
+    "temperature_rise_noise_u": (("cycle", "y", "x"), "K", "f"),
+    "rise_scale_u": (("y", "x"), "1", "f"),
     "temperature_spread": (("cycle", "y", "x"), "K", "f"),
     "count": (("cycle", "y", "x"), "1", "i"),
     "cycle_time": (("cycle",), "", "M"),

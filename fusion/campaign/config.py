@@ -26,7 +26,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from fusion.campaign.messages import Place, describe, find_line, key_lines, suggest
-from fusion.campaign.quantities import QuantityError, read_quantity
+from fusion.campaign.quantities import QuantityError, read_quantity, split_uncertainty
 from fusion.effects.effect import Effect
 from fusion.effects.library import library
 from fusion.effects.thermal import QUASI_STATIC
@@ -160,6 +160,10 @@ PartsPerMillion = Annotated[
 ]
 Feed = Annotated[float, _quantity("mm/min"), _within(0.0, 1e6, "a feed rate in mm/min"), _written("300 mm/min")]
 Fraction = Annotated[float, BeforeValidator(_fraction), _within(0.0, 1.0, "this fraction")]
+#: Standard uncertainties.
+FractionU = Annotated[float, BeforeValidator(_fraction), Field(ge=0.0, le=1.0)]
+KelvinU = Annotated[float, _quantity("K"), Field(ge=0.0), _written("1 K")]
+MetresU = Annotated[float, _quantity("mm"), AfterValidator(lambda mm: mm / 1e3), Field(ge=0.0), _written("5 cm")]
 
 
 def _zone(name: str) -> str:
@@ -198,15 +202,102 @@ class CampaignTable(_Table):
 PixelPatch = tuple[NonNegativeInt, NonNegativeInt, PositiveInt, PositiveInt]
 
 
-class ThermographyTable(_Table):
-    """``[thermography]``: the frames, and the camera parameters that override the stored ones."""
+#: Keys that may be written with their standard uncertainty, ``"0.97 +- 0.01"``; it is kept under the name with ``_u``.
+_WITH_UNCERTAINTY = (
+    "emissivity",
+    "reflected_temperature",
+    "atmospheric_temperature",
+    "relative_humidity",
+    "object_distance",
+    "window_transmission",
+    "window_temperature",
+    "temperature",
+)
+
+
+class _Measured(_Table):
+    """A table in which a value may be written with its standard uncertainty."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _split(cls, content: object) -> object:
+        """Give the uncertainty of ``"value +- uncertainty"`` a key of its own."""
+        if not isinstance(content, dict):
+            return content
+        parted = dict(content)
+        for name in _WITH_UNCERTAINTY:
+            if isinstance(content.get(name), str):
+                parted[name], u = split_uncertainty(content[name])
+                if u is not None:
+                    parted.setdefault(f"{name}_u", u)
+        return parted
+
+
+class StateTable(_Measured):
+    """One of ``states`` of a region: a cycle in which a contact sensor measured the region's temperature."""
+
+    cycle: int = Field(ge=1)
+    temperature_degC: Celsius = Field(alias="temperature")
+    temperature_u_K: KelvinU = Field(default=0.1, alias="temperature_u")
+
+
+class SurfaceTable(_Measured):
+    """``[[thermography.region]]``: a part of the table with an emissivity of its own, given or from two states."""
+
+    name: str = Field(min_length=1)
+    rectangle_mm: tuple[tuple[Millimetres, Millimetres], tuple[Millimetres, Millimetres]] | None = Field(
+        default=None, alias="rectangle"
+    )
+    polygon_mm: tuple[tuple[Millimetres, Millimetres], ...] | None = Field(default=None, alias="polygon")
+    emissivity: Fraction | None = None
+    emissivity_u: FractionU | None = None
+    states: tuple[StateTable, StateTable] | None = None
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> SurfaceTable:
+        if (self.rectangle_mm is None) == (self.polygon_mm is None):
+            text = f"region {self.name} needs either rectangle (two opposite corners) or polygon (its corners in order)"
+            raise PydanticCustomError("region", "{text}", {"text": text})
+        if self.polygon_mm is not None and len(self.polygon_mm) < 3:
+            text = f"the polygon of region {self.name} has {len(self.polygon_mm)} corners; it needs at least 3"
+            raise PydanticCustomError("region", "{text}", {"text": text})
+        if (self.emissivity is None) == (self.states is None):
+            text = f'region {self.name} needs either emissivity, for example "0.35 +- 0.05", or states (two cycles of known temperature)'
+            raise PydanticCustomError("region", "{text}", {"text": text})
+        return self
+
+    @property
+    def corners_mm(self) -> tuple[tuple[float, float], ...]:
+        """Corners (x, y) of the region in order, mm."""
+        if self.polygon_mm is not None:
+            return self.polygon_mm
+        assert self.rectangle_mm is not None
+        (x0, y0), (x1, y1) = self.rectangle_mm
+        return ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+
+
+class ThermographyTable(_Measured):
+    """``[thermography]``: the frames, the camera parameters that override the stored ones, and standard uncertainties."""
 
     frames: FramePatterns
     emissivity: Fraction | None = None
+    emissivity_u: FractionU | None = None
     reflected_temperature_degC: Celsius | None = Field(default=None, alias="reflected_temperature")
+    reflected_temperature_u_K: KelvinU | None = Field(default=None, alias="reflected_temperature_u")
     atmospheric_temperature_degC: Celsius | None = Field(default=None, alias="atmospheric_temperature")
+    atmospheric_temperature_u_K: KelvinU | None = Field(default=None, alias="atmospheric_temperature_u")
     relative_humidity: Fraction | None = None
+    relative_humidity_u: FractionU | None = None
     object_distance_m: Metres | None = Field(default=None, alias="object_distance")
+    object_distance_u_m: MetresU | None = Field(default=None, alias="object_distance_u")
+    window_transmission: Fraction | None = None
+    window_transmission_u: FractionU | None = None
+    window_temperature_degC: Celsius | None = Field(default=None, alias="window_temperature")
+    window_temperature_u_K: KelvinU | None = Field(default=None, alias="window_temperature_u")
+    camera_offset_u_K: KelvinU | None = Field(default=None, alias="camera_offset_u")
+    camera_scale_u: FractionU | None = None
+    camera_drift_u_K: KelvinU | None = Field(default=None, alias="camera_drift_u")
+    region: tuple[SurfaceTable, ...] = ()
     clock_offset_s: Seconds | None = Field(default=None, alias="clock_offset")
     table: Literal["still", "moving"] = "still"
     reference_patch_px: PixelPatch | None = Field(default=None, alias="reference_patch")

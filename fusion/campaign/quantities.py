@@ -14,6 +14,7 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     },
     "um": {"nm": (1e-3, 0.0), "um": (1.0, 0.0), "mm": (1e3, 0.0), "m": (1e6, 0.0), "in": (25.4e3, 0.0)},
     "degC": {"degC": (1.0, 0.0), "K": (1.0, -273.15), "degF": (5.0 / 9.0, -160.0 / 9.0)},
+    "K": {"mK": (1e-3, 0.0), "K": (1.0, 0.0), "degC": (1.0, 0.0), "degF": (5.0 / 9.0, 0.0)},
     "s": {"ms": (1e-3, 0.0), "s": (1.0, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0)},
     "ppm/K": {"ppm/K": (1.0, 0.0), "um/m/K": (1.0, 0.0), "1/K": (1e6, 0.0)},
     "mm/min": {"mm/min": (1.0, 0.0), "m/min": (1e3, 0.0), "mm/s": (60.0, 0.0)},
@@ -31,12 +32,14 @@ _WORDS = {
     "minutes": "min", "hr": "h", "hrs": "h", "hour": "h", "hours": "h",
 }  # fmt: skip
 _EXAMPLES = {
-    "mm": "5 mm", "um": "5 um", "degC": "22 degC", "s": "37 s", "ppm/K": "11.7 ppm/K", "mm/min": "300 mm/min",
+    "mm": "5 mm", "um": "5 um", "degC": "22 degC", "K": "1 K", "s": "37 s", "ppm/K": "11.7 ppm/K", "mm/min": "300 mm/min",
 }  # fmt: skip
 _KINDS = {
-    "mm": "a length", "um": "a displacement", "degC": "a temperature", "s": "a time",
+    "mm": "a length", "um": "a displacement", "degC": "a temperature", "K": "a temperature difference", "s": "a time",
     "ppm/K": "an expansion coefficient", "mm/min": "a feed rate",
 }  # fmt: skip
+#: Between a value and its standard uncertainty.
+_PLUS_MINUS = re.compile(r"\s*(?:\+/?-|±)\s*")
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*")
 
 
@@ -64,7 +67,7 @@ def conversion(unit: str, target: str) -> tuple[float, float]:
     unit : str
         Unit as it was written.
     target : str
-        Canonical unit: mm, um, degC, s, ppm/K or mm/min.
+        Canonical unit: mm, um, degC, K (a difference), s, ppm/K or mm/min.
 
     Returns
     -------
@@ -112,3 +115,30 @@ def read_quantity(value: object, target: str) -> float:
     if not math.isfinite(result):
         raise QuantityError(f"the number is not finite; {example}")
     return result
+
+
+def split_uncertainty(text: str) -> tuple[str, str | None]:
+    """Return value and standard uncertainty of a text such as ``"22 +- 1 degC"``, each with its unit.
+
+    Parameters
+    ----------
+    text : str
+        Value, ``+-`` or ``±``, and standard uncertainty; a unit at the end belongs to both.
+
+    Returns
+    -------
+    value, uncertainty : str
+        ``"22 degC"`` and ``"1 degC"``; the uncertainty is None where none is given.
+
+    Examples
+    --------
+    >>> split_uncertainty("1.2 m +- 5 cm"), split_uncertainty("0.97 ± 0.01"), split_uncertainty("22 degC")
+    (('1.2 m', '5 cm'), ('0.97', '0.01'), ('22 degC', None))
+    """
+    value, *uncertainty = _PLUS_MINUS.split(text.strip(), maxsplit=1)
+    if not uncertainty:
+        return value, None
+    bare, stated = _QUANTITY.fullmatch(value), _QUANTITY.fullmatch(uncertainty[0])
+    if bare is not None and bare.group(2) is None and stated is not None and stated.group(2) is not None:
+        value = f"{value} {stated.group(2)}"
+    return value, uncertainty[0]

@@ -19,7 +19,6 @@ from interferometry.compensation import (
     followed_factor_um,
 )
 from interferometry.iso230 import Iso230Budget
-from thermography.radiometry.uncertainty import InputUncertainty
 
 _NO_LOG = "log air temperature, pressure and humidity, and name the file as [interferometry] environment"
 
@@ -167,8 +166,8 @@ def _redone(redone: xr.Dataset, stated: bool, material: SeenMaterial | None) -> 
 def see_material(fields: xr.Dataset, axis: AxisGeometry, deviations: xr.Dataset) -> SeenMaterial:
     """Return the mean temperature that the camera measured between axis position 0 and each target, at the time of each reading.
 
-    Readings before the first or after the last frame take the temperature of that frame. The camera's accuracy (data sheet: ±2 K) is
-    one common error of all frames and places: it does not average out along the axis, but causes no drift.
+    Readings before the first or after the last frame take the temperature of that frame. Emissivity and
+    accuracy of the camera are common errors of all frames and places: they do not average out along the axis, but cause no drift.
 
     Parameters
     ----------
@@ -187,7 +186,7 @@ def see_material(fields: xr.Dataset, axis: AxisGeometry, deviations: xr.Dataset)
     mean = np.where(position == 0.0, at_target, line.integrate(samples) / length)
     at_readings = interpolate_series(deviations["time"].values, fields["time"].values.astype("datetime64[ns]"), mean)
     u = line.sample(fields["temperature_u"].values.astype(float))
-    u_K = float(np.hypot(np.nanmean(u), InputUncertainty().camera_offset_K))
+    u_K = float(np.nanmean(u))
     return SeenMaterial(deviations["deviation"].copy(data=at_readings), u_K)
 
 

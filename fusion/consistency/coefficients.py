@@ -41,7 +41,7 @@ def check_coefficients(loop: Mapping[str, Any], *, travel_mm: float) -> list[Che
     The stated coefficient took part in the fit as one more observation. With the fit's value x and uncertainty u, and the stated value m
     and uncertainty p, the readings alone give 1/u_d^2 = 1/u^2 - 1/p^2 and x_d = u_d^2 (x/u^2 - m/p^2). An effect that the model lacks
     moves x_d by more than u_d; how far is the jackknife's standard deviation j over targets and parts of the test. x_d - m is held against
-    (u_d^2 + j^2 + p^2)^(1/2) (GUM 5.1, independent estimates).
+    (u_d^2 + j^2 + p^2)^(1/2) (GUM 5.1, independent estimates), where u_d contains the scale of the rise.
     """
     declared = loop.get("declared_coefficients", [])
     stated = [entry for entry in declared if entry["effect"] == "axis_expansion" and entry.get("prior") is not None]
@@ -55,7 +55,8 @@ def check_coefficients(loop: Mapping[str, Any], *, travel_mm: float) -> list[Che
 
 
 def _expansion(entry: Mapping[str, Any]) -> Check:
-    value, u, stated, stated_u = entry["value"], entry["u"], entry["prior"], entry["prior_u"]
+    value, stated, stated_u = entry["value"], entry["prior"], entry["prior_u"]
+    u = entry["u"] if entry.get("u_fit") is None else entry["u_fit"]
     weight = 1.0 / u**2 - 1.0 / stated_u**2
     moved = _jackknife_u(entry)
     # The readings say nothing of their own where the fit is no better known than the statement.
@@ -63,7 +64,9 @@ def _expansion(entry: Mapping[str, Any]) -> Check:
         alone, alone_u = stated, math.inf
     else:
         alone = (value / u**2 - stated / stated_u**2) / weight
-        alone_u = math.hypot(math.sqrt(1.0 / weight), moved)
+        # The stated coefficient has diluted an error of the rise's scale as it has diluted the readings.
+        scale_u = (entry.get("u_scale") or 0.0) / (1.0 - u**2 / stated_u**2)
+        alone_u = math.hypot(math.sqrt(1.0 / weight), moved, scale_u)
     off = (alone - stated) / math.hypot(alone_u, stated_u)
     passed = abs(off) <= _LIMIT
     return Check(

@@ -93,6 +93,8 @@ class Effect:
         Whether it is told by nothing but its pattern along the axis.
     errs_camera : bool
         Whether it is an error of the camera: it makes the field wrong, not the drift.
+    follows_field : bool
+        Whether its coefficients are per kelvin of the camera's rise, so that an error of the rise's scale is theirs.
     limitation : callable
         ``limitation(readings)`` says what these readings hide of it, or returns an empty text.
     label : str
@@ -125,6 +127,7 @@ class Effect:
     repeats: bool = False
     patterned: bool = False
     errs_camera: bool = False
+    follows_field: bool = False
     limitation: Callable[[Readings], str] = field(default=lambda readings: "")
     label: str = ""
     remedy: str = ""

@@ -15,6 +15,7 @@ from fusion.attribution.leading_source import LeadingSource, find_source, recomm
 from fusion.attribution.randomised_duty import randomisation_test
 from fusion.attribution.thermal_modes import Region, cluster_cells, disc
 from fusion.campaign.inputs import Source
+from fusion.pipeline.rise_scale import place_scale_u, scaled
 from fusion.products.progress import Report
 from fusion.products.results import Outcome
 from thermography.fields.hotspots import Hotspot, detect_hotspots
@@ -70,8 +71,8 @@ def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, re
         schedule, law = source.duty
         maps["duty"] = xr.DataTree(randomisation_test(fused, schedule, law))
     parts = {
-        "hotspots": [_hotspot_part(f"hotspot {k}", spot, maps, fused) for k, spot in enumerate(spots, start=1)],
-        "correlation": _correlation_part(maps, find_source(maps)),
+        "hotspots": [_hotspot_part(f"hotspot {k}", spot, maps, fused, fields) for k, spot in enumerate(spots, start=1)],
+        "correlation": _correlation_part(maps, find_source(maps), fields),
     }
     return Outcome(maps, parts)
 
@@ -110,7 +111,7 @@ def _describe_sensors(choice: SensorChoice) -> xr.Dataset:
     return dataset.assign_coords(sensor=np.arange(1, len(losses) + 1))
 
 
-def _correlation_part(maps: xr.DataTree, source: LeadingSource) -> dict[str, Any]:
+def _correlation_part(maps: xr.DataTree, source: LeadingSource, fields: xr.Dataset) -> dict[str, Any]:
     """The part ``correlation`` of results.json."""
     session = maps.to_dataset()
     drift = session["unexplained_drift"]
@@ -125,7 +126,10 @@ def _correlation_part(maps: xr.DataTree, source: LeadingSource) -> dict[str, Any
             "x_mm": source.x_mm,
             "y_mm": source.y_mm,
             "p_value": source.p_value,
-            "sensitivity_um_per_K": {"value": source.sensitivity_um_per_K, "u": source.sensitivity_u_um_per_K},
+            "sensitivity_um_per_K": scaled(
+                {"value": source.sensitivity_um_per_K, "u": source.sensitivity_u_um_per_K},
+                place_scale_u(fields, source.x_mm, source.y_mm),
+            ),
             "lag_s": source.lag_s,
             "detectable_um_per_K": source.detectable_um_per_K,
             "equal_places_mm": [list(place) for place in source.others_mm],
@@ -134,8 +138,8 @@ def _correlation_part(maps: xr.DataTree, source: LeadingSource) -> dict[str, Any
         "unexplained_drift_um_per_h": {
             str(name): float(drift.sel(channel=name)) for name in drift["channel"].values if name != "joint"
         },
-        "modes": _candidate_parts(maps, "modes", "mode"),
-        "regions": _candidate_parts(maps, "regions", "region"),
+        "modes": _candidate_parts(maps, "modes", "mode", fields),
+        "regions": _candidate_parts(maps, "regions", "region", fields),
         "sensors": _sensor_part(maps.children["sensors"].to_dataset()),
         "randomised_duty": _duty_part(maps.children["duty"].to_dataset()) if "duty" in maps.children else None,
     }
@@ -156,7 +160,7 @@ def _duty_part(duty: xr.Dataset) -> list[dict[str, Any]]:
     ]
 
 
-def _candidate_parts(maps: xr.DataTree, name: str, kind: str) -> list[dict[str, Any]]:
+def _candidate_parts(maps: xr.DataTree, name: str, kind: str, fields: xr.Dataset) -> list[dict[str, Any]]:
     """Modes or regions with their results for every part of the drift."""
     if name not in maps.children:
         return []
@@ -165,11 +169,14 @@ def _candidate_parts(maps: xr.DataTree, name: str, kind: str) -> list[dict[str, 
     for k in range(group.sizes[kind]):
         candidate = group.isel({kind: k})
         parts: dict[str, dict[str, Any]] = {}
+        scale_u = place_scale_u(fields, float(candidate["at_x"]), float(candidate["at_y"]))
         for channel in map(str, group["channel"].values):
             found = candidate.sel(channel=channel)
             parts[channel] = {
                 "p_value": float(found["p_value"]),
-                "sensitivity_um_per_K": {"value": float(found["sensitivity"]), "u": float(found["sensitivity_u"])},
+                "sensitivity_um_per_K": scaled(
+                    {"value": float(found["sensitivity"]), "u": float(found["sensitivity_u"])}, scale_u
+                ),
                 "lag_s": float(found["lag"]),
                 "detectable_um_per_K": float(found["detectable_sensitivity"]),
             }
@@ -202,7 +209,7 @@ def _sensor_part(sensors: xr.Dataset) -> dict[str, Any]:
     }
 
 
-def _hotspot_part(name: str, spot: Hotspot, maps: xr.DataTree, fused: xr.Dataset) -> dict[str, Any]:
+def _hotspot_part(name: str, spot: Hotspot, maps: xr.DataTree, fused: xr.Dataset, fields: xr.Dataset) -> dict[str, Any]:
     """One entry of ``hotspots`` in results.json: the part of the drift that it goes with most, and the targets that it drives."""
     tested: dict[str, Any] = {"targets": [], "p_value": None, "lag_s": None}
     regions = maps.children["regions"].to_dataset() if "regions" in maps.children else None
@@ -215,7 +222,9 @@ def _hotspot_part(name: str, spot: Hotspot, maps: xr.DataTree, fused: xr.Dataset
             "p_value": float(best["p_value"]),
             "lag_s": float(best["lag"]),
         }
-    return {"x_mm": spot.x_mm, "y_mm": spot.y_mm, "peak_rise_K": spot.peak_rise_K, **tested}
+    u = fields["temperature_rise_u"].isel(cycle=-1).sel(x=spot.x_mm, y=spot.y_mm, method="nearest")
+    peak = {"peak_rise_K": spot.peak_rise_K, "peak_rise_u_K": float(u)}
+    return {"x_mm": spot.x_mm, "y_mm": spot.y_mm, **peak, **tested}
 
 
 def _driven_targets(maps: xr.DataTree, fused: xr.Dataset, region: str, best: xr.Dataset) -> list[int]:

@@ -22,7 +22,7 @@ from fusion.consistency.logs import check_log
 from fusion.consistency.readings import check_readings
 from fusion.consistency.signs import check_signs
 from fusion.consistency.temperature import check_material
-from fusion.pipeline.thermal import overridden_parameters
+from fusion.pipeline.radiometry import overridden_parameters
 
 
 def check_source(source: Source) -> list[Check]:
@@ -72,7 +72,7 @@ def check_source(source: Source) -> list[Check]:
         ),
         *check_order(source.frames),
         *_phase(source),
-        *check_frames(source.frames, overridden=set(overridden_parameters(source))),
+        *check_frames(source.frames, overridden=set(overridden_parameters(source.thermography))),
     ]
 
 

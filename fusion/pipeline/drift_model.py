@@ -21,6 +21,7 @@ from fusion.loop.camera_correction import FieldFault, correct_fields, corrected_
 from fusion.loop.result import LoopResult
 from fusion.model.fit import ModelFit, fit_model
 from fusion.pipeline.positions import judge_positions, sites_of
+from fusion.pipeline.rise_scale import axis_scale_u, plan_scale_u, scale_coefficients, scale_evidence
 from fusion.products import store
 from fusion.products.grouped import joined
 from fusion.products.progress import Report
@@ -77,9 +78,16 @@ def model_drift(
     report("anomalies", 1, 1)
     line = compare_lines(result.after, len(result.declared), correct_fields(fields, errors), source.axis)
     parts = {
-        "anomalies": [position.as_json() for position in positions],
+        "anomalies": [
+            scale_evidence(position.as_json(), source.axis, fields, deviations["position"]) for position in positions
+        ],
         "loop": {
-            **result.as_json(),
+            **scale_coefficients(
+                result.as_json(),
+                effects,
+                axis_u=axis_scale_u(fields, source.axis, deviations["position"].values),
+                plan_u=plan_scale_u(fields),
+            ),
             "field_corrections": [error.as_json() for error in errors],
             "residual_tests": {name: examined.as_json() for name, examined in tests.items()},
             "axis_line": None if line is None else line.as_json(),

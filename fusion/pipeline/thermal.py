@@ -13,6 +13,7 @@ import xarray as xr
 from fusion.alignment.align import camera_on_laser_clock, cycle_bounds
 from fusion.campaign.inputs import Source, counted, listed
 from fusion.pipeline.camera import CameraState, clear_frames, examine_camera, survey_campaign
+from fusion.pipeline.radiometry import complete_fields, overridden_parameters
 from fusion.products.contracts import check
 from fusion.products.progress import Report
 from fusion.products.results import Notice, Outcome
@@ -33,7 +34,6 @@ _REGISTRATION_FRAMES = 5
 _CHECKPOINT_FRAMES = 2000
 #: Number of frames examined for bad pixels: enough to identify a noisy pixel while the table hardly changes.
 _PIXEL_FRAMES = 24
-_KELVIN = 273.15
 
 
 def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | None, report: Report) -> Outcome:
@@ -53,7 +53,8 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
     Returns
     -------
     Outcome
-        Fields on the laser's clock that keep ``thermography.contract.FIELDS``; parts ``registration``, ``alignment`` and ``camera``.
+        Fields on the laser's clock that keep ``thermography.contract.FIELDS``; parts ``registration``, ``alignment``, ``camera`` and
+        ``radiometry``.
 
     Raises
     ------
@@ -62,7 +63,7 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
     ContractError
         If the fields break their contract.
     """
-    override = Overrides(overridden_parameters(source))
+    override = Overrides(overridden_parameters(source.thermography))
     survey = survey_campaign(source, override, report=report)
     report("registration", 0, 1)
     # A moving table is somewhere else in the next frame, so its plan is registered on one frame alone.
@@ -78,9 +79,10 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
         camera, registration, override, checkpoint=checkpoint, scheduler=scheduler, report=report
     )
     fields = fields.assign(camera.per_cycle(_bounds(source, clock["value"])))
-    check(fields, FIELDS, name="the fields")
-    notices += [*clock_notices, *_registration_notices(registration), *_frame_notices(fields)]
     fields = fields.assign_coords(cycle=source.deviations["cycle"].values)
+    completed = complete_fields(source, fields, override)
+    fields = check(completed.dataset, FIELDS, name="the fields")
+    notices += [*clock_notices, *_registration_notices(registration), *_frame_notices(fields), *completed.notices]
     for name in ("time", "cycle_time", "frame_time"):
         if name in fields.variables:
             moved = camera_on_laser_clock(fields[name].values, clock["value"])
@@ -94,6 +96,7 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
         },
         "alignment": {"clock_offset_s": clock},
         "camera": camera.part,
+        **completed.parts,
     }
     return Outcome(fields, parts, tuple(notices))
 
@@ -199,34 +202,6 @@ def _reduce(
 def _bounds(source: Source, offset_s: float) -> np.ndarray:
     """Start and end of every cycle on the camera's clock, (cycles, 2)."""
     return cycle_bounds(source.deviations) + np.timedelta64(round(offset_s * 1e9), "ns")
-
-
-def overridden_parameters(source: Source) -> dict[str, float]:
-    """Return the camera parameters that the campaign file overrides.
-
-    Parameters
-    ----------
-    source : Source
-        Inputs of the campaign.
-
-    Returns
-    -------
-    dict of str to float
-        By name of the attribute of `CameraParameters`, in its unit.
-    """
-    table = source.thermography
-    given = {
-        "emissivity": table.emissivity,
-        "relative_humidity": table.relative_humidity,
-        "object_distance_m": table.object_distance_m,
-        "reflected_temperature_K": _kelvin(table.reflected_temperature_degC),
-        "atmospheric_temperature_K": _kelvin(table.atmospheric_temperature_degC),
-    }
-    return {name: value for name, value in given.items() if value is not None}
-
-
-def _kelvin(celsius: float | None) -> float | None:
-    return None if celsius is None else celsius + _KELVIN
 
 
 def pixel_notices(counts: np.ndarray) -> list[Notice]:

@@ -39,6 +39,7 @@ from fusion.products.results_loop import (
     Verdict,
 )
 from fusion.products.results_part import ByDirection, Number, Quantity, ResultPart
+from fusion.products.results_radiometry import RadiometryPart
 from fusion.products.store import Product, plain
 
 __all__ = [
@@ -110,6 +111,8 @@ class Results(ResultPart):
     """Registration of the thermograms to the plan."""
     camera: CameraPart | None = None
     """The thermal camera: damaged frames and corrections."""
+    radiometry: RadiometryPart | None = None
+    """Uncertainty of temperatures and rises."""
     alignment: AlignmentPart | None = None
     """Both instruments on one clock."""
     iso230: Iso230Part | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
-from fusion.products.results_part import Number, Quantity, ResultPart
+from fusion.products.results_part import Number, Quantity, ResultPart, Sensitivity
 
 Attribution = Literal["attributable", "not attributable", "not separable"]
 
@@ -25,7 +25,7 @@ class SourcePart(ResultPart):
     """Place on the plan, y, mm."""
     p_value: Number
     """p-value, family-wise over everything that was tested."""
-    sensitivity_um_per_K: Quantity
+    sensitivity_um_per_K: Sensitivity
     """Drift per rise, um/K, at the far end of travel for the parts that grow along the axis."""
     lag_s: Number
     """Time constant between temperature and drift, s."""
@@ -42,7 +42,7 @@ class TestedPart(ResultPart):
 
     p_value: Number
     """p-value, family-wise over everything that was tested."""
-    sensitivity_um_per_K: Quantity
+    sensitivity_um_per_K: Sensitivity
     """Drift per rise, um/K."""
     lag_s: Number
     """Time constant between temperature and drift, s."""

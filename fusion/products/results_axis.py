@@ -158,7 +158,9 @@ class Evidence(ResultPart):
     temperature_um_per_K: Number = None
     """Displacement per local rise, um/K."""
     temperature_u_um_per_K: Number = None
-    """Standard uncertainty of the displacement per rise, um/K."""
+    """Standard uncertainty of the displacement per rise, of the fit and of the scale of the rise, um/K."""
+    temperature_scale_u_um_per_K: Number = None
+    """The part of it from the scale of the rise, um/K."""
     temperature_lag_s: Number = None
     """Time constant between local rise and displacement, s."""
     temperature_held_out_nats: Number = None
@@ -198,6 +200,8 @@ class HotspotPart(ResultPart):
     """Place of the peak on the plan, y, mm."""
     peak_rise_K: Number
     """Rise of the peak since the first cycle, K."""
+    peak_rise_u_K: Number = None
+    """Standard uncertainty of the rise of its cell, noise and scale of the rise, K; null where the cell is not seen."""
     targets: tuple[int, ...]
     """Targets whose drift follows it."""
     p_value: Number

@@ -35,7 +35,11 @@ class Coefficient(ResultPart):
     value: Number
     """Estimate."""
     u: Number
-    """Standard uncertainty."""
+    """Standard uncertainty, with that of the scale of the rise where the coefficient is per kelvin of it."""
+    u_fit: Number = None
+    """The part of the fit, the rise taken as exact; absent where the coefficient does not depend on the rise."""
+    u_scale: Number = None
+    """The part of the scale of the rise (emissivity, reflections, air, camera); absent as above."""
     unit: str
     """Unit of value and uncertainty."""
     prior: Number = None

@@ -27,6 +27,15 @@ class Quantity(ResultPart):
     """Standard uncertainty (k = 1), same unit; null where it is not known."""
 
 
+class Sensitivity(Quantity):
+    """A quantity per kelvin of the rise with both parts of its standard uncertainty."""
+
+    u_fit: Number = None
+    """The part of the fit, the rise taken as exact."""
+    u_scale: Number = None
+    """The part of the scale of the rise (emissivity, reflections, air, camera)."""
+
+
 class ByDirection(ResultPart):
     """One value per target for each direction of approach; a direction that was not measured is absent."""
 

@@ -129,7 +129,13 @@ def _coefficient(coefficient: Coefficient) -> str:
         if coefficient.prior is None
         else f" (expected beforehand {measured(coefficient.prior, coefficient.prior_u, unit)})"
     )
-    return measured(coefficient.value, coefficient.u, unit) + prior
+    parts = (
+        ""
+        if coefficient.u_scale is None
+        else f", of which the fit ± {number(2 * (coefficient.u_fit or 0.0), 2)} and the scale of the rise "
+        f"± {number(2 * coefficient.u_scale, 2)}"
+    )
+    return measured(coefficient.value, coefficient.u, unit) + parts + prior
 
 
 def _unexplained_drift(left: Nuisance) -> str:

@@ -17,6 +17,7 @@ from fusion.products.results_axis import NeighboursPart
 from fusion.products.results_inputs import Figures
 from fusion.products.results_loop import AxisLoop, Loop
 from fusion.products.results_part import Quantity
+from fusion.products.results_radiometry import RadiometryPart
 from fusion.report.attribution_section import describe_correlation
 from fusion.report.findings import ISO230_TERMS, anomaly_cause, anomaly_place, iso230_values, standing_out
 from fusion.report.model_section import (
@@ -68,7 +69,8 @@ _GLOSSARY = (
     ),
     (
         "Rise",
-        "Temperature minus that of the first cycle, in K; errors that do not change during the test cancel in it.",
+        "Temperature minus that of the first cycle, in K; a constant error of the camera cancels in it, an error of the emissivity or of "
+        "the camera's scale does not.",
     ),
     ("Expanded uncertainty", "Twice the standard uncertainty (k = 2), about 95 % coverage."),
 )
@@ -126,7 +128,11 @@ def describe_campaign(
         ],
         "data": _data_rows(results, provenance, deviations, fields),
         "fiducials": None if fields is None else _fiducials_table(fields),
-        "field_uncertainty": "" if fields is None else _field_uncertainty(fields),
+        "field_uncertainty": "" if results.radiometry is None else _field_uncertainty(results.radiometry),
+        "budget": None if results.radiometry is None else _budget_table(results.radiometry),
+        "surfaces": _surfaces_table(results.radiometry)
+        if results.radiometry and results.radiometry.edge_cells
+        else None,
         "hotspots": _hotspots_table(results) if results.hotspots else None,
         "positions": None if deviations is None else _positions_table(deviations),
         "neighbours": "" if results.neighbours is None else _neighbours_text(results.neighbours),
@@ -191,7 +197,8 @@ def _numbers(results: Results, deviations: xr.Dataset | None, fields: xr.Dataset
             )
     if fields is not None:
         rise = fields["temperature_rise"].isel(cycle=-1)
-        u = float(fields["temperature_rise_u"].isel(cycle=-1).mean())
+        # The noise of single cells averages out over the plan; what all share does not.
+        u = None if results.radiometry is None else results.radiometry.rise_u.common_K
         add(
             "Rise of the table",
             measured(float(rise.mean()), u, "K"),
@@ -248,22 +255,93 @@ def _fiducials_table(fields: xr.Dataset) -> Table:
     return table([Words("Fiducial"), "Residual / mm", "Leave-one-out / mm"], rows)
 
 
-def _field_uncertainty(fields: xr.Dataset) -> str:
-    absolute, rise = (float(fields[name].isel(cycle=-1).mean()) for name in ("temperature_u", "temperature_rise_u"))
-    return (
-        f"Standard uncertainty of a cell, mean over the plan: {number(absolute, 2)} K of the temperature, {number(rise, 2)} K of the "
-        "rise, in which errors that do not change during the test cancel."
+def _field_uncertainty(part: RadiometryPart) -> str:
+    """Return both parts of the uncertainty of temperature and rise as sentences."""
+    temperature, rise = part.temperature_u, part.rise_u
+    assumed = any(entry.source == "assumed" for entry in part.budget)
+    drift = next((entry.u for entry in part.budget if entry.input == "camera_drift_K"), None)
+    sentences = [
+        "Standard uncertainty of a cell, root mean square over the plan in the last cycle: temperature "
+        f"{number(temperature.total_K, 2)} K, of which {number(temperature.noise_K, 2)} K differ from cell to cell (noise, registration) "
+        f"and {number(temperature.common_K, 2)} K are common to all; rise {number(rise.total_K, 2)} K, of which "
+        f"{number(rise.noise_K, 2)} K noise and registration, and {number(rise.common_K, 2)} K common.",
+    ]
+    if part.rise_scale_u is not None:
+        sentences.append(
+            f"Emissivity, reflections, air and scale of the camera make every rise uncertain by {100 * part.rise_scale_u:.2g} % of itself."
+        )
+    sentences.append(
+        f"The camera's zero makes rises uncertain by up to {number(drift, 2)} K, which is contained."
+        if drift
+        else "A drift of the camera's zero is not part of these figures: it was neither examined nor stated."
     )
+    if assumed:
+        sentences.append("Inputs without a stated uncertainty have an assumed one, see the budget below.")
+    return " ".join(sentences)
+
+
+_INPUT_NAMES = {
+    "emissivity": "emissivity",
+    "reflected_temperature_K": "reflected apparent temperature / K",
+    "atmospheric_temperature_K": "temperature of the air / K",
+    "relative_humidity": "relative humidity",
+    "object_distance_m": "distance / m",
+    "window_transmission": "transmission of the window",
+    "window_temperature_K": "temperature of the window / K",
+    "camera_offset_K": "camera, constant part / K",
+    "camera_scale": "camera, share of the reading in °C",
+    "camera_drift_K": "camera, drift of its zero between cycles / K",
+}
+
+
+def _budget_table(part: RadiometryPart) -> Table:
+    """Return every input that all frames share with its contributions to temperature and rise."""
+    rows = [
+        [
+            _INPUT_NAMES.get(entry.input, entry.input),
+            "–" if entry.value is None else f"{entry.value:.5g}",
+            number(entry.u, 2),
+            entry.source,
+            number(entry.temperature_u_K, 2),
+            number(entry.rise_u_percent, 2),
+        ]
+        for entry in part.budget
+    ]
+    titles = ("Value", "Standard uncertainty u", Words("u is"), "In the temperature / K", "In a rise / % of it")
+    return table([Words("Input common to all frames"), *titles], rows)
+
+
+def _surfaces_table(part: RadiometryPart) -> Table:
+    """Return the surfaces of different emissivity."""
+    rows = [
+        [
+            surface.name or "rest of the table",
+            measured(surface.emissivity.value, surface.emissivity.u),
+            surface.source,
+            str(surface.cells),
+            "–" if surface.rise_scale_u is None else f"{100 * surface.rise_scale_u:.2g}",
+            number(surface.monte_carlo_ratio, 3),
+        ]
+        for surface in part.surfaces
+    ]
+    titles = (
+        "Emissivity (k = 2)",
+        Words("from"),
+        "Cells",
+        "Scale of the rise, u / %",
+        "Monte Carlo over first order",
+    )
+    return table([Words("Surface"), *titles], rows)
 
 
 def _hotspots_table(results: Results) -> Table:
     """Return place, rise, driven targets, p and lag of every hotspot."""
-    columns = ["x / mm", "y / mm", "Peak rise / K", Words("Positions it drives"), "p (family-wise)", "Lag"]
+    columns = ["x / mm", "y / mm", "Peak rise / K (k = 2)", Words("Positions it drives"), "p (family-wise)", "Lag"]
     rows = [
         [
             number(spot.x_mm),
             number(spot.y_mm),
-            number(spot.peak_rise_K),
+            measured(spot.peak_rise_K, spot.peak_rise_u_K),
             ", ".join(map(str, spot.targets)) or "none shown by these data",
             p_value(spot.p_value),
             duration(spot.lag_s),
@@ -381,9 +459,9 @@ def _uncertainty(results: Results, fields: xr.Dataset | None) -> list[str]:
         )
     if fields is not None:
         sentences.append(
-            "Temperatures hold for the emissivity that the campaign states. An error of the emissivity or of the reflected apparent "
-            "temperature shifts all cells alike and cancels in the rise; a surface with another emissivity (bare metal, oil) "
-            "does not follow this."
+            "Temperatures hold for the emissivity that the campaign states. A constant error of the camera cancels in the rise; an error "
+            "of the emissivity by 1 % is one of every rise by about 1 %, and of every coefficient per kelvin, whose uncertainty contains "
+            "it. A surface with another emissivity (bare metal, oil) is right only where the campaign names it as a region."
         )
     if results.loop is not None:
         sentences.append(

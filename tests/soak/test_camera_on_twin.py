@@ -42,7 +42,9 @@ def test_rise_with_steps_and_drift(tmp_path: Path, ffc_step_K: float, drift_K_pe
         fields, part = outcome.dataset, outcome.parts["camera"]
         true = truth.temperature(truth.session.frame_s, fields["x"].values, fields["y"].values, cell_mm=5.0)
         error = (fields["temperature_rise"].values - (true - true[0]))[1:]
-        u = np.hypot(fields["temperature_rise_u"].values[1:], fields["camera_correction_u"].values[1:, None, None])
+        u = np.hypot(
+            fields["temperature_rise_noise_u"].values[1:], fields["camera_correction_u"].values[1:, None, None]
+        )
         errors.append(np.sqrt(np.nanmean(error**2)))
         ratios.append(np.sqrt(np.nanmean((error / u) ** 2)))
         assert camera_corrected(part) == (ffc_step_K > 0 or drift_K_per_K > 0)

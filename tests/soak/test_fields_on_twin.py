@@ -64,7 +64,7 @@ def test_registration_and_field_of_one_frame_per_cycle(tmp_path: Path, k1: float
     fields = reduce_frames(filmed.frames, filmed.registration, GRID, filmed.bounds, override=filmed.override)
     error = fields["temperature"].values - filmed.cells_at(filmed.truth.session.frame_s)
     rms, bias = np.sqrt(np.nanmean(error**2)), np.nanmean(error)
-    ratio = np.sqrt(np.nanmean((error / fields["temperature_u"].values) ** 2))
+    ratio = np.sqrt(np.nanmean((error / fields["temperature_noise_u"].values) ** 2))
     place = filmed.registration_rms_mm()
     print(
         f"\nk1 {k1}: {filmed.registration.model}, registration rms {place:.3f} mm; field rms {1e3 * rms:.1f} mK, bias {1e3 * bias:.2f} mK, "

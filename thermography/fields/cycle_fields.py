@@ -25,9 +25,12 @@ _FLAGS = {
     "several_registrations": 4,
     "not_seen": 8,
     "no_frame": 16,
+    "surface_edge": 32,
 }
+#: Flag of cells that see two surfaces of different emissivity.
+SURFACE_EDGE = _FLAGS["surface_edge"]
 #: Coverage below which a cell is flagged as partly seen.
-_PARTLY_SEEN_BELOW = 0.99
+PARTLY_SEEN_BELOW = 0.99
 #: In images of more pixels than this, ...
 _LARGE_PX = 60_000
 #: ... this number of rows on either side of the middle determines the noise to a per cent.
@@ -39,22 +42,38 @@ _ATTRIBUTES: dict[str, dict[str, Any]] = {
     "temperature": {
         "standard_name": "surface_temperature",
         "long_name": "mean surface temperature over the frames of the cycle",
-        "ancillary_variables": "temperature_u count quality_flag",
+        "ancillary_variables": "temperature_u temperature_noise_u count quality_flag",
         **_DEGREES,
     },
     "temperature_u": {
+        "long_name": "standard uncertainty of the mean temperature",
+        "comment": "pixel noise and registration, and what all cells share: emissivity, reflections, air, accuracy of the camera",
+        **_KELVIN,
+    },
+    "temperature_noise_u": {
         "long_name": "standard uncertainty of the mean temperature from pixel noise and registration",
-        "comment": "errors common to all cells (emissivity, reflected apparent temperature, calibration of the camera) are not included",
+        "comment": "the part of temperature_u that differs from cell to cell",
         **_KELVIN,
     },
     "temperature_rise": {
         "long_name": "rise of the mean temperature since the first cycle",
-        "ancillary_variables": "temperature_rise_u count quality_flag",
+        "ancillary_variables": "temperature_rise_u temperature_rise_noise_u rise_scale_u count quality_flag",
         **_KELVIN,
     },
     "temperature_rise_u": {
-        "long_name": "standard uncertainty of the rise from pixel noise and registration",
+        "long_name": "standard uncertainty of the rise",
+        "comment": "pixel noise and registration, the scale of the rise, and the drift of the camera's zero",
         **_KELVIN,
+    },
+    "temperature_rise_noise_u": {
+        "long_name": "standard uncertainty of the rise from pixel noise and registration",
+        "comment": "the part of temperature_rise_u that differs from cell to cell",
+        **_KELVIN,
+    },
+    "rise_scale_u": {
+        "long_name": "standard uncertainty of the scale of the rise",
+        "comment": "emissivity, reflections, air and camera: the same share of all rises of a cell",
+        "units": "1",
     },
     "temperature_rate": {
         "long_name": "rate of the mean temperature over neighbouring cycles",
@@ -260,8 +279,8 @@ def assemble_fields(
     Returns
     -------
     xr.Dataset
-        Variables of `thermography.contract.FIELDS` and `temperature_rate`, `quality_flag`, `position_u`, with the dimensions
-        (cycle, y, x), in degC, K and K/h.
+        Variables of `thermography.contract.FIELDS` but for the total uncertainties, and `temperature_rate`, `quality_flag`,
+        `position_u`, with the dimensions (cycle, y, x), in degC, K and K/h.
 
     Notes
     -----
@@ -311,13 +330,13 @@ def assemble_fields(
             "history": "counts averaged per cycle, calibrated, and averaged by area over the cells of the plan",
         },
     )  # fmt: skip
-    return _annotate(dataset)
+    return annotate(dataset)
 
 
 def _flags(parts: Sequence[CyclePart], mean: Array, coverage: Array) -> NDArray[np.uint8]:
     """Quality flags of one cycle."""
     limits = {
-        "partly_seen": coverage < _PARTLY_SEEN_BELOW,
+        "partly_seen": coverage < PARTLY_SEEN_BELOW,
         "calibrated_per_frame": np.any([part.fell_back for part in parts], axis=0),
         "several_registrations": np.full(mean.shape, len(parts) > 1),
         "not_seen": np.isnan(mean),
@@ -328,7 +347,7 @@ def _flags(parts: Sequence[CyclePart], mean: Array, coverage: Array) -> NDArray[
 def _temperatures(
     mean: Array, spread: Array, noise: Array, position: Array, *, rise_position: Array, time: Array, reference: int
 ) -> dict[str, Array]:
-    """Temperature, rise since the reference cycle, rate, spread and uncertainties, (cycle, y, x).
+    """Temperature, rise since the reference cycle, rate, spread and their noise, (cycle, y, x).
 
     `noise`, `position` and `rise_position` are variances of the mean and the rise from pixel noise and registration, K2.
     """
@@ -336,18 +355,27 @@ def _temperatures(
     rise_noise = np.where(np.arange(len(mean))[:, None, None] == reference, 0.0, noise + noise[reference])
     return {
         "temperature": mean,
-        "temperature_u": np.sqrt(noise + position),
+        "temperature_noise_u": np.sqrt(noise + position),
         "temperature_rise": mean - mean[reference],
-        "temperature_rise_u": np.sqrt(rise_noise + rise_position),
-        "temperature_rate": _rate(mean, time),
+        "temperature_rise_noise_u": np.sqrt(rise_noise + rise_position),
+        "temperature_rate": rate(mean, time),
         "temperature_spread": spread,
     }
 
 
-def _annotate(dataset: xr.Dataset) -> xr.Dataset:
-    """Set the CF attributes of every listed variable, and no fill value for coordinates."""
+def annotate(dataset: xr.Dataset) -> xr.Dataset:
+    """Set the CF attributes of every listed variable, and no fill value for coordinates.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        Changed in place, and returned.
+    """
     for name, variable in dataset.variables.items():
         variable.attrs.update(_ATTRIBUTES.get(str(name), {}))
+        if "ancillary_variables" in variable.attrs:
+            listed = variable.attrs["ancillary_variables"].split()
+            variable.attrs["ancillary_variables"] = " ".join(each for each in listed if each in dataset.variables)
         if name in dataset.coords:
             variable.encoding["_FillValue"] = None
     return dataset
@@ -396,11 +424,35 @@ def _gradient_variance(fields_K: Array, covariance: Array, grid: PlanGrid) -> Ar
     return np.where(seen, across * (across * xx + 2 * down * xy) + down * down * yy, np.nan)
 
 
-def _rate(mean: Array, time: Array) -> Array:
-    """Central difference over the cycles that have a time, K/h; NaN where there are fewer than two."""
-    rate = np.full(mean.shape, np.nan)
+def reference_cycle(temperature: Array) -> int:
+    """Index of the cycle from which rises are counted: the first one with a field.
+
+    Parameters
+    ----------
+    temperature : (cycle, y, x) ndarray, degC
+        NaN where there is none.
+    """
+    return int(np.flatnonzero(np.isfinite(temperature).any(axis=(1, 2)))[0])
+
+
+def rate(mean: Array, time: Array) -> Array:
+    """Rate of the temperature as central difference over the cycles that have a time.
+
+    Parameters
+    ----------
+    mean : (cycle, y, x) ndarray, degC
+        Mean temperature of every cycle.
+    time : (cycle,) ndarray of datetime64
+        NaT for a cycle without frames.
+
+    Returns
+    -------
+    (cycle, y, x) ndarray, K/h
+        NaN where fewer than two cycles have a time.
+    """
+    rates = np.full(mean.shape, np.nan)
     timed = np.flatnonzero(~np.isnat(time))
     if timed.size >= 2:
         hours = (time[timed] - time[timed[0]]) / np.timedelta64(1, "s") / 3600
-        rate[timed] = np.gradient(mean[timed], hours, axis=0)
-    return rate
+        rates[timed] = np.gradient(mean[timed], hours, axis=0)
+    return rates

@@ -17,7 +17,9 @@ _INSIDE = 0.5
 _ORDER_STATISTICS: dict[str, Callable[..., Array]] = {"median": np.nanmedian, "min": np.nanmin, "max": np.nanmax}
 
 
-def region_series(stack: xr.DataArray, regions: Mapping[str, ArrayLike]) -> xr.Dataset:
+def region_series(
+    stack: xr.DataArray, regions: Mapping[str, ArrayLike], *, common_u: xr.DataArray | None = None
+) -> xr.Dataset:
     """Reduce a stack of fields to mean, median, minimum and maximum per region.
 
     Parameters
@@ -26,14 +28,16 @@ def region_series(stack: xr.DataArray, regions: Mapping[str, ArrayLike]) -> xr.D
         Coordinates in mm; NaN cells are excluded.
     regions : mapping of str to (n, 2) array, mm
         Corners (x, y) of a polygon by name.
+    common_u : DataArray of the shape of `stack`, K, or None
+        Standard uncertainty that all cells share, from `common_part`; None for a stack without one.
 
     Returns
     -------
     xr.Dataset
         Dimensions (region, time or cycle), in the unit of `stack`: ``mean``, weighted by the share of each cell in the region;
-        ``mean_u``, its standard uncertainty from the noise between neighbouring cells (errors common to all cells are not
-        included); ``median``, ``min``, ``max`` over the cells of which more than half lies in the region; ``n``, the sum of the
-        shares of the seen cells.
+        ``mean_noise_u``, its standard uncertainty from the noise between neighbouring cells; where `common_u` is given, ``mean_u``,
+        its standard uncertainty with what all cells share; ``median``, ``min``, ``max`` over the cells of which more than half lies in
+        the region; ``n``, the sum of the shares of the seen cells.
 
     Raises
     ------
@@ -42,8 +46,9 @@ def region_series(stack: xr.DataArray, regions: Mapping[str, ArrayLike]) -> xr.D
 
     Notes
     -----
-    With shares w and the noise s of a cell, ``mean = sum(w T) / sum(w)`` and ``mean_u = s sqrt(sum(w^2)) / sum(w)`` (JCGM 100:2008,
-    5.1.2, for independent cells); s as in `thermography.fields.cycle_fields.pixel_noise`.
+    With shares w and the noise s of a cell, ``mean = sum(w T) / sum(w)`` and ``mean_noise_u = s sqrt(sum(w^2)) / sum(w)`` (JCGM 100:2008,
+    5.1.2, for independent cells); s as in `thermography.fields.cycle_fields.pixel_noise`. What all cells share is fully correlated
+    (5.2.2, note 1), so that its part of ``mean_u`` is the weighted mean of `common_u`.
 
     Examples
     --------
@@ -63,9 +68,21 @@ def region_series(stack: xr.DataArray, regions: Mapping[str, ArrayLike]) -> xr.D
     for name, corners in regions.items():
         shares = Polygon(name, np.asarray(corners, float)).cell_shares(x_mm, y_mm)
         series.append(_reduce_region(values, seen, noise, shares, name))
+        if common_u is not None:
+            common = _weighted_mean(common_u.values.astype(float), seen, shares)
+            series[-1]["mean_u"] = np.hypot(series[-1]["mean_noise_u"], common)
     units = {key: stack.attrs[key] for key in ("units", "units_metadata") if key in stack.attrs}
     difference = {"units": "K", "units_metadata": "temperature: difference"}
-    attributes = {"mean": units, "mean_u": difference, "median": units, "min": units, "max": units, "n": {"units": "1"}}
+    attributes = {
+        "mean": units,
+        "mean_noise_u": difference,
+        "median": units,
+        "min": units,
+        "max": units,
+        "n": {"units": "1"},
+    }
+    if common_u is not None:
+        attributes["mean_u"] = difference
     return xr.Dataset(
         {
             name: (("region", along), np.stack([region[name] for region in series]), attrs)
@@ -75,17 +92,44 @@ def region_series(stack: xr.DataArray, regions: Mapping[str, ArrayLike]) -> xr.D
     )
 
 
+def common_part(fields: xr.Dataset, name: str) -> xr.DataArray:
+    """Return the standard uncertainty of a field that all its cells share.
+
+    Parameters
+    ----------
+    fields : Dataset
+        Keeps `thermography.contract.FIELDS`.
+    name : str
+        ``temperature`` or ``temperature_rise``.
+
+    Returns
+    -------
+    (cycle, y, x) DataArray, K
+        What the total has beside noise and registration.
+    """
+    total, noise = (fields[f"{name}{end}"] for end in ("_u", "_noise_u"))
+    variance = total.values.astype(float) ** 2 - noise.values.astype(float) ** 2
+    return total.copy(data=np.sqrt(np.maximum(variance, 0.0)))
+
+
 def _reduce_region(values: Array, seen: Array, noise: Array, shares: Array, name: str) -> dict[str, Array]:
     """Statistics of one region, each (time,), from values and mask (time, y, x), noise (time,) and shares (y, x)."""
     weight = np.where(seen, shares, 0.0)
     total = weight.sum(axis=(1, 2))
     if not total.any():
         raise PolygonError(f"{name}: all its cells are masked or out of view; move it away from fiducials and edges")
+    mean = _weighted_mean(values, seen, shares)
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.where(seen, weight * values, 0.0).sum(axis=(1, 2)) / total
-        mean_u = noise * np.sqrt((weight**2).sum(axis=(1, 2))) / total
+        mean_noise_u = noise * np.sqrt((weight**2).sum(axis=(1, 2))) / total
     cells = values[:, shares > min(_INSIDE, 0.999 * float(shares.max()))]
     empty = np.asarray(~np.isfinite(cells).any(axis=1))
     filled = np.where(empty[:, None], 0.0, cells)
     order = {key: np.where(empty, np.nan, reduce(filled, axis=1)) for key, reduce in _ORDER_STATISTICS.items()}
-    return {"mean": mean, "mean_u": mean_u, "n": total, **order}
+    return {"mean": mean, "mean_noise_u": mean_noise_u, "n": total, **order}
+
+
+def _weighted_mean(values: Array, seen: Array, shares: Array) -> Array:
+    """Mean of the seen cells weighted by their share, (time,); NaN where none is seen."""
+    weight = np.where(seen, shares, 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(seen, weight * values, 0.0).sum(axis=(1, 2)) / weight.sum(axis=(1, 2))

@@ -93,9 +93,10 @@ def reduce_frames(
     Returns
     -------
     xr.Dataset
-        Variables of `thermography.contract.FIELDS` with dimensions (cycle, y, x) in degC and K, coordinates in mm; further
-        `temperature_rate`, `quality_flag`, `position_u`, and as JSON texts the attributes `frames_outside_cycles` (their fields are
-        in the stack), `knocks` (frame and shift in px), `frames_shaken` (displaced alone) and `frames_unchecked` (too little
+        Variables of `thermography.contract.FIELDS` with dimensions (cycle, y, x) in degC and K, coordinates in mm, but for the total
+        uncertainties, which `thermography.fields.total_uncertainty.evaluate_uncertainty` adds; further `temperature_rate`,
+        `quality_flag`, `position_u`, and as JSON texts the attributes `frames_outside_cycles` (their fields are in the stack),
+        `knocks` (frame and shift in px), `frames_shaken` (displaced alone) and `frames_unchecked` (too little
         contrast to locate the fiducials).
 
     Raises

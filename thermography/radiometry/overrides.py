@@ -1,13 +1,12 @@
-"""Replaces stored camera parameters by those of the campaign: constants, logged series, and emissivities of regions."""
+"""Replaces stored camera parameters by those of the campaign: constants and logged series."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from skimage.measure import points_in_poly
+from numpy.typing import NDArray
 
 from thermography.io.frame import CameraParameters, FrameHeader
 from thermography.radiometry.planck import RadiometryError, override
@@ -93,59 +92,3 @@ class Overrides:
         logged = {name: log.interpolate(frame.time) for name, log in self.logs.items()}
         changes = {**self.constants, **logged}
         return override(frame.parameters, **changes) if changes else frame.parameters
-
-
-@dataclass(frozen=True)
-class EmissivityRegion:
-    """A part of the table with an emissivity of its own.
-
-    Attributes
-    ----------
-    name : str
-        Name, for messages.
-    polygon_mm : tuple of (x, y)
-        Corners in plan coordinates, mm; at least three.
-    emissivity : float
-        Above 0 and up to 1.
-    """
-
-    name: str
-    polygon_mm: tuple[tuple[float, float], ...]
-    emissivity: float
-
-
-def emissivity_map(
-    x_mm: ArrayLike, y_mm: ArrayLike, regions: Sequence[EmissivityRegion], *, default: float
-) -> NDArray[np.float64]:
-    """Return the emissivity of points of the table plan.
-
-    Parameters
-    ----------
-    x_mm, y_mm : arrays that broadcast together
-        Plan coordinates, mm: those of the cells of a grid, or of each sensor pixel from the registration.
-    regions : sequence of EmissivityRegion
-        A later region covers an earlier one.
-    default : float
-        Emissivity outside all regions, above 0 and up to 1.
-
-    Returns
-    -------
-    ndarray of float64
-        Emissivity of each point, of the broadcast shape; see `thermography.radiometry.planck.temperature_from_counts`.
-
-    Raises
-    ------
-    RadiometryError
-        Where an emissivity is not above 0 and up to 1, or a polygon has fewer than three corners.
-    """
-    x, y = np.broadcast_arrays(np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64))
-    points = np.column_stack((x.ravel(), y.ravel()))
-    result = np.full(len(points), default, np.float64)
-    for name, emissivity in (("default", default), *((region.name, region.emissivity) for region in regions)):
-        if not 0 < emissivity <= 1:
-            raise RadiometryError(f"emissivity of {name}: {emissivity:g} is not a fraction above 0 and up to 1")
-    for region in regions:
-        if len(region.polygon_mm) < 3:
-            raise RadiometryError(f"region {region.name}: expected at least 3 corners, got {len(region.polygon_mm)}")
-        result[points_in_poly(points, np.asarray(region.polygon_mm, np.float64))] = region.emissivity
-    return result.reshape(x.shape)

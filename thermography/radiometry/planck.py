@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from thermography._typing import Array
 from thermography.errors import ThermographyError
 from thermography.io.frame import CameraParameters
 
@@ -235,13 +236,42 @@ def count_line(
     e = np.asarray(p.emissivity if emissivity is None else emissivity, np.float64)
     if not np.all((e > 0) & (e <= 1)):
         raise RadiometryError(f"emissivity from {e.min():g} to {e.max():g}: expected fractions above 0 and up to 1")
-    tau, tau_window = transmission(p), p.window_transmission
-    reflected = black_body_signal(p.reflected_temperature_K, p)
-    air = black_body_signal(p.atmospheric_temperature_K, p)
-    offset = tau_window * (tau * (1 - e) * reflected + (1 - tau) * air)
-    if tau_window < 1:
-        offset = offset + (1 - tau_window) * black_body_signal(p.window_temperature_K, p)
-    return tau_window * tau * e, offset
+    reflected, air, window = (
+        black_body_signal(kelvin, p)
+        for kelvin in (
+            p.reflected_temperature_K,
+            p.atmospheric_temperature_K,
+            # Without a window its temperature has no meaning, and cameras store 0.
+            p.window_temperature_K if p.window_transmission < 1 else p.atmospheric_temperature_K,
+        )
+    )
+    return line_of_signals(e, transmission(p), p.window_transmission, reflected, air, window)
+
+
+def line_of_signals(
+    emissivity: Array | float,
+    tau: Array | float,
+    tau_window: Array | float,
+    reflected: Array,
+    air: Array,
+    window: Array,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return gain and offset of the measurement formula from fractions and signals.
+
+    Parameters
+    ----------
+    emissivity, tau, tau_window : arrays that broadcast together
+        Emissivity, transmission of the air and of the window, 0 to 1.
+    reflected, air, window : arrays that broadcast with them
+        Signals of black bodies at the reflected, the air's and the window's temperature, counts.
+
+    Returns
+    -------
+    gain, offset : ndarray of float64
+        As of `count_line`, of the broadcast shape.
+    """
+    offset = tau_window * (tau * (1 - emissivity) * reflected + (1 - tau) * air) + (1 - tau_window) * window
+    return np.asarray(tau_window * tau * emissivity), np.asarray(offset)
 
 
 def transmission(parameters: CameraParameters) -> float:
@@ -288,14 +318,38 @@ def path_transmission(parameters: CameraParameters) -> float:
     W. Minkina and S. Dudzik, Infrared Thermography: Errors and Uncertainties, Wiley, 2009.
     """
     p = parameters
-    celsius = p.atmospheric_temperature_K - ZERO_CELSIUS_K
-    water = p.relative_humidity * np.exp(
+    return float(air_transmission(p.object_distance_m, p.relative_humidity, p.atmospheric_temperature_K, p))
+
+
+def air_transmission(
+    object_distance_m: Array | float,
+    relative_humidity: Array | float,
+    atmospheric_temperature_K: Array | float,
+    parameters: CameraParameters,
+) -> NDArray[np.float64]:
+    """Return the transmission of the air for several distances and conditions; see `path_transmission`.
+
+    Parameters
+    ----------
+    object_distance_m, relative_humidity, atmospheric_temperature_K : arrays that broadcast together
+        Length of the path, m; humidity, 0 to 1; temperature of the air, K.
+    parameters : CameraParameters
+        Only the atmosphere constants are used.
+
+    Returns
+    -------
+    ndarray of float64
+        Transmission of the whole path, 0 to 1, of the broadcast shape.
+    """
+    p = parameters
+    celsius = atmospheric_temperature_K - ZERO_CELSIUS_K
+    water = relative_humidity * np.exp(
         1.5587 + 0.06939 * celsius - 0.00027816 * celsius**2 + 0.00000068455 * celsius**3
     )
-    root_distance, root_water = np.sqrt(p.object_distance_m), np.sqrt(water)
+    root_distance, root_water = np.sqrt(object_distance_m), np.sqrt(water)
     first = np.exp(-root_distance * (p.atmosphere_alpha1 + p.atmosphere_beta1 * root_water))
     second = np.exp(-root_distance * (p.atmosphere_alpha2 + p.atmosphere_beta2 * root_water))
-    return float(p.atmosphere_x * first + (1 - p.atmosphere_x) * second)
+    return np.asarray(p.atmosphere_x * first + (1 - p.atmosphere_x) * second)
 
 
 def override(parameters: CameraParameters, **changes: float) -> CameraParameters:

@@ -2,8 +2,8 @@
 
 The common part (emissivity, reflections, air, humidity, distance, window, accuracy of the camera) is the same error in every frame of a
 campaign and largely cancels in a difference; the per-frame part (noise, quantisation) does not cancel, but averages out. Uncertainties
-propagate to first order through the measurement formula (JCGM 100:2008, 5.1 and 5.2); the tests compare them with Monte Carlo
-simulations. See ``docs/method/radiometry.md``.
+propagate to first order through the measurement formula (JCGM 100:2008, 5.1 and 5.2); `monte_carlo_ratio` tells by how much a
+propagation of distributions (JCGM 101:2008) differs. See ``docs/method/radiometry.md``.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import stats
 
 from thermography._typing import Array
 from thermography.errors import ThermographyError
@@ -19,10 +20,15 @@ from thermography.io.frame import CameraParameters
 from thermography.radiometry.planck import (
     ZERO_CELSIUS_K,
     RadiometryError,
+    air_transmission,
     black_body_signal,
     count_line,
+    line_of_signals,
     override,
+    path_transmission,
     signal_slope,
+    temperature_of_signal,
+    transmission,
 )
 
 #: Parameters of the measurement formula that may be uncertain, with their range.
@@ -35,14 +41,21 @@ _RANGES = {
     "window_transmission": (1e-3, 1.0),
     "window_temperature_K": (100.0, 3000.0),
 }
+#: Largest relative difference between first order and propagation of distributions that is left as it is: an uncertainty is stated
+#: to two significant digits, so that half a unit of the last one is 5 % of the smallest such number (JCGM 101:2008, 7.9.2 and 8).
+FIRST_ORDER_TOLERANCE = 0.05
+#: Draws of the propagation of distributions: the half-width of a 95 % interval is then known to 0.7 %.
+_DRAWS = 20_000
+#: Coverage factor of 95 % under a normal distribution.
+_NORMAL_95 = 1.959964
 
 
 @dataclass(frozen=True)
 class InputUncertainty:
     """Standard uncertainties (coverage factor 1) of the inputs of the measurement formula.
 
-    The defaults apply to a painted surface in a workshop and to the data sheet of a bolometer camera: accuracy of +-2 K as a rectangular
-    distribution (JCGM 100:2008, 4.3.7), NETD of 50 mK at 30 degC.
+    The defaults apply to a painted surface in a workshop and to the data sheet of a bolometer camera: accuracy of +-2 K or +-2 % of the
+    reading, both as rectangular distributions (JCGM 100:2008, 4.3.7), NETD of 50 mK at 30 degC.
 
     Attributes
     ----------
@@ -53,9 +66,12 @@ class InputUncertainty:
     object_distance_m : float
         Standard uncertainty of the distance, m.
     camera_offset_K : float
-        Standard uncertainty of the camera that is the same at all temperatures, K.
+        Standard uncertainty of the camera's reading of a black body that is the same at all temperatures, K.
     camera_scale : float
-        Relative standard uncertainty of the signal of the camera above zero (for an accuracy of "2 % of reading"), without unit.
+        Standard uncertainty of that reading as a share of the reading in degC ("2 % of reading" of a data sheet), without unit.
+    camera_drift_K : float
+        Standard uncertainty of the change of the camera's zero between two cycles, K; it enters rises only, because the accuracy of the
+        camera holds at all times. No data sheet states it: 0 by default.
     netd_K : float
         Noise equivalent temperature difference: standard deviation of one pixel in one frame on a black body, K.
     netd_temperature_degC : float
@@ -75,7 +91,8 @@ class InputUncertainty:
     window_transmission: float = 0.0
     window_temperature_K: float = 0.0
     camera_offset_K: float = 2 / 3**0.5
-    camera_scale: float = 0.0
+    camera_scale: float = 0.02 / 3**0.5
+    camera_drift_K: float = 0.0
     netd_K: float = 0.05
     netd_temperature_degC: float = 30.0
 
@@ -150,8 +167,9 @@ def temperature_uncertainty(
     Notes
     -----
     Law of propagation of uncertainty for uncorrelated inputs, JCGM 100:2008, eq. (10). With counts = g S(T) + o, a change of gain g and
-    offset o changes the temperature by -(S dg + do) / (g dS/dT). The noise of a pixel is constant in counts; the quantisation to whole
-    counts has a standard uncertainty of 1 / sqrt(12) (JCGM 100:2008, F.2.2.1).
+    offset o changes the temperature by -(S dg + do) / (g dS/dT). An error of the camera is one of its reading of a black body; it is
+    larger on a surface by dS/dT at that reading over g dS/dT at the surface, about 1 / emissivity. The noise of a pixel is constant in
+    counts; the quantisation to whole counts has a standard uncertainty of 1 / sqrt(12) (JCGM 100:2008, F.2.2.1).
 
     Examples
     --------
@@ -161,7 +179,7 @@ def temperature_uncertainty(
     ... )
     >>> budget = temperature_uncertainty([25.0, 40.0], sc660, frames=10)
     >>> budget.total_u.round(3), budget.per_frame_u.round(3), budget.common["emissivity"].round(3)
-    (array([1.157, 1.171]), array([0.018, 0.015]), array([-0.051, -0.191]))
+    (array([1.258, 1.315]), array([0.018, 0.015]), array([-0.051, -0.191]))
     """
     inputs = inputs or InputUncertainty()
     kelvin = np.asarray(temperature, np.float64) + ZERO_CELSIUS_K
@@ -171,23 +189,76 @@ def temperature_uncertainty(
             f"frames={np.broadcast_to(frames, too_few.shape)[too_few][0]} for a temperature; give the number of frames that "
             "were averaged, 1 or more"
         )
+    common = common_contributions(temperature, parameters, inputs)
+    gain, _ = count_line(parameters)
+    # The noise of a pixel in counts does not depend on the scene.
+    noise = inputs.netd_K * signal_slope(inputs.netd_temperature_degC + ZERO_CELSIUS_K, parameters)
+    per_count = 1 / (signal_slope(kelvin, parameters) * gain * np.sqrt(frames))
+    return TemperatureBudget(common, {"noise": per_count * noise, "quantisation": per_count / 12**0.5})
+
+
+def common_contributions(
+    temperature: ArrayLike, parameters: CameraParameters, inputs: InputUncertainty
+) -> dict[str, Array]:
+    """Return what each input that all frames share contributes to the uncertainty of temperatures.
+
+    Parameters
+    ----------
+    temperature : array, any shape
+        Surface temperature, degC; NaN where there is none.
+    parameters : CameraParameters
+        Parameters with which it was calibrated.
+    inputs : InputUncertainty
+        Standard uncertainties of the inputs; those of 0 are left out.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Sensitivity coefficient, with its sign, times standard uncertainty, K, of the shape of the temperature.
+
+    Raises
+    ------
+    RadiometryError
+        Where a parameter makes the measurement formula meaningless.
+    """
+    kelvin = np.asarray(temperature, np.float64) + ZERO_CELSIUS_K
     signal = black_body_signal(kelvin, parameters)
-    kelvin_per_count = 1 / signal_slope(kelvin, parameters)
+    slope = signal_slope(kelvin, parameters)
     gain, _ = count_line(parameters)
     common = {}
     for name in _RANGES:
         u = getattr(inputs, name)
         if u > 0:
             gain_slope, offset_slope = _line_slopes(parameters, name, u)
-            common[name] = -kelvin_per_count * (offset_slope + signal * gain_slope) / gain * u
-    if inputs.camera_offset_K > 0:
-        common["camera_offset"] = np.full(kelvin.shape, inputs.camera_offset_K)
-    if inputs.camera_scale > 0:
-        common["camera_scale"] = kelvin_per_count * (signal + parameters.planck_o) * inputs.camera_scale
-    # The noise of a pixel in counts does not depend on the scene.
-    noise = inputs.netd_K * signal_slope(inputs.netd_temperature_degC + ZERO_CELSIUS_K, parameters)
-    per_count = kelvin_per_count / (gain * np.sqrt(frames))
-    return TemperatureBudget(common, {"noise": per_count * noise, "quantisation": per_count / 12**0.5})
+            common[name] = -(offset_slope + signal * gain_slope) / (gain * slope) * u
+    if inputs.camera_offset_K > 0 or inputs.camera_scale > 0:
+        reading, per_reading = reading_sensitivity(temperature, parameters)
+        common["camera_offset_K"] = per_reading * inputs.camera_offset_K
+        common["camera_scale"] = per_reading * reading * inputs.camera_scale
+    return common
+
+
+def reading_sensitivity(temperature: ArrayLike, parameters: CameraParameters) -> tuple[Array, Array]:
+    """Return what the camera reads of a black body of the same signal, and the sensitivity of a surface temperature to that reading.
+
+    Parameters
+    ----------
+    temperature : array, any shape
+        Surface temperature, degC.
+    parameters : CameraParameters
+        Parameters with which it was calibrated.
+
+    Returns
+    -------
+    reading : ndarray of float64
+        Temperature of a black body directly in front of the lens, degC.
+    sensitivity : ndarray of float64
+        Change of the surface temperature per change of the reading, about 1 / emissivity, without unit.
+    """
+    kelvin = np.asarray(temperature, np.float64) + ZERO_CELSIUS_K
+    gain, offset = count_line(parameters)
+    reading = temperature_of_signal(gain * black_body_signal(kelvin, parameters) + offset, parameters)
+    return reading, signal_slope(reading + ZERO_CELSIUS_K, parameters) / (gain * signal_slope(kelvin, parameters))
 
 
 def temperature_rise_uncertainty(
@@ -228,13 +299,144 @@ def temperature_rise_uncertainty(
     Notes
     -----
     The errors of the common inputs are the same in both temperatures (correlation 1), so their contributions are subtracted before they
-    are squared (JCGM 100:2008, 5.2.2, note 1); noise and quantisation are independent.
+    are squared (JCGM 100:2008, 5.2.2, note 1); noise and quantisation are independent, and the drift of the camera's zero between both
+    does not cancel.
     """
     later = temperature_uncertainty(temperature, parameters, inputs, frames=frames)
     earlier = temperature_uncertainty(reference, reference_parameters or parameters, inputs, frames=reference_frames)
     common = {name: later.common[name] - earlier.common[name] for name in later.common}
+    drift_K = (inputs or InputUncertainty()).camera_drift_K
+    if drift_K > 0:
+        common["camera_drift_K"] = drift_K * reading_sensitivity(temperature, parameters)[1]
     per_frame = {name: np.hypot(later.per_frame[name], earlier.per_frame[name]) for name in later.per_frame}
     return TemperatureBudget(common, per_frame)
+
+
+def rise_scale_contributions(
+    temperature: ArrayLike, parameters: CameraParameters, inputs: InputUncertainty
+) -> dict[str, Array]:
+    """Return what each common input contributes to the relative uncertainty of rises about a temperature.
+
+    Parameters
+    ----------
+    temperature : array, any shape
+        Middle of the rises, degC.
+    parameters : CameraParameters
+        Parameters with which it was calibrated.
+    inputs : InputUncertainty
+        Standard uncertainties of the inputs.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Error of a rise as a share of the rise, with its sign, without unit, of the shape of the temperature. An error of 1 % of the
+        emissivity is about 1 %.
+
+    Notes
+    -----
+    The derivative of `common_contributions` by the temperature: over the few kelvins of a test a common error changes a rise in
+    proportion; the share itself falls by about 1 % of its size per kelvin.
+    """
+    middle = np.asarray(temperature, np.float64)
+    parts = common_contributions(np.stack([middle - 0.5, middle + 0.5]), parameters, inputs)
+    return {name: part[1] - part[0] for name, part in parts.items()}
+
+
+def monte_carlo_ratio(
+    temperature: ArrayLike,
+    rise: tuple[float, float],
+    parameters: CameraParameters,
+    inputs: InputUncertainty,
+    *,
+    seed: int = 1,
+) -> tuple[Array, float]:
+    """Return how the common uncertainty by propagation of distributions compares with that of first order.
+
+    Parameters
+    ----------
+    temperature : (n,) array, degC
+        Surface temperatures.
+    rise : (float, float), degC
+        Two different temperatures, before and after a rise.
+    parameters : CameraParameters
+        Parameters with which they were calibrated.
+    inputs : InputUncertainty
+        Standard uncertainties of the inputs, at least one of them above 0.
+    seed : int
+        Of the draws.
+
+    Returns
+    -------
+    of_temperature : (n,) ndarray
+        Half the width of the interval about the temperature that holds 95 % of the draws, over that of a normal distribution with the
+        standard uncertainty of first order; 1 where the formula is linear enough.
+    of_rise : float
+        The same of the rise.
+
+    Raises
+    ------
+    RadiometryError
+        Where the emissivity is not above two of its standard uncertainties, so that the interval has no upper end.
+
+    Notes
+    -----
+    JCGM 101:2008, clauses 5 to 8: normal distributions, those of fractions and of the distance truncated to their range. The interval
+    is compared and not the standard deviation, which does not exist where the distribution of an emissivity reaches towards 0; it lies
+    about the stated value, because that is what it is printed with.
+    """
+    p = parameters
+    if p.emissivity <= 2 * inputs.emissivity:
+        raise RadiometryError(
+            f"emissivity {p.emissivity:g} with a standard uncertainty of {inputs.emissivity:g}: a surface within two standard "
+            "uncertainties emits nothing, so that its temperature has no uncertainty that could be stated; state the emissivity "
+            "better (from two states of known temperature), or paint the surface"
+        )
+    kelvin = np.append(np.asarray(temperature, np.float64), rise) + ZERO_CELSIUS_K
+    gain, offset = count_line(p)
+    counts = gain * black_body_signal(kelvin, p) + offset
+    rng = np.random.default_rng(seed)
+    offset_error, scale_error = rng.standard_normal((2, _DRAWS, 1))
+    reading = temperature_of_signal(counts, p)
+    read = reading + inputs.camera_offset_K * offset_error + inputs.camera_scale * reading * scale_error
+    drawn_gain, drawn_offset = _draw_lines(p, inputs, rng)
+    signal = (black_body_signal(read + ZERO_CELSIUS_K, p) - drawn_offset[:, None]) / drawn_gain[:, None]
+    drawn = temperature_of_signal(signal, p)
+    common = common_contributions(kelvin - ZERO_CELSIUS_K, p, inputs)
+    error = drawn - (kelvin - ZERO_CELSIUS_K)
+    of_temperature = _half_width(error[:, :-2]) / _root_sum_square({name: part[:-2] for name, part in common.items()})
+    of_rise = _half_width(error[:, -1] - error[:, -2]) / _root_sum_square(
+        {name: part[-1] - part[-2] for name, part in common.items()}
+    )
+    return of_temperature, float(of_rise)
+
+
+def _half_width(error: Array) -> Array:
+    """Half the width of the interval about 0 that holds 95 % of every column, in standard uncertainties of a normal distribution."""
+    # A draw that no temperature explains lies beyond all others.
+    return np.asarray(np.quantile(np.where(np.isfinite(error), np.abs(error), np.inf), 0.95, axis=0) / _NORMAL_95)
+
+
+def _draw_lines(
+    parameters: CameraParameters, inputs: InputUncertainty, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Gain and offset of `count_line` for draws of its parameters, (draws,)."""
+    p = parameters
+
+    def draw(name: str) -> Array:
+        value, u, (low, high) = getattr(p, name), getattr(inputs, name), _RANGES[name]
+        if u == 0:
+            return np.full(_DRAWS, value)
+        below, above = stats.norm.cdf([(low - value) / u, (high - value) / u])
+        return np.asarray(value + u * stats.norm.ppf(rng.uniform(below, above, _DRAWS)))
+
+    distance, humidity, air = (
+        draw(name) for name in ("object_distance_m", "relative_humidity", "atmospheric_temperature_K")
+    )
+    # A transmission that the file stores is changed by as much as that of the formula.
+    tau = transmission(p) + air_transmission(distance, humidity, air, p) - path_transmission(p)
+    window_K = draw("window_temperature_K") if p.window_transmission < 1 else air
+    signals = [black_body_signal(kelvin, p) for kelvin in (draw("reflected_temperature_K"), air, window_K)]
+    return line_of_signals(draw("emissivity"), tau, draw("window_transmission"), *signals)
 
 
 def _root_sum_square(parts: dict[str, Array]) -> Array:

@@ -102,8 +102,15 @@ def test_a_record_stands_instead_of_the_instruments(folder: Path) -> None:
 # Each row: text to replace, its replacement, and the message after "FOLDER/campaign.toml" with {folder} filled in.
 BAD = [
     ("emissivity", "emisivity",
-     ", line 7: unknown key thermography.emisivity; did you mean emissivity? known here: atmospheric_temperature, clock_offset, "
-     "emissivity, frames, object_distance, reference_patch, reflected_temperature, relative_humidity, table"),
+     ", line 7: unknown key thermography.emisivity; did you mean emissivity? known here: atmospheric_temperature, "
+     "atmospheric_temperature_u, camera_drift_u, camera_offset_u, camera_scale_u, clock_offset, emissivity, emissivity_u, frames, "
+     "object_distance, object_distance_u, reference_patch, reflected_temperature, reflected_temperature_u, region, relative_humidity, "
+     "relative_humidity_u, table, window_temperature, window_temperature_u, window_transmission, window_transmission_u"),
+    ("emissivity = 0.97", 'emissivity = "0.97 +- much"',
+     ', line 5: thermography.emissivity_u = "much": this is a number without quotes'),
+    ('"22 degC"', '"22 degC +- 1 mm"',
+     ', line 5: thermography.reflected_temperature_u = "1 mm": '
+     '"mm" is not a unit of a temperature difference; use one of mK, K, degC, degF'),
     ('"5 mm"', "5", ', line 15: plan.cell_size = 5: a length needs its unit in the value; write for example "5 mm"'),
     ('"5 mm"', '"5"', ', line 15: plan.cell_size = "5": a length needs its unit in the value; write for example "5 mm"'),
     ('"5 mm"', '"five mm"',

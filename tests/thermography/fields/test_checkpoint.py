@@ -113,7 +113,7 @@ def test_another_emissivity_needs_no_second_pass(film, tmp_path):
     direct = reduce_frames(frames, registration, GRID, BOUNDS[:3], override=lambda frame: dim(frame.parameters))
     assert SC660.emissivity != 0.90
     # Sums over a cycle instead of a block: second order in both, float32 in the product.
-    for name in ("temperature", "temperature_rise", "temperature_u", "temperature_spread"):
+    for name in ("temperature", "temperature_rise", "temperature_noise_u", "temperature_spread"):
         np.testing.assert_allclose(again[name], direct[name], atol=2e-5)
     assert (again["count"].values == direct["count"].values).all()
 

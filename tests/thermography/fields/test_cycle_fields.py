@@ -88,9 +88,9 @@ def test_rise_rate_and_noise_of_three_cycles():
     # Second-order differences over 0.5 h and 1.5 h: the parabola through the three points.
     slopes = np.polynomial.Polynomial.fit([0, 0.5, 2], [20, 21, 24], 2).deriv()
     assert float(middle["temperature_rate"][1]) == pytest.approx(slopes(0.5), rel=1e-6)
-    np.testing.assert_allclose(middle["temperature_u"], [0.03, 0.04, np.nan, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(middle["temperature_noise_u"], [0.03, 0.04, np.nan, 0.0], rtol=1e-6)
     # The first cycle's noise is in every rise but its own.
-    np.testing.assert_allclose(middle["temperature_rise_u"], [0.0, 0.05, np.nan, 0.03], rtol=1e-6)
+    np.testing.assert_allclose(middle["temperature_rise_noise_u"], [0.0, 0.05, np.nan, 0.03], rtol=1e-6)
     assert middle["count"].values.tolist() == [4, 4, 0, 4]
     assert middle["quality_flag"].values.tolist() == [0, 0, 16, 0]
 
@@ -101,7 +101,7 @@ def test_position_uncertainty_enters_through_the_gradient():
     covariance[..., 0, 0], covariance[..., 1, 1] = 0.2**2, 0.5**2
     fields = assemble_fields([part(0, ramp)], 1, PLAN, [covariance], [WHOLE])
     # 0.1 K/mm along x only, with 0.2 mm; the outermost cells are smoothed.
-    assert float(fields["temperature_u"][0, 2, 2]) == pytest.approx(0.02, rel=0.05)
+    assert float(fields["temperature_noise_u"][0, 2, 2]) == pytest.approx(0.02, rel=0.05)
     assert float(fields["position_u"][2, 2]) == pytest.approx(np.hypot(0.2, 0.5), rel=1e-6)
 
 
@@ -112,7 +112,9 @@ def test_a_cycle_under_two_registrations_is_weighted_by_frames():
     fields = assemble_fields(parts, 1, PLAN, [SURE, SURE], [WHOLE, 0.9 * WHOLE])
     assert float(fields["temperature"][0, 1, 1]) == pytest.approx(20.5)
     assert float(fields["temperature"][0, 0, 0]) == pytest.approx(20.0)
-    assert float(fields["temperature_u"][0, 1, 1]) == pytest.approx(np.sqrt((0.75 * 0.1) ** 2 + (0.25 * 0.2) ** 2))
+    assert float(fields["temperature_noise_u"][0, 1, 1]) == pytest.approx(
+        np.sqrt((0.75 * 0.1) ** 2 + (0.25 * 0.2) ** 2)
+    )
     assert int(fields["quality_flag"][0, 1, 1]) == 4
     assert fields["cycle_time"].values[0] == START + np.timedelta64(2, "s")
 

@@ -64,7 +64,7 @@ def test_fields_of_frames_at_different_places_overlay(travel):
 def test_stated_uncertainty_is_the_true_error(travel):
     _, _, _, fields = travel
     error = fields["temperature"].values - cell_truth()
-    ratio = np.sqrt(np.nanmean((error / fields["temperature_u"].values) ** 2))
+    ratio = np.sqrt(np.nanmean((error / fields["temperature_noise_u"].values) ** 2))
     # Neighbouring cells share pixels and misplacement, so that a few hundred values are independent.
     assert 0.7 < ratio < 1.4
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from thermography.fields.regions import region_series
+from thermography.fields.regions import common_part, region_series
 from thermography.registration.polygon import PolygonError
 
 X, Y = np.arange(140) * 5.0 + 2.5, np.arange(36) * 5.0 + 2.5
@@ -40,7 +40,22 @@ def test_stated_uncertainty_of_a_region_mean_is_its_scatter(rng):
     ).std()
     # 200 means give their standard deviation to 5 %.
     assert float(scatter) == pytest.approx(0.014 / 10, rel=0.15)
-    assert float(series["mean_u"].mean()) == pytest.approx(0.014 / 10, rel=0.05)
+    assert float(series["mean_noise_u"].mean()) == pytest.approx(0.014 / 10, rel=0.05)
+
+
+def test_what_all_cells_share_does_not_average_out(rng):
+    rise = stack(grow=0.0) * 0.0 + 5.0 + rng.normal(0, 0.014, (4, 36, 140))
+    fields = xr.Dataset(
+        {
+            "temperature_rise": rise,
+            "temperature_rise_noise_u": rise * 0.0 + 0.014,
+            "temperature_rise_u": rise * 0.0 + np.hypot(0.014, 0.05),
+        }
+    )
+    square = {"square": [(100, 40), (150, 40), (150, 90), (100, 90)]}
+    series = region_series(rise, square, common_u=common_part(fields, "temperature_rise"))
+    np.testing.assert_allclose(series["mean_u"], np.hypot(0.05, 0.0014), rtol=0.002)
+    assert "mean_u" not in region_series(rise, square)
 
 
 def test_masked_cells_take_no_part():

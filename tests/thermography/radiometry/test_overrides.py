@@ -1,4 +1,4 @@
-"""Parameters for all frames, over time and per region."""
+"""Parameters for all frames and over time."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.thermography.flir_mutations import PARAMETERS, TIME, frame
-from thermography.radiometry.overrides import EmissivityRegion, Overrides, ParameterLog, emissivity_map
+from thermography.radiometry.overrides import Overrides, ParameterLog
 from thermography.radiometry.planck import RadiometryError
 
 TIMES = TIME + np.array([0, 100, 300]).astype("timedelta64[s]")
@@ -52,21 +52,3 @@ def test_a_broken_log_is_refused(times: np.ndarray, values: list[float], message
 def test_an_unknown_parameter_is_refused() -> None:
     with pytest.raises(RadiometryError, match="parameter 'humidity' is unknown"):
         Overrides({"humidity": 0.4})(frame())
-
-
-def test_regions_of_paint_foil_and_metal() -> None:
-    x, y = np.meshgrid(np.arange(0.5, 10), np.arange(0.5, 5))
-    foil = EmissivityRegion("foil", ((2, 1), (6, 1), (6, 4), (2, 4)), 0.1)
-    patch = EmissivityRegion("paint on foil", ((3, 2), (4, 2), (4, 3), (3, 3)), 0.95)
-    result = emissivity_map(x, y, [foil, patch], default=0.97)
-    assert result.shape == (5, 10)
-    assert (result == 0.1).sum() == 4 * 3 - 1
-    assert result[2, 3] == 0.95 and result[0, 0] == 0.97
-    np.testing.assert_array_equal(emissivity_map(x[0], y[:, :1], [foil, patch], default=0.97), result)
-
-
-def test_impossible_regions_are_refused() -> None:
-    with pytest.raises(RadiometryError, match=r"emissivity of foil: 97 is not a fraction above 0 and up to 1"):
-        emissivity_map(0.0, 0.0, [EmissivityRegion("foil", ((0, 0), (1, 0), (0, 1)), 97.0)], default=0.9)
-    with pytest.raises(RadiometryError, match="region line: expected at least 3 corners, got 2"):
-        emissivity_map(0.0, 0.0, [EmissivityRegion("line", ((0, 0), (1, 0)), 0.9)], default=0.9)

@@ -10,8 +10,15 @@ import pytest
 from tests.thermography.flir_mutations import PARAMETERS
 from thermography.errors import ThermographyError
 from thermography.io.frame import CameraParameters
-from thermography.radiometry.planck import counts_from_temperature, override, temperature_from_counts
-from thermography.radiometry.uncertainty import InputUncertainty, temperature_rise_uncertainty, temperature_uncertainty
+from thermography.radiometry.planck import RadiometryError, counts_from_temperature, override, temperature_from_counts
+from thermography.radiometry.uncertainty import (
+    InputUncertainty,
+    common_contributions,
+    monte_carlo_ratio,
+    rise_scale_contributions,
+    temperature_rise_uncertainty,
+    temperature_uncertainty,
+)
 
 DRAWS = 20_000
 #: The Monte Carlo standard deviation of 20,000 draws scatters by 0.5 %; 3 % also holds what first order leaves out.
@@ -52,9 +59,13 @@ def _simulate(
     true = counts_from_temperature(temperatures, parameters)
     measured = []
     for drawn in _draw(parameters, inputs, rng):
-        noise, offset = rng.normal(size=(2, 10, len(temperatures)))
-        counts = np.rint(true + inputs.netd_K * counts_per_kelvin * noise)
-        measured.append(temperature_from_counts(counts, drawn) + inputs.camera_offset_K * offset)
+        noise = rng.normal(size=(10, len(temperatures)))
+        offset, scale = rng.normal(size=(2, 10, 1))
+        # The camera errs in what it reads of a black body.
+        reading = temperature_from_counts(true, black)
+        read = reading + inputs.camera_offset_K * offset + inputs.camera_scale * scale * reading
+        counts = np.rint(counts_from_temperature(read, black) + inputs.netd_K * counts_per_kelvin * noise)
+        measured.append(temperature_from_counts(counts, drawn))
     return np.concatenate(measured).std(axis=0, ddof=1)
 
 
@@ -75,7 +86,7 @@ def test_standard_uncertainty_equals_monte_carlo(
 
 
 def test_rise_uncertainty_equals_monte_carlo_and_not_twice_the_level(rng: np.random.Generator) -> None:
-    parameters, inputs = _scene(0.95, window=False), InputUncertainty()
+    parameters, inputs = _scene(0.95, window=False), InputUncertainty(camera_scale=0.0)
     before, after = 22.0, 27.0
     counts = [counts_from_temperature(t, parameters) for t in (before, after)]
     rises = []
@@ -105,7 +116,7 @@ def test_budget_names_its_parts_and_adds_them_up() -> None:
     budget = temperature_uncertainty(temperature, PARAMETERS, InputUncertainty(camera_scale=0.02))
     assert set(budget.common) == {
         "emissivity", "reflected_temperature_K", "atmospheric_temperature_K", "relative_humidity",
-        "object_distance_m", "camera_offset", "camera_scale",
+        "object_distance_m", "camera_offset_K", "camera_scale",
     }  # fmt: skip
     assert set(budget.per_frame) == {"noise", "quantisation"}
     parts = [*budget.common.values(), *budget.per_frame.values()]
@@ -149,3 +160,51 @@ def test_a_temperature_averaged_over_no_frame_is_refused(frames: object) -> None
 def test_cells_without_a_temperature_may_have_no_frames() -> None:
     budget = temperature_uncertainty(np.array([25.0, np.nan]), PARAMETERS, frames=np.array([4, 0]))
     assert np.isfinite(budget.total_u).tolist() == [True, False]
+
+
+def test_two_percent_of_reading_are_two_percent_of_the_reading_in_degrees_celsius() -> None:
+    black = override(PARAMETERS, emissivity=1.0, object_distance_m=0.0)
+    inputs = InputUncertainty(camera_offset_K=0.0, camera_scale=0.02)
+    parts = common_contributions([25.0, 300.0, 400.0], black, inputs)
+    np.testing.assert_allclose(parts["camera_scale"], [0.5, 6.0, 8.0], rtol=1e-6)
+
+
+def test_an_error_of_the_camera_is_larger_on_a_surface_that_emits_less() -> None:
+    inputs = InputUncertainty(camera_offset_K=1.0, camera_scale=0.0)
+    for emissivity in (0.97, 0.35):
+        parameters = override(PARAMETERS, emissivity=emissivity, object_distance_m=0.0, reflected_temperature_K=298.15)
+        # At the temperature of its surroundings the surface looks like a black body.
+        part = common_contributions(25.0, parameters, inputs)["camera_offset_K"]
+        assert float(part) == pytest.approx(1 / emissivity, rel=1e-6)
+
+
+def test_one_percent_of_emissivity_is_one_percent_of_the_rise() -> None:
+    parameters = override(PARAMETERS, emissivity=0.97, object_distance_m=0.0)
+    share = rise_scale_contributions(25.0, parameters, InputUncertainty(emissivity=0.0097))["emissivity"]
+    counts = counts_from_temperature([24.5, 25.5], parameters)
+    wrong = temperature_from_counts(counts, override(parameters, emissivity=0.9797))
+    assert float(share) == pytest.approx(np.diff(wrong)[0] - 1.0, rel=0.02)
+    assert float(share) == pytest.approx(-0.01, rel=0.1)
+
+
+def test_drift_of_the_zero_does_not_cancel_in_a_rise() -> None:
+    inputs = InputUncertainty(camera_drift_K=0.2)
+    budget = temperature_rise_uncertainty(
+        27.0, 22.0, override(PARAMETERS, emissivity=1.0, object_distance_m=0.0), inputs
+    )
+    assert float(budget.common["camera_drift_K"]) == pytest.approx(0.2, rel=1e-6)
+
+
+@pytest.mark.parametrize(("emissivity", "u", "low", "high"), [(0.97, 0.01, 0.95, 1.05), (0.15, 0.04, 1.15, 1.7)])
+def test_first_order_is_compared_with_drawn_distributions(emissivity: float, u: float, low: float, high: float) -> None:
+    inputs = InputUncertainty(emissivity=u)
+    of_temperature, of_rise = monte_carlo_ratio([25.0, 30.0], (25.0, 30.0), _scene(emissivity, window=False), inputs)
+    assert of_temperature.shape == (2,)
+    assert low < of_rise < high
+
+
+def test_an_emissivity_within_two_uncertainties_of_zero_is_refused() -> None:
+    with pytest.raises(
+        RadiometryError, match=r"emissivity 0\.15 with a standard uncertainty of 0\.08: .*paint the surface"
+    ):
+        monte_carlo_ratio([30.0], (25.0, 30.0), _scene(0.15, window=False), InputUncertainty(emissivity=0.08))

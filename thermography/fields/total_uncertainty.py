@@ -1,0 +1,216 @@
+"""Total standard uncertainty of fields: pixel noise and registration, and what all cells share, of temperatures and of rises."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from thermography._typing import Array
+from thermography.fields.cycle_fields import annotate, reference_cycle
+from thermography.fields.surfaces import Surface
+from thermography.io.frame import CameraParameters
+from thermography.radiometry.planck import override
+from thermography.radiometry.uncertainty import (
+    FIRST_ORDER_TOLERANCE,
+    InputUncertainty,
+    common_contributions,
+    monte_carlo_ratio,
+    reading_sensitivity,
+    rise_scale_contributions,
+)
+
+#: Temperatures at which the common uncertainty is evaluated; between them it is interpolated, to better than a thousandth.
+_GRID = 33
+#: Temperatures at which it is compared with a propagation of distributions.
+_COMPARED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Nonlinearity:
+    """Common uncertainty by propagation of distributions over that of first order, for one surface.
+
+    Attributes
+    ----------
+    temperature_degC, ratio : (n,) ndarray
+        Of temperatures, increasing.
+    rise_ratio : float
+        Of the largest rise.
+    """
+
+    temperature_degC: Array
+    ratio: Array
+    rise_ratio: float
+
+
+def compare_with_monte_carlo(
+    temperature: Array, rise: Array, parameters: CameraParameters, inputs: InputUncertainty
+) -> Nonlinearity:
+    """Compare first order with a propagation of distributions over the temperatures of one surface.
+
+    Parameters
+    ----------
+    temperature, rise : (n,) ndarray, degC and K
+        Of its cells in all cycles, finite.
+    parameters : CameraParameters
+        With the emissivity of the surface.
+    inputs : InputUncertainty
+        With the uncertainty of that emissivity.
+
+    Returns
+    -------
+    Nonlinearity
+        1 throughout where no input is uncertain.
+
+    Raises
+    ------
+    RadiometryError
+        Where an input is too uncertain for a temperature to be stated.
+    """
+    low, high = float(temperature.min()), float(temperature.max())
+    compared = np.linspace(low, max(high, low + 1.0), _COMPARED)
+    if not common_contributions(compared, parameters, inputs):
+        return Nonlinearity(compared, np.ones(_COMPARED), 1.0)
+    start = float(np.mean(temperature - rise))
+    # Without a rise there is nothing to compare; one of 1 K stands for what would be measured.
+    far = start + max(float(rise.max()), 1.0) if rise.max() >= -rise.min() else start + min(float(rise.min()), -1.0)
+    return Nonlinearity(compared, *monte_carlo_ratio(compared, (start, far), parameters, inputs))
+
+
+def evaluate_uncertainty(
+    fields: xr.Dataset,
+    parameters: Sequence[CameraParameters],
+    inputs: InputUncertainty | None = None,
+    *,
+    surfaces: Sequence[Surface] = (),
+) -> xr.Dataset:
+    """Add the total standard uncertainty of temperatures and rises to reduced fields.
+
+    Parameters
+    ----------
+    fields : Dataset
+        From `thermography.fields.still.reduce_frames` or `thermography.fields.moving.reduce_moving_frames`; ``camera_correction_u``
+        (cycle,), K, where the zero of the camera was corrected.
+    parameters : sequence of CameraParameters
+        With which every cycle was calibrated.
+    inputs : InputUncertainty, optional
+        Standard uncertainties of the inputs; by default those of a painted surface in a workshop and a common bolometer camera.
+    surfaces : sequence of Surface
+        Surfaces with an emissivity of their own, as they were calibrated; by default the whole plan is one.
+
+    Returns
+    -------
+    Dataset
+        The fields with ``temperature_u`` and ``temperature_rise_u`` (cycle, y, x), K, and ``rise_scale_u`` (y, x), 1: the part of the
+        uncertainty of a rise that is the same share of every rise of a cell.
+
+    Raises
+    ------
+    RadiometryError
+        Where a parameter makes the measurement formula meaningless, or an input is too uncertain for a temperature to be stated.
+
+    Notes
+    -----
+    Law of propagation of uncertainty (JCGM 100:2008, 5.2), corrected where a propagation of distributions (JCGM 101:2008) differs by more
+    than `thermography.radiometry.uncertainty.FIRST_ORDER_TOLERANCE`. An error that all frames share changes a rise r about the
+    temperature T by r c'(T), with the contribution c of `thermography.radiometry.uncertainty.common_contributions`; noise and
+    registration are independent of it, and so is what the correction or the drift of the camera's zero leaves in every cycle but the
+    first. See ``docs/method/fields.md``.
+    """
+    inputs = inputs or InputUncertainty()
+    temperature, rise = (fields[name].values.astype(float) for name in ("temperature", "temperature_rise"))
+    common, rise_common = np.full(temperature.shape, np.nan), np.full(temperature.shape, np.nan)
+    scale_u = np.full(temperature.shape[1:], np.nan)
+    drift_K = _drift(fields, parameters, inputs)
+    whole = Surface("", parameters[0].emissivity, inputs.emissivity, np.ones(scale_u.shape, bool))
+    for surface in surfaces or [whole]:
+        seen = surface.cells & np.isfinite(temperature)
+        if not seen.any():
+            continue
+        own = replace(inputs, emissivity=surface.emissivity_u)
+        cameras = [override(camera, emissivity=surface.emissivity) if surface.name else camera for camera in parameters]
+        compared = compare_with_monte_carlo(temperature[seen], rise[seen], cameras[0], own)
+        for camera, cycles in _cycles_by_parameters(cameras):
+            cells = seen & cycles[:, None, None]
+            if not cells.any():
+                continue
+            t, r = temperature[cells], rise[cells]
+            curves = _curves(float(t.min()), float(t.max()), camera, own, compared)
+            common[cells] = curves.u_K(t)
+            share = curves.rise_scale_u(t - 0.5 * r)
+            rise_common[cells] = np.hypot(share * r, curves.per_reading(t) * drift_K[np.nonzero(cells)[0]])
+            scale_u[surface.cells] = share.mean()
+    noise, rise_noise = (fields[name].values for name in ("temperature_noise_u", "temperature_rise_noise_u"))
+    dims = fields["temperature"].dims
+    return annotate(
+        fields.assign(
+            temperature_u=(dims, np.hypot(noise, common).astype(np.float32)),
+            temperature_rise_u=(dims, np.hypot(rise_noise, rise_common).astype(np.float32)),
+            rise_scale_u=(dims[1:], scale_u.astype(np.float32)),
+        )
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Curves:
+    """What all cells of a surface share as a function of temperature, tabulated."""
+
+    grid: Array
+    u: Array
+    scale: Array
+    sensitivity: Array
+
+    def u_K(self, temperature: Array) -> Array:
+        """Common standard uncertainty of temperatures."""
+        return np.interp(temperature, self.grid, self.u)
+
+    def rise_scale_u(self, middle: Array) -> Array:
+        """Common standard uncertainty of rises about a temperature, as a share of the rise."""
+        return np.interp(middle, self.grid, self.scale)
+
+    def per_reading(self, temperature: Array) -> Array:
+        """Error of a temperature per error of what the camera reads."""
+        return np.interp(temperature, self.grid, self.sensitivity)
+
+
+def _curves(
+    low: float, high: float, parameters: CameraParameters, inputs: InputUncertainty, compared: Nonlinearity
+) -> _Curves:
+    """Tabulate the common uncertainty between two temperatures, corrected where first order fails."""
+    grid = np.linspace(low, max(high, low + 1.0), _GRID)
+    u = _root_sum_square(common_contributions(grid, parameters, inputs), grid)
+    scale = _root_sum_square(rise_scale_contributions(grid, parameters, inputs), grid)
+    _, sensitivity = reading_sensitivity(grid, parameters)
+    factor = np.interp(grid, compared.temperature_degC, _beyond_tolerance(compared.ratio))
+    return _Curves(grid, u * factor, scale * _beyond_tolerance(np.array(compared.rise_ratio)), sensitivity)
+
+
+def _beyond_tolerance(ratio: Array) -> Array:
+    """Factor by which first order is corrected: 1 within the tolerance."""
+    return np.where(np.abs(ratio - 1.0) > FIRST_ORDER_TOLERANCE, ratio, 1.0)
+
+
+def _cycles_by_parameters(parameters: Sequence[CameraParameters]) -> list[tuple[CameraParameters, NDArray[np.bool_]]]:
+    """Every set of parameters with the cycles that were calibrated with it, (cycle,)."""
+    return [(camera, np.array([one == camera for one in parameters])) for camera in dict.fromkeys(parameters)]
+
+
+def _drift(fields: xr.Dataset, parameters: Sequence[CameraParameters], inputs: InputUncertainty) -> Array:
+    """What correction or drift of the camera's zero leave of it in every cycle, (cycle,) K as the camera reads it."""
+    temperature = fields["temperature"].values
+    reference = reference_cycle(temperature)
+    drift = np.full(len(temperature), inputs.camera_drift_K)
+    # Where nothing but the table is in view the zero was not examined: its uncertainty is 0, and the stated drift stands.
+    if "camera_correction_u" in fields and (left := fields["camera_correction_u"].values.astype(float)).any():
+        # The correction is one of the temperature of the table.
+        _, at_table = reading_sensitivity(float(np.nanmean(temperature)), parameters[reference])
+        drift = np.hypot(left, left[reference]) / at_table
+    drift[reference] = 0.0
+    return drift
+
+
+def _root_sum_square(parts: dict[str, Array], grid: Array) -> Array:
+    return np.sqrt(np.sum([part**2 for part in parts.values()] or [np.zeros_like(grid)], axis=0))
