@@ -14,6 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.alignment.align import AlignmentError, AxisGeometry, camera_on_laser_clock, cycle_bounds
+from fusion.alignment.zone_shift import covered_share, likely_zone_shift
 from fusion.attribution.randomised_duty import DutyLaw, read_duty
 from fusion.attribution.thermal_modes import Region, read_regions
 from fusion.campaign.config import Campaign, InterferometryTable, PlanTable, ThermographyTable, relative_name
@@ -367,11 +368,8 @@ def listed(names: Iterable[str]) -> str:
     return "; ".join(names[:_NAMED]) + more
 
 
-_QUARTER_HOUR_S = 900.0
-_DAY_S = 86_400.0
-#: A shift by whole quarter hours counts as a wrong time zone where it raises the share of readings within the frames from below
-#: the first value to above the second.
-_COVERED_NOW, _COVERED_SHIFTED = 0.6, 0.95
+#: A shift by whole quarter hours counts as a wrong time zone where less than this share of the readings lies within the frames.
+_COVERED_NOW = 0.6
 
 
 def _raise_if_clocks_disagree(
@@ -400,8 +398,8 @@ def _raise_if_clocks_disagree(
     if readings.size == 0:
         raise AlignmentError(f"{source}: no reading has a time; readings and frames cannot be brought together")
     frames = camera_on_laser_clock(frame_time, clock_offset_s or 0.0)
-    covered = _covered(readings, frames, 0.0)
-    shift = _likely_zone_shift(readings, frames)
+    covered = covered_share(readings, frames)
+    shift = likely_zone_shift(readings, frames)
     span = f"frames {_shown(frames[0])} to {_shown(frames[-1])}, readings {_shown(readings.min())} to {_shown(readings.max())}"
     if covered < _COVERED_NOW and shift is not None:
         raise AlignmentError(
@@ -414,21 +412,6 @@ def _raise_if_clocks_disagree(
             f"{source}: frames and readings never meet ({span}); set thermography.clock_offset (camera clock minus laser clock), "
             "or check that both folders belong to the same test"
         )
-
-
-def _covered(readings: NDArray[np.datetime64], frames: NDArray[np.datetime64], shift_s: float) -> float:
-    """Return the share of readings between the first and the last frame, with the frames moved back by `shift_s`."""
-    shift = np.timedelta64(round(shift_s * 1e9), "ns")
-    return float(np.mean((readings >= frames[0] - shift) & (readings <= frames[-1] - shift)))
-
-
-def _likely_zone_shift(readings: NDArray[np.datetime64], frames: NDArray[np.datetime64]) -> float | None:
-    """Return the shift in s by whole quarter hours within a day of the best overlap, None unless nearly all readings are covered."""
-    shifts = np.arange(-_DAY_S, _DAY_S + 1, _QUARTER_HOUR_S)
-    shares = np.array([_covered(readings, frames, float(shift)) for shift in shifts])
-    best = np.flatnonzero(shares == shares.max())
-    nearest = best[np.argmin(np.abs(shifts[best]))]
-    return float(shifts[nearest]) if shares[nearest] >= _COVERED_SHIFTED and shifts[nearest] != 0 else None
 
 
 def _shown(time: np.datetime64) -> str:

@@ -6,12 +6,17 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from fusion.alignment.zone_shift import likely_zone_shift
 from fusion.consistency.checks import Check, Severity
 
 #: Share of the readings that a log has to cover.
 _LEAST_COVERED = 0.9
 #: A gap is a stretch without a sample that is longer than this, s, and ten times the usual step.
 _GAP_S = 600.0
+#: A log that covers less than this share of the readings, and begins and ends with them after a shift, is on another clock, ...
+_COVERED_NOW = 0.6
+#: ... both ends within this time, s: loggers are switched on and off by hand.
+_SAME_END_S = 900.0
 
 
 def check_log(
@@ -44,6 +49,8 @@ def check_log(
         return []
     covered = _covered(log["time"].values, readings)
     passed = covered >= _LEAST_COVERED
+    late_s = None if passed else likely_zone_shift(readings, log["time"].values)
+    clear = late_s is not None and covered < _COVERED_NOW and _same_ends(log["time"].values, readings, late_s)
     first, last = (np.datetime_as_string(log["time"].values[k], unit="s") for k in (0, -1))
     span = f"{np.datetime_as_string(readings.min(), unit='s')}Z to {np.datetime_as_string(readings.max(), unit='s')}Z"
     return [
@@ -52,12 +59,28 @@ def check_log(
             covered,
             _LEAST_COVERED,
             passed,
-            f"{file} ({first}Z to {last}Z) covers {100.0 * covered:.0f} % of the readings ({span}).",
-            "" if passed else f"Check the date and the clock of {file}, or leave it out of the campaign file.",
+            f"{file} ({first}Z to {last}Z) covers {100.0 * covered:.0f} % of the readings ({span})"
+            + ("." if late_s is None else f", and nearly all of them if its clock is {_hours(late_s)}."),
+            ""
+            if passed
+            else (
+                f"Check the date, the clock and the time zone of {file} (write its times with their zone, or time_zone), or leave it out "
+                "of the campaign file."
+            ),
             endangers,
-            Severity.CONTRADICTION if covered == 0.0 else Severity.DOUBT,
+            Severity.CONTRADICTION if covered == 0.0 or clear else Severity.DOUBT,
         )
     ]
+
+
+def _same_ends(logged: NDArray[np.datetime64], readings: NDArray[np.datetime64], late_s: float) -> bool:
+    """Whether a log begins and ends with the readings once its clock is put right."""
+    ends = ((logged[[0, -1]] - [readings.min(), readings.max()]) / np.timedelta64(1, "s")) - late_s
+    return bool(np.all(np.abs(ends) <= _SAME_END_S))
+
+
+def _hours(late_s: float) -> str:
+    return f"{abs(late_s) / 3600.0:g} h {'late' if late_s > 0.0 else 'early'}"
 
 
 def _covered(logged: NDArray[np.datetime64], readings: NDArray[np.datetime64]) -> float:

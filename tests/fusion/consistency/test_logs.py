@@ -33,7 +33,7 @@ def test_a_log_of_another_day_is_a_contradiction() -> None:
     assert found.evidence.startswith(
         "drivers.csv (2026-03-10T06:30:00Z to 2026-03-10T10:30:00Z) covers 0 % of the readings"
     )
-    assert "Check the date and the clock of drivers.csv" in found.remedy
+    assert "Check the date, the clock and the time zone of drivers.csv" in found.remedy
 
 
 @pytest.mark.parametrize(("last_s", "share"), [(2 * 3600.0, 0.5), (3600.0, 0.25)])
@@ -42,6 +42,21 @@ def test_a_log_that_ends_early_is_doubted(last_s: float, share: float) -> None:
     assert not found.passed and found.severity is Severity.DOUBT
     # One reading more or less at the end.
     assert found.value == pytest.approx(share, abs=0.002)
+
+
+@pytest.mark.parametrize(("late_s", "words"), [(10_800.0, "3 h late"), (-9000.0, "2.5 h early")])
+def test_a_log_of_another_time_zone_is_a_contradiction_that_names_the_shift(late_s: float, words: str) -> None:
+    found = check(log(late_s, late_s + 4 * 3600.0))
+    assert found.severity is Severity.CONTRADICTION and found.value < 0.6
+    assert f"nearly all of them if its clock is {words}." in found.evidence and "time_zone" in found.remedy
+
+
+def test_a_log_that_may_have_been_started_late_is_only_doubted() -> None:
+    # Half of the test is covered, and after a shift all of it; but this log goes on for hours after the test.
+    found = check(log(7200.0, 10 * 3600.0))
+    assert found.severity is Severity.DOUBT and "2 h late" in found.evidence
+    # An hour late: three quarters are covered, the shift is named.
+    assert "if its clock is 1 h late" in check(log(3600.0, 5 * 3600.0)).evidence
 
 
 def test_a_log_with_a_long_gap_is_doubted() -> None:
