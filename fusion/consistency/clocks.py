@@ -27,8 +27,9 @@ from interferometry.drift.state_space import DriftModelError
 
 #: Shifts of a log that are tried, s: three hours, as far as time zones of one country lie apart, in steps of two minutes.
 _LOG_SHIFTS_S = np.arange(-10_800.0, 10_801.0, 120.0)
-#: Delays of a log against the field that are no clock's: heat takes minutes from a source to the surface, a sensor follows late.
-_LOG_DELAYS_S = (-300.0, 900.0)
+#: Delays of a log against the field that are no clock's, s: a sensor follows late; heat takes minutes from a source to the surface, and a
+#: source of another time constant than those tried looks early or late.
+_SENSOR_EARLY_S, _LOG_DELAY_S = 300.0, 900.0
 #: A shift must leave this many times less of the material temperature than every delay of physics does (variance ratio of 9, which
 #: two series of eight independent values each show by chance once in 200 times).
 _MISFIT_RATIO = 3.0
@@ -39,8 +40,9 @@ _LEAST_COMMON = 0.5
 _SOURCE_S, _TABLE_S = (300.0, 1200.0), (1800.0, 7200.0, 36_000.0)
 #: Leading modes of the field's rate: source and table make two, the rest is noise.
 _MODES = 2
-#: Share of the field's rate that the load must explain, and the factor by which a shift must lessen what is left.
-_LEAST_EXPLAINED, _LEFT_RATIO = 0.6, 2.0
+#: Share of the variance of the field's rate that the load must explain, and the factor by which a shift must lessen what is left: half
+#: the standard deviation.
+_LEAST_EXPLAINED, _LEFT_RATIO = 0.6, 4.0
 #: Resampled courses, none of which may gain as much, from blocks of this length, s.
 _DRAWS, _BLOCK_S = 400, 1800.0
 
@@ -115,7 +117,7 @@ def _material_shift(near: FieldSeries, at: Array, logged: Array) -> Shift | None
         compared = [compare_course(cells[inside], target) for cells in courses]
         left[k] = max(min(float(course.unexplained_K.min()) for course in compared), RESOLUTION_K)
         spread[k] = max(compared[0].spread_K, RESOLUTION_K)
-    within = _within_delays()
+    within = _delays(_SENSOR_EARLY_S)
     if not np.isfinite(left[within]).any():
         return None
     share = left / spread
@@ -125,9 +127,9 @@ def _material_shift(near: FieldSeries, at: Array, logged: Array) -> Shift | None
     return Shift(float(_LOG_SHIFTS_S[best]), float(share[best]), float(share[allowed]))
 
 
-def _within_delays() -> NDArray[np.bool_]:
-    least_s, most_s = _LOG_DELAYS_S
-    return np.asarray((least_s <= _LOG_SHIFTS_S) & (most_s >= _LOG_SHIFTS_S))
+def _delays(early_s: float) -> NDArray[np.bool_]:
+    """Which of the shifts are no larger than the delays of physics."""
+    return np.asarray((-early_s <= _LOG_SHIFTS_S) & (np.abs(_LOG_SHIFTS_S) <= _LOG_DELAY_S))
 
 
 def check_load_clock(field: FieldSeries | None, log: xr.Dataset | None, *, file: str) -> list[Check]:
@@ -225,7 +227,7 @@ def _load_shift(rate: _Rate, at: Array, load: Array) -> Shift | None:
     columns = rate.columns(at, load)
     shapes = columns.shape[1]
     flat = columns.reshape(-1, columns.shape[-1])
-    within = np.repeat(_within_delays(), shapes)
+    within = np.repeat(_delays(_LOG_DELAY_S), shapes)
     total = float((rate.modes**2).sum())
     left = 1.0 - ((flat @ rate.modes) ** 2).sum(axis=1) / max(total, 1e-30)
     best, allowed = int(np.argmin(left)), int(np.flatnonzero(within)[np.argmin(left[within])])
@@ -263,7 +265,7 @@ def _chance_gain(rate: _Rate, columns: Array, within: NDArray[np.bool_], kept: A
 
 def _log_check(code: str, file: str, what: str, shift: Shift | None, endangers: str) -> Check:
     """The check of a log's clock, in minutes late."""
-    limit_min = _LOG_DELAYS_S[1] / 60.0
+    limit_min = _LOG_DELAY_S / 60.0
     if shift is None:
         told = f"No shift of {file} suits {what} and field better than the delays of heat and sensors do (or it cannot be told)."
         return Check(code, 0.0, limit_min, True, told, "", endangers)

@@ -46,10 +46,15 @@ class FieldSeries:
         return np.asarray((times.astype("datetime64[ns]") - self.start) / np.timedelta64(1, "s"), float)
 
     def near(self, place_mm: tuple[float, float]) -> FieldSeries:
-        """Return the cells whose centre lies within a coarse cell of a plan point; the nearest one where none does."""
-        distance = np.hypot(self.x_mm - place_mm[0], self.y_mm - place_mm[1])
-        chosen = distance <= max(_COARSE_MM, float(distance.min()))
-        return FieldSeries(self.start, self.seconds, self.temperature[:, chosen], self.x_mm[chosen], self.y_mm[chosen])
+        """Return one cell: the temperature at a plan point, linear between the cells about it; the nearest cell where none is."""
+        away = np.abs([self.x_mm - place_mm[0], self.y_mm - place_mm[1]])
+        weight = np.prod(np.maximum(1.0 - away / _COARSE_MM, 0.0), axis=0)
+        if not weight.sum() > 0.0:
+            weight[np.argmin(np.hypot(*away))] = 1.0
+        temperature = self.temperature @ (weight / weight.sum())
+        return FieldSeries(
+            self.start, self.seconds, temperature[:, None], np.array([place_mm[0]]), np.array([place_mm[1]])
+        )
 
     def lagged(self, time_constant_s: float) -> Array:
         """Return what a sensor of a time constant, s, would show on every cell, (n, cells), degC."""

@@ -30,6 +30,8 @@ _LEAST_CHANGE_K = 1.0
 _SHORT_TERM_S = 1200.0
 #: A cell is as good as the best one where the misfit is no larger by this many units of log-likelihood.
 _AS_GOOD = 6.0
+#: So well, K, a surface probe shows the course of its place: where it is not stated, cells that follow it within this cannot be told apart.
+_PROBE_K = 0.03
 #: Largest difference of the levels, K: twice the accuracy of a thermal camera of 2 K.
 _LARGEST_LEVEL_K = 4.0
 _FIGURES = "temperatures, rises, the declared coefficients, and every cause that follows the field"
@@ -103,7 +105,7 @@ def check_material(
 def _rise(near: FieldSeries, inside: Array, logged: Array, *, stated: bool) -> Check:
     """The camera's rise per K of the logged one."""
     change = float(np.ptp(logged))
-    slopes = _slopes(near, inside, logged) if change >= _LEAST_CHANGE_K and inside.sum() >= 12 else None
+    slopes = _slopes(near, inside, logged, stated=stated) if change >= _LEAST_CHANGE_K and inside.sum() >= 12 else None
     limit = (_CONTACT if stated else _UNKNOWN_PLACE) + _CAMERA_DRIFT_K / max(change, _LEAST_CHANGE_K)
     if slopes is None:
         told = f"The logged material temperature changes by {change:.2g} K and does not show the camera's scale: cannot be told."
@@ -129,7 +131,7 @@ def _rise(near: FieldSeries, inside: Array, logged: Array, *, stated: bool) -> C
     )
 
 
-def _slopes(near: FieldSeries, inside: Array, logged: Array) -> tuple[float, float] | None:
+def _slopes(near: FieldSeries, inside: Array, logged: Array, *, stated: bool) -> tuple[float, float] | None:
     """Smallest and largest slope of the camera over the log that the data allow; None where no cell follows the log.
 
     The slope is taken from levels and from differences over 20 min, each with the error in the log and in the camera (Frisch 1934:
@@ -145,6 +147,8 @@ def _slopes(near: FieldSeries, inside: Array, logged: Array) -> tuple[float, flo
     if best > LEAST_FOLLOWED * spread:
         return None
     as_good = best * float(np.exp(_AS_GOOD / logged.size))
+    if not stated:
+        as_good = max(as_good, _PROBE_K)
     slopes = []
     for course, cells in courses:
         chosen = cells[:, course.unexplained_K <= as_good]

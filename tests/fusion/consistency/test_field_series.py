@@ -36,12 +36,13 @@ def test_a_cell_that_is_not_always_seen_is_left_out() -> None:
     assert thin_fields(fields(11, 60.0)) is None
 
 
-def test_the_cells_near_a_point() -> None:
+def test_the_temperature_at_a_point() -> None:
     series = thin_fields(fields(20, 60.0))
     assert series is not None
-    assert sorted(series.near((30.0, 10.0)).x_mm) == [10.0, 30.0, 30.0, 50.0]
+    # Linear along x, so that interpolation is exact.
+    np.testing.assert_allclose(series.near((42.0, 17.0)).temperature[:, 0], 20.0 + np.arange(20) + 4.2)
     far = series.near((500.0, 10.0))
-    assert far.x_mm.tolist() == [90.0] and far.y_mm.tolist() == [10.0]
+    np.testing.assert_allclose(far.temperature[:, 0], 20.0 + np.arange(20) + 9.0)
 
 
 def test_a_sensor_follows_with_its_time_constant() -> None:
