@@ -74,31 +74,26 @@ class Shift:
     left_within: float
 
 
-def check_material_clock(
-    field: FieldSeries | None, log: xr.Dataset | None, *, file: str, place_mm: tuple[float, float] | None
-) -> list[Check]:
+def check_material_clock(near: FieldSeries | None, log: xr.Dataset | None, *, file: str) -> list[Check]:
     """Check the clock of the environment log: the material temperature follows the camera's.
 
     Parameters
     ----------
-    field : FieldSeries or None
-        Temperature of the table; None where too few frames show it.
+    near : FieldSeries or None
+        Temperature of the table at the sensor's place, or of all cells, which are tried then; None where too few frames show it.
     log : Dataset or None
         Environment along ``time`` (UTC) with ``material_temperature``, degC.
     file : str
         The file, for the message.
-    place_mm : (float, float) or None, mm
-        Plan point of the sensor; None tries every cell.
 
     Returns
     -------
     list of Check
         ``environment_clock``; empty where nothing was logged or no field is there.
     """
-    if field is None or log is None or "material_temperature" not in log:
+    if near is None or log is None or "material_temperature" not in log:
         return []
-    near = field if place_mm is None else field.near(place_mm)
-    shift = _material_shift(near, field.since_start(log["time"].values), log["material_temperature"].values)
+    shift = _material_shift(near, near.since_start(log["time"].values), log["material_temperature"].values)
     endangered = (
         "index of air, dead path and material compensation; all fields, where it is the camera's clock that errs"
     )

@@ -21,7 +21,7 @@ _LEAST_FRAMES = 12
 
 @dataclass(frozen=True)
 class FieldSeries:
-    """Temperature of coarse cells over time.
+    """Temperature of cells over time.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class FieldSeries:
     seconds : (n,) ndarray, s
         Times since `start`, at least a minute apart.
     temperature : (n, cells) ndarray, degC
-        Means over coarse cells that every frame shows whole.
+        Of cells that every frame shows whole.
     x_mm, y_mm : (cells,) ndarray, mm
         Centres of the cells.
     """
@@ -44,17 +44,6 @@ class FieldSeries:
     def since_start(self, times: NDArray[np.datetime64]) -> Array:
         """Return times, (m,) datetime64, as seconds since `start`."""
         return np.asarray((times.astype("datetime64[ns]") - self.start) / np.timedelta64(1, "s"), float)
-
-    def near(self, place_mm: tuple[float, float]) -> FieldSeries:
-        """Return one cell: the temperature at a plan point, linear between the cells about it; the nearest cell where none is."""
-        away = np.abs([self.x_mm - place_mm[0], self.y_mm - place_mm[1]])
-        weight = np.prod(np.maximum(1.0 - away / _COARSE_MM, 0.0), axis=0)
-        if not weight.sum() > 0.0:
-            weight[np.argmin(np.hypot(*away))] = 1.0
-        temperature = self.temperature @ (weight / weight.sum())
-        return FieldSeries(
-            self.start, self.seconds, temperature[:, None], np.array([place_mm[0]]), np.array([place_mm[1]])
-        )
 
     def lagged(self, time_constant_s: float) -> Array:
         """Return what a sensor of a time constant, s, would show on every cell, (n, cells), degC."""
@@ -74,19 +63,60 @@ def thin_fields(fields: xr.Dataset) -> FieldSeries | None:
     FieldSeries or None
         None where fewer than 12 frames remain, or no coarse cell is seen whole by all of them.
     """
+    frames = _thinned(fields)
+    cell_mm = abs(float(np.median(np.diff(fields["x"].values))))
+    count = max(1, round(_COARSE_MM / cell_mm))
+    return _series(frames.coarsen(x=count, y=count, boundary="trim").reduce(np.mean))
+
+
+def field_at(fields: xr.Dataset, place_mm: tuple[float, float]) -> FieldSeries | None:
+    """Reduce the fields to the temperature at one place of the plan: a plane through the cells about it that every frame shows.
+
+    Parameters
+    ----------
+    fields : Dataset
+        Keeps ``thermography.contract.FIELDS``, on the laser's clock.
+    place_mm : (float, float), mm
+        Plan point; where fewer than three cells lie within a coarse cell of it, the nearest cell stands for it.
+
+    Returns
+    -------
+    FieldSeries or None
+        One cell; None where fewer than 12 frames remain, or no cell is seen by all of them.
+    """
+    series = _series(_thinned(fields))
+    if series is None:
+        return None
+    away = np.array([series.x_mm - place_mm[0], series.y_mm - place_mm[1]])
+    distance = np.hypot(*away)
+    about = np.flatnonzero(distance <= _COARSE_MM)
+    if about.size < 3:
+        weight, about = np.ones(1), np.array([np.argmin(distance)])
+    else:
+        weight = np.linalg.pinv(np.column_stack([np.ones(about.size), *away[:, about]]))[0]
+    temperature = series.temperature[:, about] @ weight
+    place = np.array([[place_mm[0]], [place_mm[1]]])
+    return FieldSeries(series.start, series.seconds, temperature[:, None], *place)
+
+
+def _thinned(fields: xr.Dataset) -> xr.DataArray:
+    """Frames at least a minute apart."""
     time = fields["time"].values.astype("datetime64[ns]")
     seconds = (time - time[0]) / np.timedelta64(1, "s")
     kept = [0]
     for k in range(1, seconds.size):
         if seconds[k] - seconds[kept[-1]] >= _LEAST_STEP_S:
             kept.append(k)
-    frames = fields["frame_temperature"].isel(time=kept)
-    cell_mm = abs(float(np.median(np.diff(fields["x"].values))))
-    count = max(1, round(_COARSE_MM / cell_mm))
-    coarse = frames.coarsen(x=count, y=count, boundary="trim").reduce(np.mean)
-    values = coarse.values.reshape(len(kept), -1).astype(float)
+    return fields["frame_temperature"].isel(time=kept)
+
+
+def _series(frames: xr.DataArray) -> FieldSeries | None:
+    """Cells that all frames show, as series; None where there are too few frames or no such cell."""
+    time = frames["time"].values.astype("datetime64[ns]")
+    values = frames.values.reshape(time.size, -1).astype(float)
     seen = np.isfinite(values).all(axis=0)
-    if len(kept) < _LEAST_FRAMES or not seen.any():
+    if time.size < _LEAST_FRAMES or not seen.any():
         return None
-    y, x = np.meshgrid(coarse["y"].values, coarse["x"].values, indexing="ij")
-    return FieldSeries(time[0], seconds[kept], values[:, seen], x.ravel()[seen], y.ravel()[seen])
+    seconds = (time - time[0]) / np.timedelta64(1, "s")
+    y, x = np.meshgrid(frames["y"].values, frames["x"].values, indexing="ij")
+    return FieldSeries(time[0], seconds, values[:, seen], x.ravel()[seen], y.ravel()[seen])

@@ -72,34 +72,31 @@ def compare_course(cells: Array, logged: Array) -> Course:
     return Course(np.sqrt(left / logged.size), float(target.std()))
 
 
-def check_material(
-    field: FieldSeries | None, log: xr.Dataset | None, *, place_mm: tuple[float, float] | None
-) -> list[Check]:
+def check_material(near: FieldSeries | None, log: xr.Dataset | None, *, stated: bool) -> list[Check]:
     """Check rise and level of the camera's temperature against the logged material temperature.
 
     Parameters
     ----------
-    field : FieldSeries or None
-        Temperature of the table; None where too few frames show it.
+    near : FieldSeries or None
+        Temperature of the table at the sensor's place, or of all cells; None where too few frames show it.
     log : Dataset or None
         Environment along ``time`` (UTC) with ``material_temperature``, degC.
-    place_mm : (float, float) or None, mm
-        Plan point of the sensor; None where it is not stated, so that the cell whose course is most like the log stands for it.
+    stated : bool
+        Whether the sensor's place is stated; else the cell whose course is most like the log stands for it.
 
     Returns
     -------
     list of Check
         ``material_rise`` and ``material_level``; empty where nothing was logged or no field is there.
     """
-    if field is None or log is None or "material_temperature" not in log:
+    if near is None or log is None or "material_temperature" not in log:
         return []
-    near = field if place_mm is None else field.near(place_mm)
-    at = field.since_start(log["time"].values)
+    at = near.since_start(log["time"].values)
     inside = (near.seconds >= at[0]) & (near.seconds <= at[-1])
     if inside.sum() < 2:
         return []
     logged = np.interp(near.seconds[inside], at, log["material_temperature"].values)
-    return [_rise(near, inside, logged, stated=place_mm is not None), _level(near.temperature[inside], logged)]
+    return [_rise(near, inside, logged, stated=stated), _level(near.temperature[inside], logged)]
 
 
 def _rise(near: FieldSeries, inside: Array, logged: Array, *, stated: bool) -> Check:

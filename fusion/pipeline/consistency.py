@@ -16,7 +16,7 @@ from fusion.consistency.camera_stamps import check_order, check_phase
 from fusion.consistency.checks import CODES, Check
 from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_material_clock
 from fusion.consistency.coefficients import check_coefficients
-from fusion.consistency.field_series import thin_fields
+from fusion.consistency.field_series import field_at, thin_fields
 from fusion.consistency.frames import check_frames
 from fusion.consistency.logs import check_log
 from fusion.consistency.readings import check_readings
@@ -101,15 +101,15 @@ def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[
     list of Check
         Of the clocks, and of rise and level of the camera's temperature.
     """
-    field = thin_fields(fields)
+    field, place_mm = thin_fields(fields), source.interferometry.material_sensor_mm
+    near = field if place_mm is None else field_at(fields, place_mm)
     interferometry, drivers = source.campaign.interferometry, source.campaign.drivers
     environment_file = (interferometry.environment if interferometry is not None else None) or "the environment log"
-    place_mm = source.interferometry.material_sensor_mm
     return [
         *check_camera_clock(read_fused(fused)),
-        *check_material_clock(field, source.environment, file=environment_file, place_mm=place_mm),
+        *check_material_clock(near, source.environment, file=environment_file),
         *check_load_clock(field, source.drivers, file=drivers.file if drivers is not None else "the drivers' log"),
-        *check_material(field, source.environment, place_mm=place_mm),
+        *check_material(near, source.environment, stated=place_mm is not None),
     ]
 
 

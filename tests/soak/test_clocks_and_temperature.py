@@ -14,7 +14,7 @@ from fusion.alignment.readings import read_fused
 from fusion.consistency.camera_stamps import check_phase
 from fusion.consistency.checks import Check
 from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_material_clock
-from fusion.consistency.field_series import thin_fields
+from fusion.consistency.field_series import field_at, thin_fields
 from fusion.consistency.temperature import check_material
 from fusion.twin import simulate
 from fusion.twin.machine.recipe import EffectRecipe, Recipe
@@ -62,11 +62,12 @@ def record(recipe: Recipe) -> Recorded:
 
 def of_logs(test: Recorded, *, stated: bool) -> list[Check]:
     """The checks of the logs and of the camera's rise."""
-    field, place_mm = thin_fields(test.fields), PROBE_MM if stated else None
+    field = thin_fields(test.fields)
+    near = field_at(test.fields, PROBE_MM) if stated else field
     return [
-        *check_material_clock(field, test.environment, file="environment.csv", place_mm=place_mm),
+        *check_material_clock(near, test.environment, file="environment.csv"),
         *check_load_clock(field, test.drivers, file="drivers.csv"),
-        *check_material(field, test.environment, place_mm=place_mm),
+        *check_material(near, test.environment, stated=stated),
     ]
 
 

@@ -7,14 +7,15 @@ import pytest
 
 from fusion.consistency.checks import Check
 from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_material_clock
-from fusion.consistency.field_series import thin_fields
+from fusion.consistency.field_series import field_at, thin_fields
 from tests.fusion.consistency.twin_fields import SENSOR_MM, Recorded, late, recorded
 
 
 def logs(test: Recorded, *, environment: float = 0.0, drivers: float = 0.0, camera: float = 0.0) -> dict[str, Check]:
-    field = thin_fields(late(test.fields, camera))
+    fields = late(test.fields, camera)
+    field, near = thin_fields(fields), field_at(fields, SENSOR_MM)
     checks = [
-        *check_material_clock(field, late(test.environment, environment), file="environment.csv", place_mm=SENSOR_MM),
+        *check_material_clock(near, late(test.environment, environment), file="environment.csv"),
         *check_load_clock(field, late(test.drivers, drivers), file="drivers.csv"),
     ]
     return {check.code: check for check in checks}
@@ -60,7 +61,7 @@ def test_where_nothing_varies_nothing_is_told() -> None:
     test = recorded(duty="constant")
     assert set(logs(test)) == {"environment_clock"}
     assert check_load_clock(None, test.drivers, file="") == []
-    assert check_material_clock(thin_fields(test.fields), None, file="", place_mm=None) == []
+    assert check_material_clock(thin_fields(test.fields), None, file="") == []
 
 
 def test_a_load_that_drives_nothing_seen_is_not_doubted() -> None:

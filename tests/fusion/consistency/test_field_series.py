@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fusion.consistency.field_series import thin_fields
+from fusion.consistency.field_series import field_at, thin_fields
 
 START = np.datetime64("2026-03-09T06:30", "ns")
 
@@ -36,13 +36,17 @@ def test_a_cell_that_is_not_always_seen_is_left_out() -> None:
     assert thin_fields(fields(11, 60.0)) is None
 
 
-def test_the_temperature_at_a_point() -> None:
-    series = thin_fields(fields(20, 60.0))
-    assert series is not None
-    # Linear along x, so that interpolation is exact.
-    np.testing.assert_allclose(series.near((42.0, 17.0)).temperature[:, 0], 20.0 + np.arange(20) + 4.2)
-    far = series.near((500.0, 10.0))
-    np.testing.assert_allclose(far.temperature[:, 0], 20.0 + np.arange(20) + 9.0)
+def test_the_temperature_at_a_place_is_that_of_a_plane_through_the_cells_about_it() -> None:
+    holed = fields(20, 60.0)
+    # A disc beside the place hides some of its cells; linear along x, so that a plane is exact.
+    holed["frame_temperature"][:, 2:5, 8:11] = np.nan
+    place = field_at(holed, (42.0, 17.0))
+    assert place is not None
+    np.testing.assert_allclose(place.temperature[:, 0], 20.0 + np.arange(20) + 4.2)
+    far = field_at(holed, (500.0, 10.0))
+    assert far is not None
+    np.testing.assert_allclose(far.temperature[:, 0], 20.0 + np.arange(20) + 9.75)
+    assert field_at(fields(11, 60.0), (42.0, 17.0)) is None
 
 
 def test_a_sensor_follows_with_its_time_constant() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fusion.consistency.checks import Check
-from fusion.consistency.field_series import thin_fields
+from fusion.consistency.field_series import field_at, thin_fields
 from fusion.consistency.temperature import check_material
 from tests.fusion.consistency.twin_fields import SENSOR_MM, recorded, scaled
 
@@ -14,7 +14,8 @@ def checks(factor: float = 1.0, *, seed: int = 5, offset_K: float = 0.0, stated:
     test = recorded(seed)
     fields = scaled(test.fields, factor)
     fields["frame_temperature"] = fields["frame_temperature"] + offset_K
-    found = check_material(thin_fields(fields), test.environment, place_mm=SENSOR_MM if stated else None)
+    near = field_at(fields, SENSOR_MM) if stated else thin_fields(fields)
+    found = check_material(near, test.environment, stated=stated)
     return {check.code: check for check in found}
 
 
@@ -45,16 +46,15 @@ def test_a_small_change_tells_nothing() -> None:
     test = recorded()
     short = test.fields.isel(time=slice(0, 12))
     found = {
-        check.code: check for check in check_material(thin_fields(scaled(short, 1.9)), test.environment, place_mm=None)
+        check.code: check for check in check_material(thin_fields(scaled(short, 1.9)), test.environment, stated=False)
     }
     assert found["material_rise"].passed and "cannot be told" in found["material_rise"].evidence
 
 
 def test_without_a_log_or_a_field_there_is_no_check() -> None:
     test = recorded()
-    assert check_material(None, test.environment, place_mm=None) == []
-    assert check_material(thin_fields(test.fields), None, place_mm=None) == []
+    assert check_material(None, test.environment, stated=False) == []
+    assert check_material(thin_fields(test.fields), None, stated=False) == []
     assert (
-        check_material(thin_fields(test.fields), test.environment.drop_vars("material_temperature"), place_mm=None)
-        == []
+        check_material(thin_fields(test.fields), test.environment.drop_vars("material_temperature"), stated=False) == []
     )
