@@ -90,17 +90,7 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
             fields[name] = (fields[name].dims, moved, fields[name].attrs)
     fields = fields.assign(_registration_variables(registration, reference)).assign(_target_places(source))
     parts = {
-        "registration": {
-            "rms_mm": registration.rms_mm,
-            "position_u_mm": float(np.sqrt(np.mean(registration.position_u(source.grid.centres_mm) ** 2))),
-            "fiducials_listed": sum(fiducial.marker is None for fiducial in source.fiducials),
-            "unchecked": list(registration.unchecked),
-            "contradicted_hints": registration.contradicted_hints,
-            "mirrored": registration.mirrored,
-            "model": registration.model,
-            "leave_one_out_mm": registration.leave_one_out_mm,
-            "frames_rejected": source.frames_rejected,
-        },
+        "registration": _registration_part(registration, source),
         "alignment": {"clock_offset_s": clock},
         "camera": camera.part,
         **completed.parts,
@@ -269,6 +259,21 @@ def _registration_variables(registration: Registration, reference: np.ndarray) -
     variables["reference_frame"] = (("row", "column"), reference.astype("f4"), degrees)
     variables["fiducial_name"] = ("fiducial", names)
     return xr.Dataset(variables)
+
+
+def _registration_part(registration: Registration, source: Source) -> dict[str, Any]:
+    """Return the part ``registration`` of results.json."""
+    return {
+        "rms_mm": registration.rms_mm,
+        "position_u_mm": float(np.sqrt(np.mean(registration.position_u(source.grid.centres_mm) ** 2))),
+        "fiducials_listed": sum(fiducial.marker is None for fiducial in source.fiducials),
+        "unchecked": list(registration.unchecked),
+        "contradicted_hints": registration.contradicted_hints,
+        "mirrored": registration.mirrored,
+        "model": registration.model,
+        "leave_one_out_mm": registration.leave_one_out_mm,
+        "frames_rejected": source.frames_rejected,
+    }
 
 
 def _registration_notices(registration: Registration) -> list[Notice]:

@@ -134,7 +134,7 @@ def _common_u(registration: Registration, places_mm: Array) -> Array:
     places = registration.to_sensor(places_mm)
     in_view = ((places >= 0) & (places <= np.array(registration.shape[::-1]) - 1.0)).all(axis=-1)
     # Without any disc in view the table is not located there, and any value serves.
-    in_view |= ~in_view.any(axis=1, keepdims=True)
+    in_view |= ~np.any(in_view, axis=1)[:, None]
     common: Array = np.sqrt(np.mean(registration.position_u(places_mm) ** 2, axis=1, where=in_view))
     return common
 
