@@ -301,6 +301,7 @@ class ThermographyTable(_Measured):
     clock_offset_s: Seconds | None = Field(default=None, alias="clock_offset")
     table: Literal["still", "moving"] = "still"
     reference_patch_px: PixelPatch | None = Field(default=None, alias="reference_patch")
+    lens: ExistingFile | None = None
 
 
 class AxisTable(_Table):
@@ -459,6 +460,8 @@ class Campaign(_Table):
             names = [self.drivers.file]
         elif table == "record" and self.record is not None:
             names = [self.record.file]
+        elif table == "thermography" and self.thermography is not None:
+            names = [self.thermography.lens]
         paths = list(self.frame_paths()) if table == "thermography" else []
         paths += [self.resolve(name) for name in names if name is not None]
         return {relative_name(path, self.folder): path for path in paths}

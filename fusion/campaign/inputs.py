@@ -28,6 +28,7 @@ from interferometry.contract import DEVIATIONS
 from interferometry.io.readers import read_deviations, read_environment
 from interferometry.iso230 import Iso230Budget
 from thermography.io.flir import FrameReference, index_frames
+from thermography.registration.lens import Lens, read_lens
 from thermography.registration.plan import Fiducial, PlanGrid, read_fiducials
 
 #: Maximum number of omitted items listed in a message; the products hold all of them.
@@ -60,6 +61,8 @@ class Source:
         Everything that was left out.
     iso_budget : Iso230Budget or None
         Uncertainty contributions to ISO 230-2 values; None for those of the readings as recorded.
+    lens : Lens or None
+        Calibration of the camera's lens.
     """
 
     campaign: Campaign
@@ -76,6 +79,7 @@ class Source:
     duty: tuple[xr.DataArray, DutyLaw] | None = None
     notices: list[Notice] = field(default_factory=list)
     iso_budget: Iso230Budget | None = None
+    lens: Lens | None = None
 
     @property
     def needs_camera(self) -> bool:
@@ -169,6 +173,7 @@ def read_source(campaign: Campaign) -> Source:
         read_fiducials(campaign.resolve(plan.fiducials)), timed, rejected_frames,
         [] if plan.regions is None else read_regions(campaign.resolve(plan.regions)), _randomised(campaign, drivers),
         [] if by_camera else compensated.notices, compensated.budget,
+        None if thermography.lens is None else read_lens(campaign.resolve(thermography.lens)),
     )  # fmt: skip
     source.notices[:0] = _notices(source)
     return source

@@ -20,6 +20,7 @@ from fusion.consistency.field_series import field_at, thin_fields
 from fusion.consistency.frames import check_frames
 from fusion.consistency.logs import check_log
 from fusion.consistency.readings import check_readings
+from fusion.consistency.registration import check_registration
 from fusion.consistency.signs import check_signs
 from fusion.consistency.temperature import check_material
 from fusion.pipeline.radiometry import overridden_parameters
@@ -111,6 +112,19 @@ def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[
         *check_load_clock(field, source.drivers, file=drivers.file if drivers is not None else "the drivers' log"),
         *check_material(near, source.environment, stated=place_mm is not None),
     ]
+
+
+def check_place(source: Source, registration: Mapping[str, Any]) -> list[Check]:
+    """Check what the registration found.
+
+    Parameters
+    ----------
+    source : Source
+        Inputs of the campaign.
+    registration : mapping
+        Part ``registration`` of results.json.
+    """
+    return check_registration(registration, file=source.plan.fiducials)
 
 
 def check_loop(loop: Mapping[str, Any], source: Source) -> list[Check]:

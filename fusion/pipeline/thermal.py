@@ -26,6 +26,7 @@ from thermography.radiometry.camera_artefacts import DEAD, NOISY, OFFSET, find_b
 from thermography.radiometry.overrides import Overrides
 from thermography.radiometry.planck import calibrate
 from thermography.registration.clock_offset import ClockOffset, estimate_clock_offset
+from thermography.registration.evidence import RegistrationError
 from thermography.registration.register import Registration, register
 
 #: Number of first frames whose mean is registered: the noise falls, and the table has hardly warmed.
@@ -69,7 +70,7 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
     # A moving table is somewhere else in the next frame, so its plan is registered on one frame alone.
     first = clear_frames(survey, 1 if source.thermography.table == "moving" else _REGISTRATION_FRAMES)
     reference = np.mean([calibrate(frame.read_counts(), override(frame)) for frame in first], axis=0)
-    registration = register(reference, source.fiducials, grid=source.grid)
+    registration = _register(source, reference)
     report("registration", 1, 1)
     camera = examine_camera(source, survey, registration)
     source, notices = camera.source, camera.notices
@@ -89,16 +90,26 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
             fields[name] = (fields[name].dims, moved, fields[name].attrs)
     fields = fields.assign(_registration_variables(registration, reference)).assign(_target_places(source))
     parts = {
-        "registration": {
-            "rms_mm": registration.rms_mm,
-            "leave_one_out_mm": registration.leave_one_out_mm,
-            "frames_rejected": source.frames_rejected,
-        },
+        "registration": _registration_part(registration, source),
         "alignment": {"clock_offset_s": clock},
         "camera": camera.part,
         **completed.parts,
     }
     return Outcome(fields, parts, tuple(notices))
+
+
+def _register(source: Source, reference: np.ndarray) -> Registration:
+    """Register the plan on the mean of the first frames; a refusal names the file of the fiducials."""
+    moving = source.thermography.table == "moving"
+    if moving and any(fiducial.is_point for fiducial in source.fiducials):
+        raise RegistrationError(
+            f"{source.plan.fiducials}: points picked by hand hold for one position of the table only, but thermography.table = "
+            '"moving"; paint discs, or use frames of the table at rest'
+        )
+    try:
+        return register(reference, source.fiducials, grid=source.grid, lens=source.lens)
+    except RegistrationError as error:
+        raise RegistrationError(f"{source.plan.fiducials}: {error}") from error
 
 
 def _reduce_on_clock(
@@ -248,6 +259,21 @@ def _registration_variables(registration: Registration, reference: np.ndarray) -
     variables["reference_frame"] = (("row", "column"), reference.astype("f4"), degrees)
     variables["fiducial_name"] = ("fiducial", names)
     return xr.Dataset(variables)
+
+
+def _registration_part(registration: Registration, source: Source) -> dict[str, Any]:
+    """Return the part ``registration`` of results.json."""
+    return {
+        "rms_mm": registration.rms_mm,
+        "position_u_mm": float(np.sqrt(np.mean(registration.position_u(source.grid.centres_mm) ** 2))),
+        "fiducials_listed": sum(fiducial.marker is None for fiducial in source.fiducials),
+        "unchecked": list(registration.unchecked),
+        "contradicted_hints": registration.contradicted_hints,
+        "mirrored": registration.mirrored,
+        "model": registration.model,
+        "leave_one_out_mm": registration.leave_one_out_mm,
+        "frames_rejected": source.frames_rejected,
+    }
 
 
 def _registration_notices(registration: Registration) -> list[Notice]:

@@ -29,7 +29,19 @@ class RegistrationPart(ResultPart):
     """Registration of the thermograms to the plan."""
 
     rms_mm: Number
-    """Root mean square of the registration residuals of the fiducials, mm."""
+    """Root mean square of the registration residuals of the fiducials, mm; null where four fiducials determine the plan exactly."""
+    position_u_mm: Number = None
+    """Standard uncertainty of a place on the plan, root mean square over its cells, mm."""
+    fiducials_listed: int = 0
+    """Number of fiducials in the list, without markers."""
+    unchecked: tuple[str, ...] = ()
+    """Fiducials whose place the others do not check."""
+    contradicted_hints: tuple[str, ...] = ()
+    """Fiducials that lie far from their rough pixel positions."""
+    mirrored: bool = False
+    """Whether the plan appears as in a mirror."""
+    model: str = ""
+    """Lens model."""
     leave_one_out_mm: Mapping[str, Number]
     """Distance by which each fiducial is missed when it takes no part in the registration, mm, by name."""
     frames_rejected: tuple[RejectedFrame, ...]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from fusion.campaign.config import CampaignError
 from fusion.campaign.inputs import counted, left_out_notices
 from fusion.campaign.quantities import read_quantity
 from fusion.products.results import Results
+from fusion.products.results_axis import RegistrationPart
 from fusion.products.results_loop import Loop
 from fusion.products.store import write_atomically
 from fusion.report.findings import (
@@ -75,7 +77,7 @@ def summary_rows(results: Results) -> list[tuple[str, str]]:
         lines = [line for line in (*doubts, untouched(results.inputs)) if line]
         rows.append(("inputs", "\n".join(lines) or f"sound in {len(results.inputs.checks)} checks"))
     if results.registration is not None:
-        rows.append(("registration", f"{number(results.registration.rms_mm, 2)} mm rms"))
+        rows.append(("registration", _registration(results.registration)))
     if results.iso230 is not None:
         values = iso230_values(results.iso230)
         where = condition(results.inputs, "positions")
@@ -108,6 +110,14 @@ def summary_rows(results: Results) -> list[tuple[str, str]]:
     if results.loop is not None:
         rows += _loop_rows(results.loop, conditional_headline(results))
     return rows + [("warning", warning.message) for warning in results.warnings]
+
+
+def _registration(part: RegistrationPart) -> str:
+    """Return the scatter of the fiducials; of four, which determine the plan exactly, the uncertainty alone."""
+    if part.rms_mm is None or not math.isfinite(part.rms_mm):
+        count = len(part.leave_one_out_mm)
+        return f"standard uncertainty {number(part.position_u_mm, 2)} mm, not checked: {count} fiducials determine the plan exactly"
+    return f"{number(part.rms_mm, 2)} mm rms"
 
 
 def _loop_rows(loop: Loop, headline: str) -> list[tuple[str, str]]:

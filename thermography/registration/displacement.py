@@ -119,6 +119,8 @@ def monitor_fiducials(registration: Registration, grid: PlanGrid, window: tuple[
     origin = np.array([window[1].start, window[0].start])
     shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
     for name, disc in registration.fiducials.items():
+        if disc.is_point:
+            continue
         located = registration.located[name]
         centre = np.array([located.column_px, located.row_px]) - origin
         placed = _disc_weights(disc, centre, registration, grid, shape)
@@ -317,7 +319,7 @@ def register_after_knock(
         replace(disc, column_px=float(c), row_px=float(r)) for disc, (c, r) in zip(old.masked, places, strict=True)
     ]
     try:
-        return register(temperature, hinted, grid=grid)
+        return register(temperature, hinted, grid=grid, lens=old.lens)
     except RegistrationError as error:
         raise RegistrationError(
             f"{frame_name}: the fiducials moved by ({shift_px[0]:.1f}, {shift_px[1]:.1f}) px and the plan is not located again: "

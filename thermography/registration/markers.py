@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from thermography._constants import MAD_TO_SIGMA
 from thermography._typing import Array
 from thermography.errors import ThermographyError
 from thermography.registration.plan import Fiducial
@@ -16,6 +18,12 @@ from thermography.registration.plan import Fiducial
 DICTIONARY = cv2.aruco.DICT_4X4_50
 #: Hints come from an affine map of the plan, which three markers determine. It neglects perspective and serves as a hint only.
 _LEAST_MARKERS = 3
+#: Widths of the surroundings against which the contrast is stretched, px: a third and two thirds of a marker of 30 px.
+_SURROUNDINGS_PX = (10.0, 20.0)
+#: Grey levels per standard deviation of the surroundings, of 256, and the blur before, px.
+_GREY_PER_DEVIATION, _BLUR_PX = 60.0, 0.7
+#: Contrast below this many standard deviations of the noise is not stretched any further.
+_LEAST_DEVIATION = 2.0
 
 
 class MarkerError(ThermographyError):
@@ -40,20 +48,32 @@ def detect_markers(temperature: Array) -> dict[int, Array]:
     S. Garrido-Jurado et al., Automatic generation and detection of highly reliable fiducial markers under occlusion, Pattern
     Recognition 47 (2014) 2280-2292, as implemented in OpenCV.
     """
-    low, high = np.nanpercentile(temperature, (1, 99))
-    picture = np.round(255 * np.clip((temperature - low) / max(high - low, 1e-6), 0, 1)).astype(np.uint8)
     parameters = cv2.aruco.DetectorParameters()
     # Paint of low emissivity swaps dark and bright. A pattern with a wrong square is rejected rather than corrected to a similar marker.
     parameters.detectInvertedMarker = True
     parameters.errorCorrectionRate = 0.0
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARY), parameters)
-    quadrilaterals, numbers, _ = detector.detectMarkers(picture)
-    if numbers is None:
-        return {}
-    return {
-        int(number): corners.reshape(4, 2).mean(axis=0)
-        for number, corners in zip(numbers.ravel(), quadrilaterals, strict=True)
-    }
+    detected: dict[int, Array] = {}
+    for picture in _pictures(np.nan_to_num(temperature, nan=float(np.nanmean(temperature)))):
+        quadrilaterals, numbers, _ = detector.detectMarkers(picture)
+        if numbers is not None:
+            for number, corners in zip(numbers.ravel(), quadrilaterals, strict=True):
+                detected.setdefault(int(number), corners.reshape(4, 2).mean(axis=0))
+    return detected
+
+
+def _pictures(temperature: Array) -> Iterator[NDArray[np.uint8]]:
+    """The thermogram in 256 grey levels: stretched as a whole, then against its surroundings, where a tenth of a kelvin shows."""
+    low, high = np.percentile(temperature, (1, 99))
+    yield np.round(255 * np.clip((temperature - low) / max(high - low, 1e-6), 0, 1)).astype(np.uint8)
+    smooth = cv2.GaussianBlur(temperature.astype(np.float32), (0, 0), _BLUR_PX)
+    # Neighbouring pixels differ by noise, but for the few at edges.
+    noise = MAD_TO_SIGMA * float(np.median(np.abs(np.diff(smooth, axis=1)))) / np.sqrt(2)
+    for width in _SURROUNDINGS_PX:
+        lifted = smooth - cv2.GaussianBlur(smooth, (0, 0), width)
+        deviation = np.sqrt(cv2.GaussianBlur(lifted**2, (0, 0), width))
+        grey = 128 + _GREY_PER_DEVIATION * lifted / np.maximum(deviation, max(_LEAST_DEVIATION * noise, 1e-6))
+        yield np.clip(grey, 0, 255).astype(np.uint8)
 
 
 def identify_plan(temperature: Array, fiducials: Sequence[Fiducial]) -> list[Fiducial]:

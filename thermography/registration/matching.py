@@ -3,29 +3,58 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations, permutations
+from dataclasses import dataclass
+from itertools import permutations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from thermography._typing import Array
 from thermography.errors import ThermographyError
+from thermography.registration.consensus import fit_agreeing
 from thermography.registration.discs import Spot
+from thermography.registration.evidence import chance_of_arrangement
 from thermography.registration.plan import Fiducial
-from thermography.registration.projection import DiscObservations, Projection, fit_homography, fit_projection
+from thermography.registration.projection import DiscObservations, Projection
+from thermography.registration.quadruples import corner_triangles, exact_homographies, spread_quadruples
 
+#: Standard uncertainty of the centroid of a detected spot, before the disc is located, px.
+SPOT_U_PX = 0.2
+#: An assignment is clear if every other one is this many times as likely to arise by chance.
+_CLEAR_ODDS = 1e3
+#: Root mean square distance below which assignments fit equally well, px: spots are centred no better.
+_LEAST_MISFIT_PX = 0.05
 #: A hint farther than this from the position predicted by the other hints is an outlier.
 _HINT_TOLERANCE_PX = 30.0
 #: Largest distance of a spot from the position that a homography through four others predicts: the lens distorts the corners.
 _ARRANGEMENT_TOLERANCE_PX = 16.0
 #: Largest number of spots tried; the number of quadruples grows with its fourth power.
 _LARGEST_ARRANGEMENT = 22
+#: Quadruples of fiducials that are tried.
+_QUADRUPLES = 8
 #: Hypotheses compared at once: all distances of all hypotheses would take gigabytes.
 _HYPOTHESES_AT_ONCE = 4096
 
 
 class MatchError(ThermographyError):
     """The spots cannot be assigned to the fiducials; the message gives the reason and what to add."""
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """Assignment of spots to fiducials by their arrangement.
+
+    Attributes
+    ----------
+    spots : dict of str to Spot
+        By fiducial name.
+    hypotheses : int
+        Number of assignments of four spots of fitting size that were tried: each might have met the other discs by chance.
+    """
+
+    spots: dict[str, Spot]
+    hypotheses: int
 
 
 def match_by_hints(spots: Sequence[Spot], fiducials: Sequence[Fiducial]) -> dict[str, Spot]:
@@ -61,7 +90,7 @@ def match_by_hints(spots: Sequence[Spot], fiducials: Sequence[Fiducial]) -> dict
 
 def match_by_arrangement(
     spots: Sequence[Spot], fiducials: Sequence[Fiducial], *, shape: tuple[int, int]
-) -> dict[str, Spot]:
+) -> Arrangement:
     """Match spots to fiducials by their arrangement and sizes alone: the homography that most discs agree with.
 
     Parameters
@@ -75,13 +104,12 @@ def match_by_arrangement(
 
     Returns
     -------
-    dict of str to Spot
-        By fiducial name.
+    Arrangement
 
     Raises
     ------
     MatchError
-        Fewer than six discs agree, or two assignments fit about equally well (a symmetric plan).
+        Fewer than six discs agree, or two assignments fit about equally well (a symmetric plan, or spots that are no discs).
     """
     if len(fiducials) < 6:
         raise MatchError(
@@ -90,60 +118,75 @@ def match_by_arrangement(
     tried = list(spots)[:_LARGEST_ARRANGEMENT]
     if len(tried) < 6:
         raise MatchError(
-            f"only {len(tried)} disc-shaped spots are seen where {len(fiducials)} fiducials are listed; "
+            f"only {len(tried)} disc-shaped spots are in view where {len(fiducials)} fiducials are listed; "
             "give column_px,row_px, or a frame with more contrast"
         )
+    plan = np.array([(disc.x_mm, disc.y_mm) for disc in fiducials], float)
     solutions: dict[tuple[tuple[str, Spot], ...], float] = {}
-    for quad in _spread_quads(fiducials)[:8]:
-        for homography in _candidates(quad, tried, fiducials):
+    hypotheses = 0
+    for quad in spread_quadruples(plan, limit=_QUADRUPLES):
+        candidates, fitting = _candidates(quad, tried, fiducials)
+        hypotheses += fitting
+        for homography in candidates:
             matched = _grow(_nearest(homography, tried, fiducials, _ARRANGEMENT_TOLERANCE_PX), tried, fiducials)
             if len(matched) >= 6:
                 key = tuple(sorted(matched.items(), key=lambda item: item[0]))
-                solutions[key] = _misfit(matched, fiducials, shape)
+                if key not in solutions:
+                    solutions[key] = _chance(matched, fiducials, len(tried), shape)
         best = max((len(key) for key in solutions), default=0)
         if best >= min(len(fiducials), len(tried)) - 1:
             break
     if not solutions:
         raise MatchError(
-            f"no arrangement of the {len(tried)} spots seen fits the {len(fiducials)} fiducials; give column_px,row_px for at least 4"
+            f"no arrangement of the {len(tried)} spots in view fits the {len(fiducials)} fiducials; give column_px,row_px for at least 4"
         )
-    ranked = sorted(solutions.items(), key=lambda item: (-len(item[0]), item[1]))
-    best_match, misfit = ranked[0]
-    rivals = [rival_misfit for match, rival_misfit in ranked[1:] if len(match) == len(best_match)]
-    if rivals and rivals[0] < 2 * max(misfit, 0.05):
-        raise MatchError(
+    ranked = sorted(solutions.items(), key=lambda item: item[1])
+    best_match, chance = ranked[0]
+    for match, rival in ranked[1:]:
+        if rival < _CLEAR_ODDS * max(chance, np.finfo(float).tiny):
+            raise MatchError(_ambiguity(dict(best_match), dict(match), len(fiducials)))
+    return Arrangement(dict(best_match), hypotheses)
+
+
+def _ambiguity(best: dict[str, Spot], rival: dict[str, Spot], count: int) -> str:
+    """Why two assignments cannot be told apart: the plan maps to itself, or too few of its discs are in view."""
+    if {id(spot) for spot in best.values()} == {id(spot) for spot in rival.values()}:
+        return (
             "the arrangement of the fiducials is symmetric and fits in two ways; give column_px,row_px for at least 4"
         )
-    return dict(best_match)
+    return (
+        f"{len(best)} of {count} fiducials fit the spots in view in two ways, neither of which need be right; check that this is the "
+        "list of this table, and give column_px,row_px for at least 4"
+    )
 
 
-def _spread_quads(fiducials: Sequence[Fiducial]) -> list[tuple[int, ...]]:
-    """Quadruples of fiducials, those first whose smallest triangle is largest, so that no three lie near a line."""
-    plan = np.array([(disc.x_mm, disc.y_mm) for disc in fiducials])
-    quads = []
-    for quad in combinations(range(len(fiducials)), 4):
-        areas = [abs(float(_signed_area(plan, three))) for three in combinations(quad, 3)]
-        quads.append((min(areas), quad))
-    return [quad for _, quad in sorted(quads, reverse=True)]
+def _candidates(
+    quad: NDArray[np.intp], spots: Sequence[Spot], fiducials: Sequence[Fiducial]
+) -> tuple[list[Array], int]:
+    """Homographies from the quad of fiducials to four spots of the same or of mirrored handedness, best supported first.
 
-
-def _candidates(quad: tuple[int, ...], spots: Sequence[Spot], fiducials: Sequence[Fiducial]) -> list[Array]:
-    """Homographies that map the quad of fiducials to four spots of the same or of mirrored handedness, best supported first."""
+    Also the number of them under which the four spots have the size of their discs.
+    """
     plan = np.array([(disc.x_mm, disc.y_mm) for disc in fiducials])
     image = np.array([(spot.column_px, spot.row_px) for spot in spots])
     chosen = np.array(list(permutations(range(len(spots)), 4)))
-    turns = np.stack([_signed_area(plan[list(quad)], three) for three in combinations(range(4), 3)])
-    image_turns = np.stack([_signed_area(image[chosen], three) for three in combinations(range(4), 3)], axis=-1)
-    same = (np.sign(image_turns) == np.sign(turns)).all(axis=1)
-    mirrored = (np.sign(image_turns) == -np.sign(turns)).all(axis=1)
-    matrices = _homographies(plan[list(quad)], image[chosen[same | mirrored]])
-    support = _support(matrices, plan, image, fiducials, spots)
+    turns = np.sign(corner_triangles(plan[quad]))
+    image_turns = np.sign(corner_triangles(image[chosen]))
+    same, mirrored = (image_turns == turns).all(axis=1), (image_turns == -turns).all(axis=1)
+    chosen = chosen[same | mirrored]
+    matrices = exact_homographies(plan[quad][None], image[chosen])
+    support, sizes = _support(matrices, plan, image, fiducials, spots)
+    areas = np.array([spot.area_px for spot in spots])[chosen]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        fitting = (np.abs(np.log(areas / sizes[:, quad])) < np.log(2)).all(axis=1)
     order = np.argsort(-support)[:24]
-    return [matrices[i] for i in order if support[i] > 0]
+    return [matrices[i] for i in order if support[i] > 0], int(fitting.sum())
 
 
-def _support(matrices: Array, plan: Array, image: Array, fiducials: Sequence[Fiducial], spots: Sequence[Spot]) -> Array:
-    """Number of fiducials that lie near a spot of fitting size under every homography (k, 3, 3), weighted by closeness, (k,)."""
+def _support(
+    matrices: Array, plan: Array, image: Array, fiducials: Sequence[Fiducial], spots: Sequence[Spot]
+) -> tuple[Array, Array]:
+    """Number of fiducials near a spot of fitting size under every homography (k, 3, 3), weighted by closeness, (k,); areas (k, n) px."""
     projected = np.einsum("kij,nj->kni", matrices, np.column_stack([plan, np.ones(len(plan))]))
     scale = projected[..., 2]
     squares = np.array([disc.diameter_mm**2 for disc in fiducials])
@@ -163,23 +206,7 @@ def _support(matrices: Array, plan: Array, image: Array, fiducials: Sequence[Fid
         relative = np.where(fits, distance, np.inf) / _ARRANGEMENT_TOLERANCE_PX
         support[part] = (1 - np.minimum(relative, 1).min(axis=2)).sum(axis=1)
     support[~in_front] = 0
-    return support
-
-
-def _homographies(plan: Array, image: Array) -> Array:
-    """Homographies (k, 3, 3) that map four plan points (4, 2) exactly to the image points (k, 4, 2)."""
-    middle, scale = plan.mean(axis=0), np.abs(plan - plan.mean(axis=0)).max()
-    x, y = ((plan - middle) / scale).T
-    u, v = image[..., 0], image[..., 1]
-    system = np.zeros((len(image), 8, 8))
-    system[:, :4, 0], system[:, :4, 1], system[:, :4, 2] = x, y, 1
-    system[:, 4:, 3], system[:, 4:, 4], system[:, 4:, 5] = x, y, 1
-    system[:, :4, 6], system[:, :4, 7] = -u * x, -u * y
-    system[:, 4:, 6], system[:, 4:, 7] = -v * x, -v * y
-    entries = np.linalg.solve(system, np.concatenate([u, v], axis=1)[..., None])[..., 0]
-    matrices = np.concatenate([entries, np.ones((len(image), 1))], axis=1).reshape(-1, 3, 3)
-    to_unit = np.array([[1 / scale, 0, -middle[0] / scale], [0, 1 / scale, -middle[1] / scale], [0, 0, 1]])
-    return matrices @ to_unit
+    return support, expected
 
 
 def _nearest(
@@ -225,26 +252,25 @@ def _grow(matched: dict[str, Spot], spots: Sequence[Spot], fiducials: Sequence[F
     return matched
 
 
-def _misfit(matched: dict[str, Spot], fiducials: Sequence[Fiducial], shape: tuple[int, int]) -> float:
-    """Root mean square distance, px, of the matched spots from a plane seen through a lens, without the worst one of seven or more."""
+def _chance(matched: dict[str, Spot], fiducials: Sequence[Fiducial], spots: int, shape: tuple[int, int]) -> float:
+    """Chance of the agreement of the matched spots on a plane seen through a lens, one hypothesis."""
     plan, image = _pairs(matched, fiducials)
     ideal = Projection(np.eye(3), np.zeros(4), float(shape[1]), ((shape[1] - 1) / 2, (shape[0] - 1) / 2))
-    observations = DiscObservations(image, plan, np.ones(len(plan)), np.ones(len(plan)))
-    distance = _distances(observations, ideal)
-    if len(plan) > 6:
-        distance = _distances(observations.without(int(np.argmax(distance))), ideal)
-    return float(np.sqrt(np.mean(distance**2)))
-
-
-def _distances(observations: DiscObservations, ideal: Projection) -> Array:
-    """Distance of every disc from its projection by the fit, (n,) px; infinite where there is no fit."""
-    count = len(observations.u_px)
+    observations = DiscObservations(image, plan, np.ones(len(plan)), np.full(len(plan), SPOT_U_PX))
     try:
-        projection = fit_projection(observations, fit_homography(observations, ideal), 1 if count >= 7 else 0)
-    except ValueError:
-        return np.full(count, np.inf)
-    distances: Array = np.linalg.norm(projection.to_sensor(observations.centres_mm) - observations.points_px, axis=1)
-    return distances
+        projection, coefficients, agreeing = fit_agreeing(observations, ideal, calibrated=False)
+    except ThermographyError:
+        return np.inf
+    distance = np.linalg.norm(projection.to_sensor(plan) - image, axis=1)[agreeing]
+    misfit = max(float(np.sqrt(np.mean(distance**2))), _LEAST_MISFIT_PX)
+    return chance_of_arrangement(
+        len(fiducials),
+        spots,
+        np.full(len(distance), misfit),
+        hypotheses=1,
+        coefficients=coefficients,
+        area_px=float(shape[0] * shape[1]),
+    )
 
 
 def _pairs(matched: dict[str, Spot], fiducials: Sequence[Fiducial]) -> tuple[Array, Array]:
@@ -252,11 +278,3 @@ def _pairs(matched: dict[str, Spot], fiducials: Sequence[Fiducial]) -> tuple[Arr
     discs = [disc for disc in fiducials if disc.name in matched]
     plan = np.array([(disc.x_mm, disc.y_mm) for disc in discs], float)
     return plan, np.array([(matched[disc.name].column_px, matched[disc.name].row_px) for disc in discs])
-
-
-def _signed_area(points: Array, three: tuple[int, ...]) -> Array:
-    """Twice the area of the triangle of three of the points (..., n, 2), signed by its sense."""
-    a, b, c = (points[..., i, :] for i in three)
-    ab, ac = b - a, c - a
-    area: Array = ab[..., 0] * ac[..., 1] - ab[..., 1] * ac[..., 0]
-    return area

@@ -126,7 +126,7 @@ class PlanGrid:
 
 @dataclass(frozen=True)
 class Fiducial:
-    """A disc on the table whose plan position is known, or an ArUco marker that identifies the plan.
+    """A disc on the table whose plan position is known, a point picked by hand, or an ArUco marker that identifies the plan.
 
     Attributes
     ----------
@@ -134,9 +134,9 @@ class Fiducial:
     x_mm, y_mm : float, mm
         Centre on the plan.
     diameter_mm : float, mm
-        Of the disc, or of the circle that contains the marker with its quiet zone.
+        Of the disc, or of the circle that contains the marker with its quiet zone; 0 for a point.
     column_px, row_px : float or None, px
-        Hint where the disc appears in the frame; it may be wrong by tens of pixels. None: no hint.
+        Hint where the disc appears in the frame; it may be wrong by tens of pixels. None: no hint. Of a point, its place itself.
     marker : int or None
         Number in the dictionary of 4 x 4 ArUco markers, 0 to 49; None for a disc.
     """
@@ -148,6 +148,11 @@ class Fiducial:
     column_px: float | None = None
     row_px: float | None = None
     marker: int | None = None
+
+    @property
+    def is_point(self) -> bool:
+        """Whether this is a corner, bore or bolt whose place in the frame was picked by hand, not a painted disc."""
+        return self.marker is None and self.diameter_mm == 0
 
     @property
     def hint_px(self) -> tuple[float, float] | None:
@@ -164,7 +169,8 @@ def read_fiducials(path: str | Path) -> list[Fiducial]:
     ----------
     path : str or Path
         CSV file with the columns ``name``, ``x_mm``, ``y_mm``, ``diameter_mm`` and, optionally, ``column_px``, ``row_px`` (an
-        empty position means that there is no hint for that disc) and ``marker`` (a number makes the row an ArUco marker).
+        empty position means that there is no hint for that disc) and ``marker`` (a number makes the row an ArUco marker). Where
+        ``diameter_mm`` is empty, nothing is painted: the row is a point that was picked by hand at ``column_px``, ``row_px``.
 
     Returns
     -------
@@ -204,8 +210,14 @@ def read_fiducials(path: str | Path) -> list[Fiducial]:
         reader.fieldnames = header
         fiducials = [_parse(path, reader.line_num, row) for row in reader if any(row.values())]
     discs = sum(fiducial.marker is None for fiducial in fiducials)
+    points = sum(fiducial.is_point for fiducial in fiducials)
     if discs < 4:
         raise FiducialError(f"{path}: lists {discs} fiducials; a plan is located by at least 4")
+    if points not in (0, discs):
+        raise FiducialError(
+            f"{path}: lists {discs - points} discs and {points} points without diameter_mm; a plan is located by discs or by points, "
+            "not by both: give every disc its diameter, or leave it empty everywhere and give column_px,row_px"
+        )
     return fiducials
 
 
@@ -237,8 +249,10 @@ def _parse(path: Path, line: int, row: dict[str, str]) -> Fiducial:
     name = (row["name"] or "").strip()
     if not name:
         raise FiducialError(f"{path}:{line}: name is empty; give every fiducial a name")
-    x_mm, y_mm, diameter_mm = (_number(path, line, column, row[column]) for column in _REQUIRED_COLUMNS[1:])
-    if diameter_mm <= 0:
+    point = not (row["diameter_mm"] or "").strip()
+    x_mm, y_mm = (_number(path, line, column, row[column]) for column in _REQUIRED_COLUMNS[1:3])
+    diameter_mm = 0.0 if point else _number(path, line, "diameter_mm", row["diameter_mm"])
+    if diameter_mm <= 0 and not point:
         raise FiducialError(f"{path}:{line}: diameter_mm = {row['diameter_mm']}; a disc has a positive diameter")
     marker = (row.get(_MARKER_COLUMN) or "").strip()
     if marker:
@@ -246,6 +260,8 @@ def _parse(path: Path, line: int, row: dict[str, str]) -> Fiducial:
             raise FiducialError(
                 f"{path}:{line}: marker = {marker!r}; give the number of an ArUco marker, 0 to {_MARKER_COUNT - 1}"
             )
+        if point:
+            raise FiducialError(f"{path}:{line}: diameter_mm is empty; give the circle that contains the marker")
         return Fiducial(name, x_mm, y_mm, diameter_mm, marker=int(marker))
     hints = [(row.get(column) or "").strip() for column in _HINT_COLUMNS]
     if all(hints):
@@ -255,6 +271,10 @@ def _parse(path: Path, line: int, row: dict[str, str]) -> Fiducial:
         return Fiducial(name, x_mm, y_mm, diameter_mm, column_px, row_px)
     if any(hints):
         raise FiducialError(f"{path}:{line}: {name} has one of column_px, row_px; give both or neither")
+    if point:
+        raise FiducialError(
+            f"{path}:{line}: {name} has neither diameter_mm (of a painted disc) nor column_px, row_px (of a point picked in a frame)"
+        )
     return Fiducial(name, x_mm, y_mm, diameter_mm)
 
 

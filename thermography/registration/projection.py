@@ -17,6 +17,7 @@ from functools import cached_property
 import cv2
 import numba
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from thermography._typing import Array
@@ -26,6 +27,12 @@ from thermography.errors import ThermographyError
 LENS_MODELS: tuple[tuple[str, int], ...] = (("homography", 0), ("homography+k1", 1), ("homography+k1,k2,p1,p2", 4))
 #: A model with more coefficients is chosen only if it lowers the leave-one-out error below this share.
 _REQUIRED_GAIN = 0.75
+#: Standard deviations of k1, k2, p1, p2 about zero among lenses that are not calibrated, for coordinates divided by the width of the
+#: frame. A k1 of 0.2 moves a corner of a 4:3 frame by 8 % of its distance from the centre, as wide-angle thermal lenses do; k2 adds up
+#: to half of that there, p1 and p2 of 0.002 about one pixel of 640 at the edge (decentred by some tenths of a degree).
+LENS_SPREAD = np.array([0.2, 0.1, 0.002, 0.002])
+#: Fewest discs whose residuals can tell whether k1 is needed; with fewer it is fitted against its spread alone.
+_LEAST_FOR_CHOICE = 7
 #: Points on the rim of a disc, as unit circle. The centroid of their image polygon shows 98.9 % of the perspective shift of the disc's
 #: centroid: the second moment of an inscribed 24-gon over that of its circle, (2 + cos(2 pi / 24)) / 3.
 _RIM = np.exp(2j * np.pi * np.arange(24) / 24)
@@ -177,7 +184,9 @@ class Projection:
         origin = rim[:, :1]
         a, b = rim - origin, np.roll(rim, -1, axis=1) - origin
         cross = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-        centroid: Array = origin[:, 0] + ((a + b) * cross[..., None]).sum(axis=1) / (3 * cross.sum(axis=1))[:, None]
+        moment, area = ((a + b) * cross[..., None]).sum(axis=1), 3 * cross.sum(axis=1)[:, None]
+        # A disc of no diameter is a point, and has no perspective shift.
+        centroid: Array = origin[:, 0] + np.divide(moment, area, out=np.zeros_like(moment), where=area != 0)
         return centroid
 
 
@@ -207,6 +216,12 @@ class DiscObservations:
                 np.delete(values, index, axis=0)
                 for values in (self.points_px, self.centres_mm, self.radii_mm, self.u_px)
             )
+        )
+
+    def select(self, chosen: NDArray[np.bool_]) -> DiscObservations:
+        """The observations that are True in `chosen`, (n,)."""
+        return DiscObservations(
+            self.points_px[chosen], self.centres_mm[chosen], self.radii_mm[chosen], self.u_px[chosen]
         )
 
     def residuals_px(self, projection: Projection) -> Array:
@@ -269,6 +284,11 @@ def fit_projection(observations: DiscObservations, start: Projection, coefficien
     Returns
     -------
     Projection
+
+    Notes
+    -----
+    A fitted coefficient takes part as one more observation, zero with a standard uncertainty of `LENS_SPREAD` (Bayesian least squares;
+    JCGM 101:2008, 4.11.2): with many discs it decides nothing, with four or five it keeps the fit determined.
     """
     pack, unpack = _parameters(start, observations.centres_mm, coefficients)
     # The perspective shift of the centroids hardly changes during the fit and is held fixed.
@@ -278,7 +298,8 @@ def fit_projection(observations: DiscObservations, start: Projection, coefficien
 
     def residuals(parameters: Array) -> Array:
         residuals_px = unpack(parameters).to_sensor(observations.centres_mm) + shift - observations.points_px
-        return (residuals_px / observations.u_px[:, None]).ravel()
+        weighted = (residuals_px / observations.u_px[:, None]).ravel()
+        return np.concatenate([weighted, parameters[8:] / LENS_SPREAD[:coefficients]])
 
     return unpack(least_squares(residuals, pack(start), method="lm", xtol=1e-9, ftol=1e-9).x)
 
@@ -286,7 +307,8 @@ def fit_projection(observations: DiscObservations, start: Projection, coefficien
 def select_lens_model(observations: DiscObservations, start: Projection) -> tuple[Projection, int]:
     """Fit every lens model that the discs determine, and choose the simplest that no richer one clearly improves on.
 
-    A richer model is chosen if it lowers the leave-one-out error, weighted by the uncertainties of the discs, below 75 %.
+    A richer model is chosen if it lowers the leave-one-out error, weighted by the uncertainties of the discs, below 75 %. Six discs or
+    fewer cannot tell, and k1 is fitted against its spread among lenses.
 
     Parameters
     ----------
@@ -302,6 +324,8 @@ def select_lens_model(observations: DiscObservations, start: Projection) -> tupl
         Its number of distortion coefficients, see `LENS_MODELS`.
     """
     best, best_count, best_error = fit_projection(observations, fit_projection(observations, start, 0), 0), 0, np.inf
+    if len(observations.u_px) < _LEAST_FOR_CHOICE:
+        return fit_projection(observations, best, 1), 1
     for _, count in LENS_MODELS:
         if count > 0 and 2 * (len(observations.u_px) - 2) < 8 + count:
             break
@@ -335,15 +359,50 @@ def leave_one_out_mm(observations: DiscObservations, projection: Projection, coe
     equals n repeated fits as long as the projection is linear over the residuals, which are hundredths of a pixel.
     """
     count = len(observations.u_px)
-    if 2 * (count - 1) < 8 + coefficients:
+    if 2 * (count - 1) < 8:
         return np.full(count, np.nan)
-    jacobian = _weighted_jacobian(observations, projection, coefficients)
-    flat = jacobian.reshape(2 * count, -1)
-    leverage = jacobian @ np.linalg.pinv(flat.T @ flat) @ np.swapaxes(jacobian, 1, 2)
-    weighted = observations.residuals_px(projection) / observations.u_px[:, None]
-    missed_px = np.linalg.solve(np.eye(2) - leverage, weighted[..., None]) * observations.u_px[:, None, None]
+    missed_px = prediction_errors_px(observations, projection, coefficients)[0][..., None]
     missed_mm = np.linalg.solve(projection.jacobian(observations.centres_mm), missed_px)[..., 0]
     return np.asarray(np.linalg.norm(missed_mm, axis=1))
+
+
+def prediction_errors_px(
+    observations: DiscObservations,
+    projection: Projection,
+    coefficients: int,
+    *,
+    fitted: NDArray[np.bool_] | None = None,
+) -> tuple[Array, Array]:
+    """Error by which each disc is missed by a fit that it takes no part in, and the covariance of that error.
+
+    Parameters
+    ----------
+    observations : DiscObservations
+        Discs of the fit, and others.
+    projection : Projection
+        The fit.
+    coefficients : int
+        Number of its fitted distortion coefficients.
+    fitted : (n,) ndarray of bool or None
+        Which discs took part in the fit; None for all. Of these, the fit to the others is taken.
+
+    Returns
+    -------
+    errors_px : (n, 2) ndarray, px
+        Observed minus predicted centroid.
+    covariances : (n, 2, 2) ndarray
+        Of the errors divided by the uncertainty of their disc.
+    """
+    fitted = np.ones(len(observations.u_px), bool) if fitted is None else fitted
+    jacobian = _weighted_jacobian(observations, projection, coefficients)
+    part = jacobian[fitted].reshape(2 * int(fitted.sum()), -1)
+    parameters = np.linalg.pinv(part.T @ part + _prior_information(coefficients))
+    leverage = jacobian @ parameters @ np.swapaxes(jacobian, 1, 2)
+    covariances = np.where(fitted[:, None, None], np.eye(2) - leverage, np.eye(2) + leverage)
+    errors = observations.residuals_px(projection)
+    covariances[fitted] = np.linalg.inv(covariances[fitted])
+    errors[fitted] = (covariances[fitted] @ errors[fitted, :, None])[..., 0]
+    return errors, covariances
 
 
 def parameter_jacobian(projection: Projection, centres_mm: Array, coefficients: int) -> Callable[[Array], Array]:
@@ -377,8 +436,8 @@ def parameter_jacobian(projection: Projection, centres_mm: Array, coefficients: 
     return derivative
 
 
-def parameter_covariance(observations: DiscObservations, projection: Projection, coefficients: int) -> Array:
-    """Covariance of the fitted parameters.
+def variance_factor(observations: DiscObservations, projection: Projection, coefficients: int) -> tuple[float, float]:
+    """Reduced chi-square of the residuals, and its degrees of freedom.
 
     Parameters
     ----------
@@ -390,17 +449,50 @@ def parameter_covariance(observations: DiscObservations, projection: Projection,
 
     Returns
     -------
-    (8 + coefficients, 8 + coefficients) ndarray
-        In the units of `parameter_jacobian`: ``(J^T J)^-1`` with rows of J divided by the uncertainty of the discs, times the
-        reduced chi-square of the residuals where that is above 1 (Birge ratio; R. T. Birge, Phys. Rev. 40 (1932) 207-227).
+    factor : float
+        1 at least: residuals smaller than the centroids' uncertainty prove nothing about the list of places.
+    freedom : float
+        Two per disc, less the trace of the leverage; 0 where the discs only just determine the fit.
     """
     jacobian = _weighted_jacobian(observations, projection, coefficients).reshape(2 * len(observations.u_px), -1)
+    information = jacobian.T @ jacobian
+    used = float(np.trace(np.linalg.pinv(information + _prior_information(coefficients)) @ information))
+    freedom = 2 * len(observations.u_px) - used
+    if freedom < 0.5:
+        return 1.0, 0.0
     weighted = observations.residuals_px(projection) / observations.u_px[:, None]
-    freedom = 2 * len(observations.u_px) - jacobian.shape[1]
-    # Four discs leave no degree of freedom: then the uncertainty of the centroids is all there is.
-    scale = max(float((weighted**2).sum()) / freedom, 1.0) if freedom > 0 else 1.0
-    covariance: Array = scale * np.linalg.pinv(jacobian.T @ jacobian)
+    return max(float((weighted**2).sum()) / freedom, 1.0), freedom
+
+
+def parameter_covariance(
+    observations: DiscObservations, projection: Projection, coefficients: int, *, factor: float
+) -> Array:
+    """Covariance of the parameters.
+
+    Parameters
+    ----------
+    observations : DiscObservations
+    projection : Projection
+        The fit.
+    coefficients : int
+        Number of distortion coefficients that are uncertain: those fitted, and those that were taken as zero.
+    factor : float
+        `variance_factor` of the residuals (Birge ratio squared; R. T. Birge, Phys. Rev. 40 (1932) 207-227).
+
+    Returns
+    -------
+    (8 + coefficients, 8 + coefficients) ndarray
+        In the units of `parameter_jacobian`: ``(J^T J / factor + P)^-1`` with rows of J divided by the uncertainty of the discs and P
+        the inverse squares of `LENS_SPREAD`.
+    """
+    jacobian = _weighted_jacobian(observations, projection, coefficients).reshape(2 * len(observations.u_px), -1)
+    covariance: Array = np.linalg.pinv(jacobian.T @ jacobian / factor + _prior_information(coefficients))
     return covariance
+
+
+def _prior_information(coefficients: int) -> Array:
+    """Inverse covariance of the parameters before any disc: nothing is known of the homography."""
+    return np.diag(np.concatenate([np.zeros(8), LENS_SPREAD[:coefficients] ** -2.0]))
 
 
 def _weighted_jacobian(observations: DiscObservations, projection: Projection, coefficients: int) -> Array:

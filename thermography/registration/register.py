@@ -9,21 +9,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thermography._typing import Array
-from thermography.errors import ThermographyError
-from thermography.registration.discs import LocatedDisc, detect_discs, locate_disc
+from thermography.registration.consensus import fit_agreeing
+from thermography.registration.discs import LocatedDisc, Spot, detect_discs, locate_disc
+from thermography.registration.evidence import (
+    RegistrationError,
+    contradicted_hints,
+    refuse_chance,
+    refuse_picks,
+    refuse_scatter,
+    refuse_sizes,
+    size_contradiction,
+)
+from thermography.registration.lens import Lens
 from thermography.registration.markers import identify_plan
-from thermography.registration.matching import MatchError, match_by_arrangement, match_by_hints
+from thermography.registration.matching import SPOT_U_PX, MatchError, match_by_arrangement, match_by_hints
 from thermography.registration.plan import Fiducial, PlanGrid
 from thermography.registration.projection import (
     LENS_MODELS,
+    LENS_SPREAD,
     DiscObservations,
     Projection,
-    fit_homography,
-    fit_projection,
     leave_one_out_mm,
     parameter_covariance,
     parameter_jacobian,
-    select_lens_model,
+    prediction_errors_px,
+    variance_factor,
 )
 
 _MODEL_NAMES = {count: name for name, count in LENS_MODELS}
@@ -32,35 +42,15 @@ _MODEL_NAMES = {count: name for name, count in LENS_MODELS}
 _CENTROID_FLOOR_PX = 0.01
 #: Standard uncertainty of a point picked by hand, px.
 _PICKED_U_PX = 0.5
-#: Standard uncertainty of the centroid of a detected spot, before the disc is located, px.
-_SPOT_U_PX = 0.2
-#: A fiducial missed by more than this, and by five times the median of the others, is left out as misplaced, mm.
-_MISPLACED_MM = 1.0
-#: A hint farther than this from the located disc is reported, px.
-_WRONG_HINT_PX = 25
-
-
-class RegistrationError(ThermographyError):
-    """The table cannot be located in the frame; the message says which fiducials were located and what to do."""
-
-
-@dataclass(frozen=True)
-class Lens:
-    """Intrinsic parameters from a lens calibration, in OpenCV's convention.
-
-    Attributes
-    ----------
-    focal_length_px : float, px
-        Unit of the normalised image coordinates.
-    principal_point_px : (column, row), px
-        Centre of the distortion.
-    distortion : (k1, k2, p1, p2)
-        Of the normalised image coordinates.
-    """
-
-    focal_length_px: float
-    principal_point_px: tuple[float, float]
-    distortion: tuple[float, float, float, float]
+#: Standard uncertainty, in diameters, with which the others must predict a disc for its place to be checked by them: a place that is
+#: wrong by a diameter is then missed by four standard deviations.
+_LARGEST_PREDICTION_U = 0.25
+#: What serves as diameter of a point, px: a pick that is wrong by that much is noticed.
+_POINT_PX = 20.0
+#: Scatter of the places above which an assignment by hints is compared with one by arrangement, mm: as good as a calliper.
+_PLAIN_SCATTER_MM = 0.3
+#: Distance within which a disc is looked for where a first fit to detected spots expects it, px.
+_REACH_PX = 5.0
 
 
 @dataclass(frozen=True)
@@ -85,16 +75,23 @@ class Registration:
         Registration residual: distance on the plan between the observed and the listed position of each fiducial, with the
         fiducial in the fit and without it (NaN where the others do not determine the fit).
     rms_mm : float, mm
-        Root mean square of `residual_mm`.
+        Root mean square of `residual_mm`; NaN where four fiducials determine the plan exactly, which tells nothing.
+    scatter_mm, scatter_px : float, mm and px
+        Standard deviation of the places along either coordinate, on the plan and on the sensor, from the residuals and their degrees
+        of freedom; not below the uncertainty of the centroids.
+    unchecked : tuple of str
+        Fiducials whose place the others predict too badly to notice if it were wrong by a disc's diameter; all of four.
     left_out : dict of str to str
         Reason, by name, for every listed fiducial that was not used.
     masked : tuple of Fiducial
         Every fiducial on the table, used or not: their pixels do not show the table's temperature.
     shape : (int, int)
         (rows, columns) of the frames.
+    lens : Lens or None
+        The calibrated lens that was given.
     covariance : (p, p) ndarray
-        Of the fitted parameters, p = 8 + number of distortion coefficients, see
-        `thermography.registration.projection.parameter_covariance`.
+        Of the homography and of the distortion, p = 8 with a calibrated lens, else 12: coefficients that were not fitted are not
+        known to be zero. See `thermography.registration.projection.parameter_covariance`.
     """
 
     homography: Array
@@ -106,10 +103,25 @@ class Registration:
     residual_mm: dict[str, float]
     leave_one_out_mm: dict[str, float]
     rms_mm: float
+    scatter_mm: float
+    scatter_px: float
+    unchecked: tuple[str, ...]
     left_out: dict[str, str]
     masked: tuple[Fiducial, ...]
     shape: tuple[int, int]
+    lens: Lens | None
     covariance: Array = field(repr=False)
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether the plan appears as in a mirror: what turns clockwise on it turns anticlockwise in the frame."""
+        centre = np.mean([(disc.x_mm, disc.y_mm) for disc in self.fiducials.values()], axis=0)
+        return bool(np.linalg.det(self.projection.jacobian(centre)) < 0)
+
+    @property
+    def contradicted_hints(self) -> list[str]:
+        """Names of the fiducials in use that lie far from their hints."""
+        return [name.removesuffix(" (hint)") for name in self.left_out if name.endswith(" (hint)")]
 
     def to_plan(self, points_px: Array) -> Array:
         """Locate sensor points, shape (..., 2) px (column, row), on the plan, shape (..., 2) mm (x, y)."""
@@ -164,7 +176,8 @@ def register(
     temperature : (row, column) or (time, row, column) ndarray, degC
         One frame, or a stack, of which the mean is used: averaging raises the contrast of discs above the noise.
     fiducials : sequence of Fiducial
-        As listed in the plan. Pixel hints may be wrong by 20 px, or missing. Markers serve as hints and are masked.
+        As listed in the plan. Pixel hints may be wrong by 20 px, or missing. Markers serve as hints and are masked. Points are
+        taken where they were picked, see `register_points`.
     grid : PlanGrid or None
         The plan, whose edge bounds the table; None takes all discs to lie far from any edge.
     lens : Lens or None
@@ -180,8 +193,8 @@ def register(
     Raises
     ------
     RegistrationError
-        The temperature is neither a frame nor a stack, fewer than four disc fiducials are listed or located, they lie on a line, or
-        their arrangement is ambiguous.
+        The temperature is neither a frame nor a stack, fewer than four disc fiducials are listed or located, they lie on a line,
+        their arrangement is ambiguous or may be chance, or their places contradict one another or their diameters.
     MarkerError
         The markers in view are those of another plan.
 
@@ -210,6 +223,8 @@ def register(
             f"temperature has shape {frame.shape}; give one frame (row, column) or a stack (time, row, column)"
         )
     frame = frame.mean(axis=0) if frame.ndim == 3 else frame
+    if any(fiducial.is_point for fiducial in fiducials):
+        return register_points(None, fiducials, _shape(frame), lens=lens)
     listed, left_out = _without_duplicates(identify_plan(frame, fiducials))
     if len(listed) < 4:
         raise RegistrationError(
@@ -219,29 +234,83 @@ def register(
     if not use_hints:
         listed = [replace(disc, column_px=None, row_px=None) for disc in listed]
     spots = detect_discs(frame)
+    registration = _by_hints_or_arrangement(frame, listed, left_out, spots, grid, lens)
+    markers = tuple(fiducial for fiducial in fiducials if fiducial.marker is not None)
+    return replace(registration, masked=registration.masked + markers)
+
+
+def _by_hints_or_arrangement(
+    frame: Array,
+    listed: list[Fiducial],
+    left_out: dict[str, str],
+    spots: list[Spot],
+    grid: PlanGrid | None,
+    lens: Lens | None,
+) -> Registration:
+    """Register with the discs matched by hints; where these fail or do not agree to a few tenths of a millimetre, by arrangement."""
+    found: list[Registration] = []
+    refusals: list[str] = []
     matched = match_by_hints(spots, listed)
-    if len(matched) < min(6, len(listed)):
+    if len(matched) >= 4:
         try:
-            matched = max(matched, match_by_arrangement(spots, listed, shape=_shape(frame)), key=len)
-        except MatchError as error:
-            if len(matched) < 4:
-                raise RegistrationError(f"the table cannot be located: {error}") from error
-    discs = [disc for disc in listed if disc.name in matched]
-    spot_positions = {
-        name: LocatedDisc(spot.column_px, spot.row_px, _SPOT_U_PX, np.nan, np.nan) for name, spot in matched.items()
+            found.append(_by_spots(frame, listed, left_out, spots, matched, 1, grid, lens))
+        except RegistrationError as error:
+            refusals.append(str(error))
+    # Hints of the mirrored or turned picture lead to a plausible but wrong assignment on a nearly symmetric plan.
+    if not found or found[0].scatter_mm > _PLAIN_SCATTER_MM or len(found[0].located) < min(6, len(listed)):
+        try:
+            arrangement = match_by_arrangement(spots, listed, shape=_shape(frame))
+            found.append(
+                _by_spots(frame, listed, left_out, spots, arrangement.spots, arrangement.hypotheses, grid, lens)
+            )
+        except (MatchError, RegistrationError) as error:
+            refusals.append(str(error))
+    if not found:
+        raise RegistrationError(f"the table cannot be located: {size_contradiction(spots, listed) or refusals[0]}")
+    return max(found, key=lambda registration: (len(registration.located), -registration.scatter_mm))
+
+
+def _by_spots(
+    frame: Array,
+    listed: list[Fiducial],
+    left_out: dict[str, str],
+    spots: list[Spot],
+    matched: dict[str, Spot],
+    hypotheses: int,
+    grid: PlanGrid | None,
+    lens: Lens | None,
+) -> Registration:
+    """Locate all discs from those that are matched with spots, fit those that agree, and refuse what nothing proves."""
+    places = {
+        name: LocatedDisc(spot.column_px, spot.row_px, SPOT_U_PX, spot.area_px, spot.contrast_K)
+        for name, spot in matched.items()
     }
-    projection, _ = _fit(_observations(spot_positions, discs), _shape(frame), lens)
+    located = places
     for _ in range(2):
-        located, missed = locate_fiducials(frame, listed, projection, grid=grid, reach_px=5.0)
+        discs = [disc for disc in listed if disc.name in located]
+        projection, _, _ = _fit(_observations(located, discs), _shape(frame), lens)
+        located, missed = locate_fiducials(frame, listed, projection, grid=grid, reach_px=_REACH_PX)
         if len(located) < 4:
             raise RegistrationError(
                 f"only {len(located)} of {len(listed)} fiducials are located, a plan needs 4: {_reasons(missed)}"
             )
-        discs = [disc for disc in listed if disc.name in located]
-        projection, _ = _fit(_observations(located, discs), _shape(frame), lens)
-    registration = _registration(located, listed, left_out | missed | _wrong_hints(located, discs), _shape(frame), lens)
-    markers = tuple(fiducial for fiducial in fiducials if fiducial.marker is not None)
-    return replace(registration, masked=registration.masked + markers)
+    apart = {name: place for name, place in places.items() if name not in located}
+    registration = _registration(located, listed, left_out | missed, _shape(frame), lens, apart=apart)
+    discs = list(registration.fiducials.values())
+    missed_mm = np.array([registration.leave_one_out_mm[disc.name] for disc in discs])
+    magnification = np.sqrt(np.abs(np.linalg.det(registration.projection.jacobian(_geometry(discs)[0]))))
+    refuse_chance(
+        registration.located,
+        listed,
+        spots,
+        missed_mm * magnification,
+        hypotheses=hypotheses,
+        coefficients=0 if lens is not None else dict(LENS_MODELS)[registration.model],
+        shape=_shape(frame),
+    )
+    refuse_sizes(registration.located, discs, registration.projection)
+    refuse_scatter(registration.scatter_mm, registration.leave_one_out_mm, discs)
+    return replace(registration, left_out=registration.left_out | contradicted_hints(registration.located, discs))
 
 
 def register_points(
@@ -267,14 +336,14 @@ def register_points(
     Returns
     -------
     Registration
-        With a standard uncertainty of 0.5 px for every picked coordinate.
+        With a standard uncertainty of 0.5 px for every picked coordinate, or what their scatter says where that is more.
 
     Raises
     ------
     RegistrationError
-        A name is not listed, fewer than four points are given, or they lie on a line.
+        A name is not listed, fewer than four points are given, they lie on a line, or contradict one another.
     """
-    listed, left_out = _without_duplicates(fiducials)
+    listed, left_out = _without_duplicates([fiducial for fiducial in fiducials if fiducial.marker is None])
     if points_px is None:
         points_px = {disc.name: disc.hint_px for disc in listed if disc.hint_px is not None}
     unknown = sorted(set(points_px) - {disc.name for disc in listed})
@@ -287,7 +356,9 @@ def register_points(
         raise RegistrationError(f"{len(discs)} points are picked; a plan needs at least 4")
     located = {disc.name: LocatedDisc(*points_px[disc.name], _PICKED_U_PX, np.nan, np.nan) for disc in discs}
     missed = {disc.name: "was not picked" for disc in listed if disc.name not in points_px}
-    return _registration(located, listed, left_out | missed, shape, lens)
+    registration = _registration(located, listed, left_out | missed, shape, lens)
+    refuse_picks(registration.scatter_px, registration.leave_one_out_mm)
+    return registration
 
 
 def locate_fiducials(
@@ -328,6 +399,9 @@ def locate_fiducials(
     located: dict[str, LocatedDisc] = {}
     missed: dict[str, str] = {}
     for disc, place, jacobian in zip(fiducials, predicted, jacobians, strict=True):
+        if disc.is_point:
+            missed[disc.name] = "is a point without a disc"
+            continue
         moved = replace(disc, x_mm=disc.x_mm + shift[0], y_mm=disc.y_mm + shift[1])
         result = locate_disc(temperature, moved, bounds, place, jacobian, reach_px=reach_px)
         if isinstance(result, str):
@@ -343,65 +417,104 @@ def _registration(
     left_out: dict[str, str],
     shape: tuple[int, int],
     lens: Lens | None,
+    *,
+    apart: Mapping[str, LocatedDisc] | None = None,
 ) -> Registration:
-    """Choose the lens model, leave out misplaced fiducials one by one, and evaluate residuals and covariance."""
-    located, left_out = dict(located), dict(left_out)
+    """Fit the fiducials that agree; leave out the others, with where they are (`apart`: those that were detected but not located)."""
     discs = [disc for disc in listed if disc.name in located]
-    misplaced: dict[str, tuple[Fiducial, LocatedDisc]] = {}
-    while True:
-        observations = _observations(located, discs)
-        projection, coefficients = _fit(observations, shape, lens)
-        leave_one_out = leave_one_out_mm(observations, projection, coefficients)
-        worst = _misplaced(leave_one_out, observations, projection)
-        if worst is None:
-            break
-        disc = discs.pop(worst)
-        left_out[disc.name] = f"misplaced by {leave_one_out[worst]:.2f} mm against the others; check its x_mm, y_mm"
-        misplaced[disc.name] = (disc, located.pop(disc.name))
-    # A misplaced disc masks the table where it is observed, not where it is listed.
-    observed = {}
-    for name, (disc, place) in misplaced.items():
-        x_mm, y_mm = projection.to_plan(np.array([place.column_px, place.row_px]))
-        observed[name] = replace(disc, x_mm=float(x_mm), y_mm=float(y_mm))
+    observations = _observations(located, discs)
+    projection, coefficients, agree = _fit(observations, shape, lens)
+    misplaced = dict(apart or {})
+    misplaced |= {disc.name: located[disc.name] for disc, agrees in zip(discs, agree, strict=True) if not agrees}
+    observed, left_out = _misplaced(misplaced, listed, projection, left_out)
+    discs = [disc for disc, agrees in zip(discs, agree, strict=True) if agrees]
+    observations = observations.select(agree)
     residual = np.linalg.norm(observations.residuals_mm(projection), axis=1)
+    factor, freedom = variance_factor(observations, projection, coefficients)
     names = [disc.name for disc in discs]
+    leave_one_out = leave_one_out_mm(observations, projection, coefficients)
+    magnification = np.sqrt(np.abs(np.linalg.det(projection.jacobian(observations.centres_mm))))
     return Registration(
         homography=np.linalg.inv(projection.plan_to_sensor),
         distortion=projection.distortion,
         model=_MODEL_NAMES[coefficients] if lens is None else "calibrated lens + homography",
         projection=projection,
         fiducials={disc.name: disc for disc in discs},
-        located=located,
+        located={name: located[name] for name in names},
         residual_mm=dict(zip(names, residual.tolist(), strict=True)),
         leave_one_out_mm=dict(zip(names, leave_one_out.tolist(), strict=True)),
-        rms_mm=float(np.sqrt(np.mean(residual**2))),
+        rms_mm=float(np.sqrt(np.mean(residual**2))) if freedom > 0 else float("nan"),
+        scatter_mm=float(np.sqrt(factor) * np.median(observations.u_px / magnification)),
+        scatter_px=float(np.sqrt(factor) * np.median(observations.u_px)),
+        unchecked=_unchecked(observations, projection, coefficients, discs, factor),
         left_out=left_out,
         masked=tuple(observed.get(disc.name, disc) for disc in listed),
         shape=shape,
-        covariance=parameter_covariance(observations, projection, coefficients),
+        lens=lens,
+        covariance=parameter_covariance(
+            observations, projection, len(LENS_SPREAD) if lens is None else 0, factor=factor
+        ),
     )
 
 
-def _misplaced(leave_one_out: Array, observations: DiscObservations, projection: Projection) -> int | None:
-    """Index of the fiducial whose error exceeds its own uncertainty and the errors of the others by far; None if there is none."""
-    if len(leave_one_out) < 6 or not np.isfinite(leave_one_out).all():
-        return None
-    worst = int(np.argmax(leave_one_out))
-    magnification = float(np.sqrt(abs(np.linalg.det(projection.jacobian(observations.centres_mm[worst])))))
-    u_mm = observations.u_px[worst] / magnification
-    limit = max(_MISPLACED_MM, 5 * float(np.median(np.delete(leave_one_out, worst))), 5 * u_mm)
-    return worst if leave_one_out[worst] > limit else None
+def _unchecked(
+    observations: DiscObservations, projection: Projection, coefficients: int, discs: Sequence[Fiducial], factor: float
+) -> tuple[str, ...]:
+    """Fiducials whose place the others predict with a standard uncertainty above a quarter of their diameter."""
+    if len(discs) == 4:
+        return tuple(disc.name for disc in discs)
+    _, covariances = prediction_errors_px(observations, projection, coefficients)
+    to_mm = np.linalg.inv(projection.jacobian(observations.centres_mm)) * observations.u_px[:, None, None]
+    variances = factor * np.trace(to_mm @ covariances @ np.swapaxes(to_mm, 1, 2), axis1=1, axis2=2)
+    pixel_mm = np.sqrt(np.abs(np.linalg.det(projection.jacobian(observations.centres_mm)))) ** -1.0
+    limits = _LARGEST_PREDICTION_U * np.array(
+        [disc.diameter_mm or _POINT_PX * size for disc, size in zip(discs, pixel_mm, strict=True)]
+    )
+    # Where the others lie on a line, rounding decides the sign of what has no bound.
+    return tuple(
+        disc.name
+        for disc, variance, limit in zip(discs, variances, limits, strict=True)
+        if not 0 <= variance <= limit**2
+    )
 
 
-def _fit(observations: DiscObservations, shape: tuple[int, int], lens: Lens | None) -> tuple[Projection, int]:
-    """Projection and its number of fitted distortion coefficients."""
-    try:
-        if lens is not None:
-            ideal = Projection(np.eye(3), np.array(lens.distortion), lens.focal_length_px, lens.principal_point_px)
-            return fit_projection(observations, fit_homography(observations, ideal), 0), 0
+def _misplaced(
+    places: Mapping[str, LocatedDisc], listed: Sequence[Fiducial], projection: Projection, left_out: dict[str, str]
+) -> tuple[dict[str, Fiducial], dict[str, str]]:
+    """Fiducials that lie elsewhere than listed, at the place where they are observed, and the reasons for leaving out with theirs.
+
+    A misplaced disc masks the table where it is observed, not where it is listed.
+    """
+    observed, left_out = {}, dict(left_out)
+    for disc in listed:
+        if disc.name in places:
+            place = places[disc.name]
+            x_mm, y_mm = projection.to_plan(np.array([place.column_px, place.row_px])).tolist()
+            observed[disc.name] = replace(disc, x_mm=x_mm, y_mm=y_mm)
+            left_out[disc.name] = (
+                f"misplaced by {np.hypot(x_mm - disc.x_mm, y_mm - disc.y_mm):.2f} mm against the others, which see it at "
+                f"({x_mm:.1f}, {y_mm:.1f}) mm; check its x_mm, y_mm, and that nothing covers a part of it"
+            )
+    return observed, left_out
+
+
+def _fit(
+    observations: DiscObservations, shape: tuple[int, int], lens: Lens | None
+) -> tuple[Projection, int, NDArray[np.bool_]]:
+    """Projection fitted to the discs that agree, its number of distortion coefficients, and which discs agree."""
+    if lens is not None:
+        if lens.size_px is not None and lens.size_px != shape[::-1]:
+            raise RegistrationError(
+                "the lens was calibrated with frames of {} x {} pixels, these have {} x {}; calibrate with frames of this size".format(
+                    *lens.size_px, *shape[::-1]
+                )
+            )
+        ideal = Projection(np.eye(3), np.array(lens.distortion), lens.focal_length_px, lens.principal_point_px)
+    else:
         # Only k1 over the squared focal length is determined: the frame's width serves as focal length, its middle as centre.
         ideal = Projection(np.eye(3), np.zeros(4), float(shape[1]), ((shape[1] - 1) / 2, (shape[0] - 1) / 2))
-        return select_lens_model(observations, fit_homography(observations, ideal))
+    try:
+        return fit_agreeing(observations, ideal, calibrated=lens is not None)
     except ValueError as error:
         raise RegistrationError(str(error)) from error
 
@@ -421,7 +534,7 @@ def _without_duplicates(fiducials: Sequence[Fiducial]) -> tuple[list[Fiducial], 
         for other in kept:
             if (
                 disc.name == other.name
-                or np.hypot(disc.x_mm - other.x_mm, disc.y_mm - other.y_mm) < disc.diameter_mm / 2
+                or np.hypot(disc.x_mm - other.x_mm, disc.y_mm - other.y_mm) <= disc.diameter_mm / 2
             ):
                 again = disc.name if disc.name != other.name else f"{disc.name} (second)"
                 left_out[again] = (
@@ -431,20 +544,6 @@ def _without_duplicates(fiducials: Sequence[Fiducial]) -> tuple[list[Fiducial], 
         else:
             kept.append(disc)
     return kept, left_out
-
-
-def _wrong_hints(located: dict[str, LocatedDisc], fiducials: Sequence[Fiducial]) -> dict[str, str]:
-    """Hints far from their fiducial, by a key that says that only the hint is left out: the fiducial itself is used."""
-    wrong = {}
-    for disc in fiducials:
-        if disc.hint_px is not None:
-            place = located[disc.name]
-            distance = np.hypot(disc.hint_px[0] - place.column_px, disc.hint_px[1] - place.row_px)
-            if distance > _WRONG_HINT_PX:
-                wrong[f"{disc.name} (hint)"] = (
-                    f"the hint ({disc.hint_px[0]:g}, {disc.hint_px[1]:g}) px is {distance:.0f} px from the disc; it was not used"
-                )
-    return wrong
 
 
 def _geometry(fiducials: Sequence[Fiducial]) -> tuple[Array, Array]:

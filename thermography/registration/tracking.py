@@ -18,7 +18,7 @@ from thermography.registration.register import Registration
 _COARSE_STEP = 0.25
 #: Discs that differ from the median by more than this (and by five times the median deviation) are left out, mm.
 _OUTLIER_MM = 0.5
-#: A position near that of the previous frame is accepted without a search if its uncertainty is below this, mm, ...
+#: A position near that of the previous frame is accepted without a search if its discs agree to below this, mm, ...
 _RELIABLE_U_MM = 0.3
 #: ... and this share of the discs in view is located.
 _RELIABLE_SHARE = 0.7
@@ -81,11 +81,14 @@ class TablePosition:
         Standard uncertainty of the displacement along either coordinate.
     discs : int
         Number of discs used.
+    scatter_u_mm : float, mm
+        The part of `u_mm` that the scatter of the discs shows, without what the registration contributes to all of them.
     """
 
     shift_mm: Array
     u_mm: float
     discs: int
+    scatter_u_mm: float
 
 
 def make_tracker(registration: Registration, grid: PlanGrid, direction: Array, *, reach_mm: float) -> TableTracker:
@@ -122,8 +125,18 @@ def make_tracker(registration: Registration, grid: PlanGrid, direction: Array, *
         bias_px=projection.disc_centroids(centres, discs[:, 2]) - projection.to_sensor(centres),
         margin_px=3 * np.linalg.norm(projection.jacobian(centres), axis=-1) * radii,
         common_mm=along,
-        common_u_mm=np.sqrt(np.mean(registration.position_u(displaced) ** 2, axis=1)),
+        common_u_mm=_common_u(registration, displaced),
     )
+
+
+def _common_u(registration: Registration, places_mm: Array) -> Array:
+    """Standard uncertainty that the discs of one displacement share, root mean square over those in view, (m,) mm, for (m, n, 2) places."""
+    places = registration.to_sensor(places_mm)
+    in_view = ((places >= 0) & (places <= np.array(registration.shape[::-1]) - 1.0)).all(axis=-1)
+    # Without any disc in view the table is not located there, and any value serves.
+    in_view |= ~np.any(in_view, axis=1)[:, None]
+    common: Array = np.sqrt(np.mean(registration.position_u(places_mm) ** 2, axis=1, where=in_view))
+    return common
 
 
 def locate_table(
@@ -157,13 +170,13 @@ def locate_table(
     candidates = [near, *(_refine(counts, tracker, along[peak] * tracker.direction) for peak in strongest)]
     # Discs at equal distances can be confused with each other: the position on which most discs agree, and agree best, is the right one.
     positions = [candidate for candidate in candidates if candidate is not None]
-    return max(positions, key=lambda p: (p.u_mm < _RELIABLE_U_MM, p.discs, -p.u_mm), default=None)
+    return max(positions, key=lambda p: (p.scatter_u_mm < _RELIABLE_U_MM, p.discs, -p.scatter_u_mm), default=None)
 
 
 def _is_reliable(position: TablePosition, counts: NDArray[np.uint16], tracker: TableTracker) -> bool:
     """Whether most discs that should be in view are located, and agree."""
     in_view = _discs_in_view(counts, tracker, position.shift_mm)
-    return position.u_mm < _RELIABLE_U_MM and position.discs >= _RELIABLE_SHARE * in_view
+    return position.scatter_u_mm < _RELIABLE_U_MM and position.discs >= _RELIABLE_SHARE * in_view
 
 
 def _discs_in_view(counts: NDArray[np.uint16], tracker: TableTracker, shift_mm: Array) -> int:
@@ -189,7 +202,8 @@ def _refine(counts: NDArray[np.uint16], tracker: TableTracker, predicted_mm: Arr
     mean = shifts[kept].mean(axis=0)
     scatter = np.sqrt(((shifts[kept] - mean) ** 2).sum() / (2 * kept.sum() - 2))
     common = np.interp(mean @ tracker.direction, tracker.common_mm, tracker.common_u_mm)
-    return TablePosition(mean, float(np.hypot(scatter / np.sqrt(kept.sum()), common)), int(kept.sum()))
+    own = float(scatter / np.sqrt(kept.sum()))
+    return TablePosition(mean, float(np.hypot(own, common)), int(kept.sum()), own)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -5,18 +5,22 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from compliance_checker.runner import CheckSuite
 
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import read_source
+from fusion.pipeline.consistency import check_place
 from fusion.pipeline.thermal import clock_notices, pixel_notices, reduce_thermography
 from fusion.products.progress import silent
 from fusion.products.store import read_dataset
 from fusion.twin.instruments import simulate_campaign
 from thermography.registration.clock_offset import ClockOffset
+from thermography.registration.evidence import RegistrationError
 
 
 def test_bad_pixels_are_counted_by_kind(rng: np.random.Generator) -> None:
@@ -73,3 +77,35 @@ def test_the_clock_of_a_camera_that_sees_the_table_move_is_found(tmp_path: Path)
     place = outcome.dataset["table_position"]
     assert float(place.max() - place.min()) == pytest.approx(240.0, abs=0.5)
     assert {"time", "frame_time"} <= set(outcome.dataset.coords)
+
+
+def test_points_picked_by_hand_and_a_calibrated_lens_serve_a_campaign(tmp_path: Path) -> None:
+    """A table without painted discs, and the lens that the recipe gave the camera; a wrong list is refused by its name."""
+    (tmp_path / "recipe.toml").write_text(
+        "[campaign]\nseed = 4\n[plan]\nhint_error_px = 0.7\n[test]\ncycles = 12\ntargets = 5\nperiod_s = 120\n"
+        '[camera]\nfile = "seq"\ncolumns = 320\nrows = 240\nfocal_px = 600.0\ndistance_mm = 1500.0\nframes_per_cycle = 1\n'
+    )
+    campaign = simulate_campaign(tmp_path / "recipe.toml", tmp_path / "campaign")
+    text = campaign.read_text().replace('cell_size = "5 mm"', 'cell_size = "20 mm"')
+    campaign.write_text(text.replace("[thermography]", '[thermography]\nlens = "lens.json"'))
+    (campaign.parent / "lens.json").write_text(
+        '{"K": [[600, 0, 159.5], [0, 600, 119.5], [0, 0, 1]], "D": [-0.3, 0, 0, 0], "image_width": 320, "image_height": 240}'
+    )
+    fiducials = pd.read_csv(campaign.parent / "fiducials.csv")
+
+    def registered(table: pd.DataFrame) -> dict[str, Any]:
+        table.to_csv(campaign.parent / "fiducials.csv", index=False)
+        source = read_source(load_campaign(campaign))
+        outcome = reduce_thermography(source, checkpoint=tmp_path / "cycles", scheduler=None, report=silent)
+        part: dict[str, Any] = outcome.parts["registration"]
+        assert [check.code for check in check_place(source, part) if not check.passed] == []
+        return part
+
+    by_discs = registered(fiducials)
+    assert by_discs["model"] == "calibrated lens + homography"
+    assert max(by_discs["rms_mm"], by_discs["position_u_mm"]) < 0.1
+    # Places as read off a screen: whole pixels with the twin's error of a hint, 5 mm each.
+    by_points = registered(fiducials.assign(diameter_mm=np.nan))
+    assert by_discs["position_u_mm"] < 0.1 * by_points["position_u_mm"]
+    with pytest.raises(RegistrationError, match=r"^fiducials\.csv: the table cannot be located: places and diameters"):
+        registered(fiducials.assign(diameter_mm=2 * fiducials["diameter_mm"]))

@@ -23,6 +23,12 @@ def test_the_findings_of_a_run_in_a_few_rows() -> None:
     assert rows["warning"] == "The clocks disagree."
 
 
+def test_an_exact_fit_is_not_printed_as_accuracy() -> None:
+    part = {**PARTS["registration"], "rms_mm": None, "position_u_mm": 0.87, "leave_one_out_mm": dict.fromkeys("ABCD")}
+    rows = dict(summary_rows(assemble("four discs", {**PARTS, "registration": part}, [])))
+    assert rows["registration"] == ("standard uncertainty 0.87 mm, not checked: 4 fiducials determine the plan exactly")
+
+
 def test_a_window_names_cycles_that_were_measured() -> None:
     deviations = build_deviations(
         range(1, 9), [1, 2], np.array([0.0, 10.0]), np.zeros((8, 2, 2)), np.full((8, 2, 2), "NaT", "M8[ns]")

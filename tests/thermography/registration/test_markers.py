@@ -48,6 +48,13 @@ def test_markers_are_found_dark_and_bright(contrast_K, rng):
         assert np.hypot(*(found[one.marker] - SCENE.to_pixels(np.array([(one.x_mm, one.y_mm)]))[0])) < 2
 
 
+@pytest.mark.parametrize("contrast_K", [-0.3, 0.3])
+def test_faint_markers_are_found_beside_a_wide_range(contrast_K, rng):
+    frame = with_markers(SCENE.render(rng), (7, 11, 23, 42), contrast_K)
+    assert set(detect_markers(frame)) == {7, 11, 23, 42}
+    assert detect_markers(SCENE.render(rng)) == {}
+
+
 def test_hints_by_markers_locate_the_plan_as_the_discs_do(rng):
     frame = with_markers(SCENE.render(rng), (7, 11, 23, 42), -4.0)
     hinted = identify_plan(frame, [*DISCS, *MARKERS])

@@ -40,6 +40,7 @@ def test_margins_of_plan_and_discs():
         ("name,x_mm,y_mm,diameter_mm\n,1,2,16\n", r":2: name is empty"),
         ("name,x_mm,y_mm,diameter_mm\nF1,1,2,-16\n", r":2: diameter_mm = -16; a disc has a positive diameter"),
         ("name,x_mm,y_mm,diameter_mm,column_px,row_px\nF1,1,2,16,5,\n", r":2: F1 has one of column_px, row_px"),
+        ("name,x_mm,y_mm,diameter_mm\nF1,1,2,\n", r":2: F1 has neither diameter_mm .* nor column_px, row_px"),
         ("name,x_mm,y_mm,diameter_mm\nF1,1,2,16\n", r"lists 1 fiducials; a plan is located by at least 4"),
     ],
 )
@@ -69,6 +70,20 @@ def test_marker_column_of_the_fiducial_file(tmp_path):
         read_fiducials(path)
     path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,marker", *rows[1:], "M7,120,40,52,7"]))
     with pytest.raises(FiducialError, match="lists 3 fiducials; a plan is located by at least 4"):
+        read_fiducials(path)
+
+
+def test_points_have_places_instead_of_diameters(tmp_path):
+    path = tmp_path / "fiducials.csv"
+    rows = [f"P{i},{100 * i},{20 * i * i},,{90 * i},{50 + i}" for i in range(1, 5)]
+    path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,column_px,row_px", *rows]))
+    points = read_fiducials(path)
+    assert all(point.is_point for point in points)
+    assert points[1].hint_px == (180.0, 52.0)
+    path.write_text("\n".join(["name,x_mm,y_mm,diameter_mm,column_px,row_px", *rows, "F5,30,40,16,,"]))
+    with pytest.raises(
+        FiducialError, match=r"lists 1 discs and 4 points without diameter_mm; .* by discs or by points"
+    ):
         read_fiducials(path)
 
 

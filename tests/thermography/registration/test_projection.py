@@ -7,6 +7,7 @@ import pytest
 from tests.thermography.plan_scene import DISCS, FOCAL_PX, Scene
 from thermography.errors import ThermographyError
 from thermography.registration.projection import (
+    LENS_SPREAD,
     DiscObservations,
     Projection,
     fit_homography,
@@ -15,6 +16,7 @@ from thermography.registration.projection import (
     parameter_covariance,
     parameter_jacobian,
     select_lens_model,
+    variance_factor,
 )
 
 PLAN = np.array([(disc.x_mm, disc.y_mm) for disc in DISCS], float)
@@ -70,11 +72,34 @@ def test_covariance_is_that_of_repeated_observations(rng):
     observed = [exact + rng.normal(0, u_px[:, None], PLAN.shape) for _ in range(200)]
     fits = [fit_projection(DiscObservations(points, PLAN, radii, u_px), true, 0) for points in observed]
     scatter = np.std([fit.to_sensor(places) for fit in fits], axis=0)
-    covariance = parameter_covariance(DiscObservations(exact, PLAN, radii, u_px), true, 0)
+    covariance = parameter_covariance(DiscObservations(exact, PLAN, radii, u_px), true, 0, factor=1.0)
     derivative = parameter_jacobian(true, PLAN, 0)(places)
     stated = np.sqrt(np.diagonal(derivative @ covariance @ np.swapaxes(derivative, 1, 2), axis1=1, axis2=2))
     # 200 fits give a standard deviation to 5 %.
     np.testing.assert_allclose(scatter, stated, rtol=0.2)
+
+
+def test_variance_factor_is_the_reduced_chi_square(rng):
+    true = Projection(Scene().plan_to_pixel, np.zeros(4), 640.0, (319.5, 239.5))
+    radii, u_px = np.full(len(PLAN), 8.0), np.full(len(PLAN), 0.02)
+    points = true.disc_centroids(PLAN, radii) + rng.normal(0, 0.1, PLAN.shape)
+    observations = DiscObservations(points, PLAN, radii, u_px)
+    factor, freedom = variance_factor(observations, fit_projection(observations, true, 1), 1)
+    # 24 coordinates less 9 parameters, of which the discs determine all; their scatter is five times the stated one.
+    assert freedom == pytest.approx(15.0, abs=0.01)
+    assert 12 < factor < 45
+    four = observations.select(np.isin(np.arange(12), [0, 4, 5, 9]))
+    assert variance_factor(four, fit_projection(four, true, 1), 1) == (1.0, 0.0)
+
+
+def test_where_discs_are_few_the_spread_among_lenses_is_the_uncertainty():
+    four = np.isin(np.arange(12), [0, 4, 5, 9])
+    true = Projection(Scene().plan_to_pixel, np.zeros(4), 640.0, (319.5, 239.5))
+    observations = DiscObservations(true.to_sensor(PLAN), PLAN, np.full(12, 1e-6), np.full(12, 0.02)).select(four)
+    fitted, coefficients = select_lens_model(observations, fit_homography(observations, true))
+    assert (coefficients, fitted.distortion[0]) == (1, pytest.approx(0.0, abs=1e-6))
+    covariance = parameter_covariance(observations, fitted, 4, factor=1.0)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(covariance)[8:]), LENS_SPREAD, rtol=1e-3)
 
 
 def test_discs_on_a_line_determine_no_homography():

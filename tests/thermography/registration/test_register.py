@@ -101,7 +101,7 @@ def test_symmetric_arrangement_is_refused_without_hints(rng):
 
 def test_too_few_fiducials_are_refused(rng):
     image = Scene(disc_K=-4.0, discs=tuple(DISCS[:3])).render(rng)
-    with pytest.raises(RegistrationError, match="only 3 disc-shaped spots are seen where 12 fiducials are listed"):
+    with pytest.raises(RegistrationError, match="only 3 disc-shaped spots are in view where 12 fiducials are listed"):
         register(image, DISCS, grid=GRID)
 
 
@@ -119,6 +119,61 @@ def test_picked_points_register_without_an_image():
     assert register_points(None, pairs, (480, 640)).located == registration.located
     with pytest.raises(RegistrationError, match="picked points G1 are not in the list of fiducials"):
         register_points({"G1": (1.0, 1.0)}, DISCS, (480, 640))
+
+
+def test_points_without_discs_register_by_command_and_a_wrong_pick_is_named(rng):
+    scene = Scene()
+    plan = np.array([(d.x_mm, d.y_mm) for d in DISCS], float)
+    places = scene.to_pixels(plan) + rng.normal(0, 0.5, plan.shape)
+    points = [Fiducial(d.name, d.x_mm, d.y_mm, 0.0, c, r) for d, (c, r) in zip(DISCS, places, strict=True)]
+    points[2] = replace(points[2], column_px=points[2].column_px + 40)
+    registration = register(np.full((480, 640), 22.0), points, grid=GRID)
+    assert set(registration.left_out) == {"F3"}
+    assert scene.registration_rms_mm(registration) < 2 * np.sqrt(np.mean(registration.position_u(plan) ** 2))
+    with pytest.raises(RegistrationError, match="picked points contradict one another"):
+        register_points({points[i].name: points[i].hint_px for i in (0, 2, 4, 5, 9)}, points, (480, 640))
+
+
+def test_four_discs_determine_the_plan_and_check_nothing(rng):
+    scene = Scene(disc_K=-4.0, k1=-0.3)
+    corners = [disc for disc in hinted(scene, rng, 5) if disc.name in ("F1", "F5", "F6", "F10")]
+    registration = register(scene.render(rng), corners, grid=GRID)
+    assert registration.unchecked == ("F1", "F5", "F6", "F10")
+    assert np.isnan(registration.rms_mm)
+    # The lens distorts by up to 0.9 mm between the corners, which nothing but the spread among lenses tells.
+    u_mm = np.sqrt(np.mean(registration.position_u(GRID.centres_mm) ** 2))
+    assert scene.registration_rms_mm(registration) < 2 * u_mm
+    assert u_mm > 0.3
+
+
+def test_three_wrong_places_of_twelve_are_named_and_do_not_bend_the_others(rng):
+    scene = Scene(disc_K=-4.0)
+    listed = [replace(d, x_mm=d.x_mm + 4, y_mm=d.y_mm - 3) if d.name in ("F2", "F6", "F12") else d for d in DISCS]
+    registration = register(scene.render(rng), listed, grid=GRID)
+    assert set(registration.left_out) == {"F2", "F6", "F12"}
+    assert "misplaced by 5.0" in registration.left_out["F6"]
+    assert scene.registration_rms_mm(registration) < 0.05
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_diameters_that_contradict_the_places_are_refused(rng, factor):
+    scene = Scene(disc_K=-4.0)
+    listed = [replace(d, diameter_mm=factor * d.diameter_mm) for d in hinted(scene, rng, 5)]
+    with pytest.raises(RegistrationError, match="places and diameters of the fiducials contradict each other"):
+        register(scene.render(rng), listed, grid=GRID)
+
+
+def test_a_mirrored_plan_is_recognised(rng):
+    scene = Scene(disc_K=-4.0)
+    listed = [replace(d, y_mm=180 - d.y_mm) for d in DISCS]
+    assert register(scene.render(rng), listed, grid=GRID).mirrored
+    assert not register(scene.render(rng), DISCS, grid=GRID).mirrored
+
+
+def test_a_lens_of_other_frames_is_refused(rng):
+    lens = Lens(FOCAL_PX, (159.5, 119.5), (-1.2, 0.0, 0.0, 0.0), (320, 240))
+    with pytest.raises(RegistrationError, match="calibrated with frames of 320 x 240 pixels, these have 640 x 480"):
+        register(Scene(disc_K=-4.0).render(rng), DISCS, grid=GRID, lens=lens)
 
 
 def test_points_on_a_line_are_refused():

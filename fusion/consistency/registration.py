@@ -1,0 +1,87 @@
+"""Checks of the registration: fiducials that are missing or that nothing checks, hints that contradict, a mirrored plan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fusion.consistency.checks import Check
+
+#: Least share of the listed fiducials that must agree: of a list of this table, most are in view.
+_LEAST_FOUND = 0.5
+#: Largest share of the fiducials in use that may lie far from their hints: hints are read off a screen, and single ones go wrong.
+_LARGEST_CONTRADICTED = 0.5
+_FIGURES = (
+    "the place of every temperature on the plan, rises along the measured line, and every cause that follows the field"
+)
+
+
+def check_registration(registration: Mapping[str, Any], *, file: str) -> list[Check]:
+    """Check what the registration found.
+
+    Parameters
+    ----------
+    registration : mapping
+        Part ``registration`` of results.json.
+    file : str
+        The list of fiducials, as the campaign names it.
+
+    Returns
+    -------
+    list of Check
+        Of the share that agrees, of fiducials that the others do not check, of hints, and of a plan seen as in a mirror.
+    """
+    used, listed = list(registration["leave_one_out_mm"]), int(registration["fiducials_listed"])
+    unchecked, hints = list(registration["unchecked"]), list(registration["contradicted_hints"])
+    share, against = len(used) / listed, len(hints) / len(used)
+    mirrored = bool(registration["mirrored"])
+    return [
+        Check(
+            "fiducials_found",
+            share,
+            _LEAST_FOUND,
+            share >= _LEAST_FOUND,
+            f"{len(used)} of the {listed} fiducials of {file} are in view and agree.",
+            ""
+            if share >= _LEAST_FOUND
+            else f"Check that {file} belongs to this table, and clean or repaint the discs.",
+            _FIGURES,
+        ),
+        Check(
+            "fiducials_unchecked",
+            float(len(unchecked)),
+            0.0,
+            not unchecked,
+            f"If {', '.join(unchecked)} stood elsewhere than {file} says, the other fiducials would not show it."
+            if unchecked
+            else "Every fiducial is checked by the others.",
+            f"Measure the places of {', '.join(unchecked)} again, and paint and list more discs: six or more, over the whole plan."
+            if unchecked
+            else "",
+            _FIGURES,
+        ),
+        Check(
+            "fiducial_hints",
+            against,
+            _LARGEST_CONTRADICTED,
+            against <= _LARGEST_CONTRADICTED,
+            f"{len(hints)} of {len(used)} fiducials lie more than 25 px from their column_px, row_px in {file}.",
+            ""
+            if against <= _LARGEST_CONTRADICTED
+            else f"Read column_px, row_px of {file} off a frame of this series, or remove them; check that the names belong to the places.",
+            _FIGURES,
+        ),
+        Check(
+            "plan_mirrored",
+            float(mirrored),
+            0.0,
+            not mirrored,
+            f"The plan of {file} appears mirrored in the frames."
+            if mirrored
+            else "The plan turns in the frames as it is drawn.",
+            "Check the signs of x_mm and y_mm, and [plan.axis]; if the plan is drawn with y upwards, accept this doubt."
+            if mirrored
+            else "",
+            "place and direction of the measured line on the plan, and every cause that follows the field",
+        ),
+    ]

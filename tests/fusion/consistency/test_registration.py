@@ -1,0 +1,45 @@
+"""What a registration leaves to doubt."""
+
+import pytest
+
+from fusion.consistency.checks import CODES
+from fusion.consistency.registration import check_registration
+
+SOUND = {
+    "leave_one_out_mm": {f"F{i}": 0.02 for i in range(1, 13)},
+    "fiducials_listed": 12,
+    "unchecked": [],
+    "contradicted_hints": [],
+    "mirrored": False,
+}
+
+
+def doubts(**changed):
+    checks = check_registration({**SOUND, **changed}, file="fiducials.csv")
+    assert all(check.code in CODES for check in checks)
+    assert all(bool(check.remedy) != check.passed for check in checks)
+    return [(check.code, check.evidence) for check in checks if not check.passed]
+
+
+def test_a_sound_registration_is_not_doubted():
+    assert doubts() == []
+    assert doubts(contradicted_hints=["F1", "F2"], leave_one_out_mm={f"F{i}": 0.0 for i in range(6)}) == []
+
+
+@pytest.mark.parametrize(
+    ("changed", "code", "evidence"),
+    [
+        (
+            {"leave_one_out_mm": dict.fromkeys("ABCDE", 0.1)},
+            "fiducials_found",
+            "5 of the 12 fiducials of fiducials.csv",
+        ),
+        ({"unchecked": ["F1", "F3"]}, "fiducials_unchecked", "If F1, F3 stood elsewhere than fiducials.csv says"),
+        ({"contradicted_hints": list("ABCDEFG")}, "fiducial_hints", "7 of 12 fiducials lie more than 25 px"),
+        ({"mirrored": True}, "plan_mirrored", "appears mirrored"),
+    ],
+)
+def test_each_doubt_is_named(changed, code, evidence):
+    ((named, text),) = doubts(**changed)
+    assert named == code
+    assert evidence in text
