@@ -340,8 +340,8 @@ def declare(readings: Readings, declared: Sequence[str], effects: Mapping[str, E
             )
         if not candidates[0].columns.any():
             raise LoopError(
-                f"declared effect {name!r} is zero at every reading: what it follows does not change during the test; check that the frames "
-                "are not copies of one (camera frozen) and that the logs move, or leave it out of [model] declared"
+                f"declared effect {name!r} is zero at every reading: what it follows does not change during the test; check that the "
+                "frames are not copies of one (camera frozen) and that the logs move, or leave it out of [model] declared"
             )
         terms.append(Term(name, replace(candidates[0], prior=effects[name].prior)))
     return terms
