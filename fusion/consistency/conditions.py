@@ -38,6 +38,8 @@ _CONDITIONS = {
     "travel": Condition("the positions are in mm", _LASER),
     "copied_cycles": Condition("every cycle was measured", _LASER),
     "approach_labels": Condition("the labels of the approaches are right", _LASER),
+    "travel_order": Condition("the labels of the approaches are right", _LASER),
+    "mirrored_readings": Condition("the signs of the deviations are right", _LASER),
     "datum": Condition("the datum of the laser stayed the same", _LASER),
     "zeroed_cycles": Condition("the laser was not set to zero in every cycle", _LASER),
     "environment_coverage": Condition("the environment log belongs to this test", (_CAUSES,)),

@@ -322,7 +322,8 @@ def declare(readings: Readings, declared: Sequence[str], effects: Mapping[str, E
     Raises
     ------
     LoopError
-        if a name is unknown, or the effect cannot be computed from these readings or has parameters that are not known beforehand.
+        if a name is unknown, or the effect cannot be computed from these readings, is zero at all of them, or has parameters that are not
+        known beforehand.
     """
     terms = []
     for name in declared:
@@ -336,6 +337,11 @@ def declare(readings: Readings, declared: Sequence[str], effects: Mapping[str, E
             raise LoopError(
                 f"declared effect {name!r} has parameters that are not known beforehand; leave it out of [model] declared, the "
                 "search tries it anyway"
+            )
+        if not candidates[0].columns.any():
+            raise LoopError(
+                f"declared effect {name!r} is zero at every reading: what it follows does not change during the test; check that the "
+                "frames are not copies of one (camera frozen) and that the logs move, or leave it out of [model] declared"
             )
         terms.append(Term(name, replace(candidates[0], prior=effects[name].prior)))
     return terms

@@ -34,6 +34,20 @@ def inverted_signs(folder: Path) -> None:
     _laser(folder, lambda table: table.__setitem__("deviation_um", -table["deviation_um"]))
 
 
+def one_gross_reading(folder: Path) -> None:
+    """One reading of a metre."""
+    _laser(
+        folder, lambda table: table.__setitem__("deviation_um", table["deviation_um"].where(table.index != 100, 1e6))
+    )
+
+
+def new_datum(folder: Path) -> None:
+    """The beam was broken before cycle 15."""
+    _laser(
+        folder, lambda table: table.__setitem__("deviation_um", table["deviation_um"] + 80.0 * (table["cycle"] >= 15))
+    )
+
+
 def copied_cycle(folder: Path) -> None:
     """Cycle 13 holds the deviations of cycle 12."""
 

@@ -185,6 +185,16 @@ def test_declared_effects_that_cannot_be_computed_are_refused(declared, message)
         close_loop(readings_of(), declared)
 
 
+def test_a_declared_effect_that_follows_nothing_is_refused_by_name():
+    readings = readings_of()
+    frozen = {
+        name: replace(series, values=np.zeros_like(series.values)) if name in ("mean_rise", "axis_integral") else series
+        for name, series in readings.series.items()
+    }
+    with pytest.raises(LoopError, match=r"'axis_expansion' is zero at every reading: .*camera frozen"):
+        close_loop(replace(readings, series=frozen), DECLARED)
+
+
 def test_too_few_cycles_are_refused():
     with pytest.raises(LoopError, match="too few to hold some out"):
         close_loop(readings_of(test={"cycles": 9}), DECLARED)

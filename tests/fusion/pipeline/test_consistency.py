@@ -45,6 +45,7 @@ def test_a_contradiction_is_refused_before_a_folder_is_made(
         (lies.positions_in_inch, "travel"),
         (lies.inverted_signs, "axis_line"),
         (lies.copied_cycle, "copied_cycles"),
+        (lies.new_datum, "datum"),
         (lies.drivers_end_early, "drivers_coverage"),
         (lies.aluminium, "expansion_coefficient"),
         (lies.emissivity_of_half, "material_rise"),
@@ -81,3 +82,19 @@ def test_a_doubt_can_be_accepted_and_an_unknown_one_is_refused(copied: Path, tmp
         CampaignError, match=r"accept\.doubts = 'weather': no such check; there are: deviation_magnitude"
     ):
         run_campaign(path, tmp_path / "other")
+
+
+def test_one_error_of_reading_changes_neither_the_verdict_on_the_field_nor_the_causes(
+    copied: Path, tmp_path: Path, results_folder: Path
+) -> None:
+    lies.one_gross_reading(copied)
+    sound, spoilt = read_results(results_folder), run_campaign(copied / "campaign.toml", tmp_path / "out")
+    assert sound.correlation is not None and spoilt.correlation is not None and sound.loop is not None
+    assert spoilt.correlation.verdict == sound.correlation.verdict
+    # One reading of 288 less; the p-values have a standard error of 0.016 from their 499 draws.
+    assert spoilt.correlation.source.p_value == pytest.approx(sound.correlation.source.p_value, abs=0.06)
+    assert spoilt.loop is not None
+    assert [step.effect for step in spoilt.loop.steps] == [step.effect for step in sound.loop.steps]
+    assert spoilt.loop.rmse_final_um == pytest.approx(sound.loop.rmse_final_um, rel=0.02)
+    (notice,) = (warning for warning in spoilt.warnings if warning.code == "gross_readings")
+    assert "cycle 9 positive target 5; left out" in notice.message
