@@ -224,8 +224,9 @@ def _added_effect(
         before_um, after_um, without_um = *state.errors_um[place : place + 2], state.errors_without_um[place]
     without = fit_model(model.readings, state.kept([place]), used=model.used)
     cross_before_um, cross_after_um = (cross_rmse(one, event_s) for one in (without, model))
-    # The drift that is carried into the hold-out set has learnt an early step by then.
-    held_out_tells = not step.is_late_entry and event_s is None
+    # The drift that is carried into the hold-out set has learnt an early step by then, and what happened only in the hold-out set makes
+    # every error there larger.
+    held_out_tells = event_s is None and not any(one.is_late_entry for one in state.steps)
     judged = (state.errors_um[-1], without_um) if held_out_tells else (cross_after_um, cross_before_um)
     doubt = doubt_of(
         *judged, model.fit.sigma, "on the hold-out set" if held_out_tells else "of blocks that are left out"
