@@ -26,7 +26,7 @@ _BLOCK = 5
 #: Probability of reporting a shape where none is left, over all statistics together.
 LEVEL = 0.02
 #: An unexplained drift counts as a remainder from this share of a reading's noise on.
-_DRIFT_SHARE = 0.5
+DRIFT_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -97,6 +97,11 @@ class Remainder:
     series: Array
     free: Callable[[Array], Array]
 
+    @property
+    def is_tested(self) -> bool:
+        """Whether a permutation test shows the shape; a drift counts by its size alone."""
+        return bool(self.shape) and self.p_value < LEVEL
+
     def share_of(self, columns: Array) -> float:
         """Share of the remainder's variance that columns (n, q) explain beside what the model has already."""
         beside = self.free(columns)
@@ -157,7 +162,7 @@ def with_drift(remainder: Remainder, fit: DriftFit) -> Remainder:
     drift, basis = unexplained_drift(fit)
     sizes = np.sqrt(np.mean(drift**2, axis=0))
     largest = int(np.argmax(sizes))
-    if sizes[largest] <= _DRIFT_SHARE * fit.sigma:
+    if sizes[largest] <= DRIFT_SHARE * fit.sigma:
         return remainder
     course = "smooth" if fit.system.order == 2 else "irregular"
     where = ("all positions alike", "growing along the axis")[largest] if sizes.size == 2 else f"channel {largest + 1}"

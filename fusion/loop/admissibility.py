@@ -38,6 +38,9 @@ class Grounds(Protocol):
     def at_switching(self, candidate: Candidate) -> float | None:
         """Hours since the start at which a driver was switched together with the candidate's event, None if it was not."""
 
+    def heat_is_logged(self) -> bool:
+        """Whether anything that makes heat was logged and varied."""
+
     def noise_of_lag(self, candidate: Candidate) -> tuple[str, float, float]:
         """Name of the temperature that the candidate delays, its noise over its range, and the largest share that is admissible."""
 
@@ -91,6 +94,8 @@ def refuse(effect: str, excited_by: str, candidate: Candidate, grounds: Grounds)
         advantage = grounds.advantage_over_smoothing(candidate)
         if advantage < _SMOOTH_GAIN:
             return Decision(effect, Reason.SMOOTHING, {"series": series, "advantage": advantage})
+        if not grounds.heat_is_logged():
+            return Decision(effect, Reason.UNLOGGED_HEAT)
     return None
 
 
@@ -104,6 +109,10 @@ class AxisGrounds:
     def at_switching(self, candidate: Candidate) -> float | None:
         """Return None: a load that is switched between cycles leaves an event its instant."""
         return None
+
+    def heat_is_logged(self) -> bool:
+        """Whether a driver was logged."""
+        return bool(self._training.drivers)
 
     def noise_of_lag(self, candidate: Candidate) -> tuple[str, float, float]:
         """Noise of the mean rise; a single warm-up needs a quieter temperature."""

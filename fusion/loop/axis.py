@@ -1,7 +1,8 @@
 """The closed loop on a positioning campaign: readings along an axis, a hold-out set of the last cycles, a second look at all of them.
 
 The last fifth of the cycles is held out. After the search on the others the hold-out set is opened once: the error before and after is
-that of predicting these cycles in open loop with frozen coefficients. What acted only there is searched for in a second look.
+that of predicting these cycles in open loop with frozen coefficients. What acted only there is searched for in a second look, which has
+no held-out error any more.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from fusion._typing import Array
 from fusion.alignment.readings import Readings
 from fusion.diagnosis import remainder
 from fusion.effects.effect import Candidate, Effect
@@ -22,6 +24,7 @@ from fusion.effects.library import LIBRARY, library
 from fusion.errors import FusionError
 from fusion.loop.admissibility import AxisGrounds, refuse
 from fusion.loop.axis_pattern import wrong_patterns
+from fusion.loop.baselines import ErrorInterval, error_interval, plain_errors
 from fusion.loop.closed_loop import (
     HOLD_OUT_SHARE,
     MOST_EFFECTS,
@@ -29,38 +32,28 @@ from fusion.loop.closed_loop import (
     Progress,
     choose,
     drop_superfluous,
-    enter,
     no_progress,
     open_hold_out,
     search,
-    verdict,
     withdraw,
 )
 from fusion.loop.confirmation import CandidateScorer, ask_hold_out
-from fusion.loop.decisions import Decision, Reason
+from fusion.loop.decisions import FINAL, Decision, Reason
 from fusion.loop.detectability import detection_limits
-from fusion.loop.result import (
-    LoopResult,
-    declared_coefficients,
-    nuisance_size,
-    persistence,
-    report_steps,
-    rmse,
-)
+from fusion.loop.result import LoopResult, declared_coefficients, nuisance_size, report_steps, rmse
 from fusion.loop.scoring import WORTH_CONFIRMING, Families, collect_candidates, of_same_kind, refine, score_effects
-from fusion.loop.state import Confirmation, Confirmed, HoldOutQuestion, LoopState, Round, Score
+from fusion.loop.state import Confirmed, HoldOutQuestion, LoopState, Round, Score
+from fusion.loop.verdict import has_skill
 from fusion.model.fit import ModelFit, Term, again, fit_model, refit_fixed, settled
 
 LEAST_CYCLES = 10
-#: Shares of the probability of adding an effect under the null hypothesis, over everything that is tried (2.5 %): the search, the one
-#: question to the hold-out set, the second look. Every effect that is found opens the search again with the same probability, and a
-#: campaign may lack two: half of the 5 % that a wrong name may have.
-SEARCH_LEVEL, ASKED_LEVEL, SECOND_LEVEL = 0.015, 0.005, 0.005
-ENTRY_LEVEL = SEARCH_LEVEL + ASKED_LEVEL + SECOND_LEVEL
-#: An effect with a larger p-value, uncorrected, is not worth the one question to the hold-out set.
+#: Shares of the probability of adding an effect under the null hypothesis, over everything that is tried (2.5 %): the search, and the
+#: second look. Every effect that is found opens the search again with the same probability, and a campaign may lack two: half of the 5 %
+#: that a wrong name may have.
+SEARCH_LEVEL, SECOND_LEVEL = 0.02, 0.005
+ENTRY_LEVEL = SEARCH_LEVEL + SECOND_LEVEL
+#: An effect with a larger p-value, uncorrected, is not worth a question to the hold-out set.
 _WORTH_ASKING = 0.1
-#: An effect is withdrawn where the hold-out error grows by more than this factor with it.
-_WORSE = 1.05
 _BUILT_IN = frozenset(effect.name for effect in LIBRARY)
 
 AxisState = LoopState[ModelFit]
@@ -113,30 +106,33 @@ def close_loop(
     problem = AxisProblem(readings, used, effects, np.random.default_rng(seed))
     start = problem.start(terms)
     state = search(problem, start, progress=progress)
+    state = keep_right_patterns(problem, state)
     progress(MOST_EFFECTS, MOST_EFFECTS + 2, "opening the hold-out set")
-    state = open_hold_out(problem, state)
-    rmse_declared_um = state.errors_um[0]
-    state = replace(state, model=settled(fit_model(readings, state.model.terms), effects))
+    state = problem.ask_hold_out(open_hold_out(problem, state))
+    decided = state.model.terms
+    state = replace(state, model=settled(fit_model(readings, decided), effects))
     progress(MOST_EFFECTS + 1, MOST_EFFECTS + 2, "second look, at all cycles")
     state = keep_right_patterns(problem, look_again(problem, state))
     left = examine_remainder(state.model, seed, set_aside)
-    progress(MOST_EFFECTS + 2, MOST_EFFECTS + 2, "loop closed")
-    return LoopResult(
+    result = LoopResult(
         declared=list(declared),
         declared_coefficients=declared_coefficients(state.model, len(terms)),
         held_out=description,
         noise_floor_um=state.model.fit.sigma,
-        rmse_persistence_um=persistence(readings, used),
-        rmse_declared_um=rmse_declared_um,
+        rmse_declared_um=state.errors_um[0],
         rmse_final_um=state.errors_um[-1],
-        steps=report_steps(state),
-        verdict=verdict(added=bool(state.steps), remains=bool(left.shape)),
+        hold_out=hold_out_intervals(problem, {"declared": terms, "final": decided}, seed),
+        skill=problem.has_skill(state),
+        steps=report_steps(state, wrong_patterns(state.model, state.added, effects)),
+        unnamed=state.unnamed(SECOND_LEVEL),
         remainder=left,
         nuisance=nuisance_size(state.model),
         state=state,
         before=start.model,
         after=state.model,
     )
+    progress(MOST_EFFECTS + 2, MOST_EFFECTS + 2, "loop closed")
+    return result
 
 
 class AxisProblem:
@@ -204,23 +200,29 @@ class AxisProblem:
         return 0.5 * model.fit.response.size * float(np.log(refit_fixed(model, kept).rss / model.fit.rss))
 
     def hold_out_error(self, terms: Sequence[Term]) -> float:
-        """Open-loop error on the hold-out cycles, um; an event among them is sized on one half of the targets, tested on the other."""
+        """Open-loop error on the hold-out cycles, root mean square, um."""
+        return rmse(self.hold_out_errors(terms))
+
+    def hold_out_errors(self, terms: Sequence[Term]) -> Array:
+        """Open-loop errors on the hold-out cycles, um; an event among them is sized on one half of the targets, tested on the other."""
         if not any(self.is_late(term) for term in terms):
-            return rmse(fit_model(self.readings, terms, used=self.used).open_loop_errors()[0])
+            return fit_model(self.readings, terms, used=self.used).open_loop_errors()[0]
         half = self.readings.target_index % 2 == 0
-        parts = [fit_model(self.readings, terms, used=self.used | fitted) for fitted in (half, ~half)]
-        return rmse(np.concatenate([part.open_loop_errors()[0] for part in parts]))
+        errors = np.full(self.used.size, np.nan)
+        for fitted in (half, ~half):
+            used = self.used | fitted
+            errors[~used] = fit_model(self.readings, terms, used=used).open_loop_errors()[0]
+        return errors[~self.used]
 
-    def is_judged_by_hold_out(self, score: Score) -> bool:
-        """An event before the hold-out set shifts a level that the carried drift has learnt by then, so the error says nothing of it."""
-        return not score.is_event
-
-    def is_harmless(self, with_it_um: float, without_it_um: float) -> bool:
-        """An effect may stay unless the error grows clearly with it."""
-        return with_it_um <= _WORSE * without_it_um
+    def has_skill(self, state: AxisState) -> bool:
+        """Whether the final model predicts the hold-out cycles better than the last values and the means before them."""
+        late = any(step.confirmed is Confirmed.SECOND_LOOK for step in state.steps)
+        error_um = self.hold_out_error(state.model.terms) if late else state.errors_um[-1]
+        plain = {name: rmse(errors) for name, errors in plain_errors(self.readings, self.used).items()}
+        return has_skill(error_um, plain["last_value"], plain["mean"], state.model.fit.sigma, remainder.DRIFT_SHARE)
 
     def ask_hold_out(self, state: AxisState) -> AxisState:
-        """Put the strongest candidate that the search could not decide on to the hold-out set.
+        """Say what the hold-out set thinks of the strongest candidate that the search could not decide on; it enters in no case.
 
         One question, chosen before the hold-out set is opened, needs no correction for the search.
         """
@@ -230,17 +232,10 @@ class AxisProblem:
                 continue
             refusal = self.refuse(score, state.model)
             if refusal is not None:
-                state = state.decide(refusal)
+                state = state.decide(replace(refusal, evidence={**refusal.evidence, "search_p": score.family_wise_p}))
                 continue
-            before, after, p_value = ask_hold_out(state.model, score.best, self.rng)
-            entered = after < before and p_value <= ASKED_LEVEL
-            question = HoldOutQuestion(score.name, score.best.parameters, before, after, p_value, entered)
-            state = replace(state, question=question)
-            if not entered:
-                return state
-            way = Confirmed.HOLD_OUT_QUESTION
-            gain = score.confirmation.gain if score.confirmation else 0.0
-            return enter(self, state, replace(score, confirmation=Confirmation(True, way, gain, p_value)))
+            answer = ask_hold_out(state.model, score.best, self.rng)
+            return replace(state, question=HoldOutQuestion(score.name, score.best.parameters, *answer))
         return state
 
     def is_late(self, term: Term) -> bool:
@@ -348,15 +343,19 @@ def declare(readings: Readings, declared: Sequence[str], effects: Mapping[str, E
 
 
 def look_again(problem: AxisProblem, state: AxisState) -> AxisState:
-    """Search once more with the hold-out cycles in view: what acted only there could not be found before.
+    """Search once more, in all cycles: what acted only in the hold-out set could not be found before.
 
-    Coefficients behind the error after still come from the training cycles, but the name does not; the step says so.
+    An effect that enters now has no held-out error, and those that were decided on the training part stay. Where one of those was
+    withdrawn for its pattern nothing is searched for: the library does not hold it, and what would be found stands in for it.
 
     Parameters
     ----------
     problem : the campaign
     state : with a model fitted to all readings and the hold-out errors of its steps
     """
+    decided = len(state.steps)
+    if any(decision.reason in FINAL for decision in state.decisions):
+        return state
     while len(state.steps) < MOST_EFFECTS:
         state, score = choose(problem, state.scored(problem.score(state)), level=SECOND_LEVEL)
         if score is None or state.events + (score.name == "step_event") > MOST_EVENTS:
@@ -364,14 +363,7 @@ def look_again(problem: AxisProblem, state: AxisState) -> AxisState:
         model = settled(
             fit_model(problem.readings, [*state.model.terms, Term(score.name, score.best)]), problem.effects
         )
-        before_um, after_um = state.errors_um[-1], problem.hold_out_error(model.terms)
-        if after_um > _WORSE * before_um:
-            evidence = {"without_um": before_um, "with_um": after_um}
-            state = state.decide(Decision(score.name, Reason.SECOND_LOOK_ERROR, evidence))
-            continue
-        confirmed = Confirmed.LATE_EVENT if problem.is_late(model.terms[-1]) else Confirmed.SECOND_LOOK
-        entered = state.entered(model, score, confirmed)
-        state = drop_superfluous(problem, replace(entered, errors_um=(*state.errors_um, after_um)))
+        state = drop_superfluous(problem, state.entered(model, score, Confirmed.SECOND_LOOK), first=decided)
     return state
 
 
@@ -383,9 +375,11 @@ def keep_right_patterns(problem: AxisProblem, state: AxisState) -> AxisState:
     Parameters
     ----------
     problem : the campaign
-    state : with a model fitted to all readings and the hold-out errors of its steps
+    state : after the search, or after the second look; what was decided before the hold-out set was opened stays in that case
     """
+    open_now = [place for place, step in enumerate(state.steps) if not state.errors_um or step.is_late_entry]
     wrong = wrong_patterns(state.model, state.added, problem.effects)
+    wrong = {place: decision for place, decision in wrong.items() if place in open_now}
     if not wrong:
         return state
     first = min(wrong)
@@ -394,7 +388,29 @@ def keep_right_patterns(problem: AxisProblem, state: AxisState) -> AxisState:
     decisions = [
         wrong.get(place, Decision(state.steps[place].effect, Reason.BESIDE_WRONG_PATTERN, beside)) for place in places
     ]
+    decisions = [
+        replace(decision, evidence={**decision.evidence, "search_p": state.steps[place].score.family_wise_p})
+        for place, decision in zip(places, decisions, strict=True)
+    ]
     return keep_right_patterns(problem, withdraw(problem, state, places, decisions))
+
+
+def hold_out_intervals(
+    problem: AxisProblem, models: Mapping[str, Sequence[Term]], seed: int
+) -> dict[str, ErrorInterval]:
+    """Errors on the hold-out cycles with their intervals: of some models, and of plain predictions.
+
+    Parameters
+    ----------
+    problem : the campaign
+    models : terms by the name of the model
+    seed : of the bootstrap
+    """
+    readings, used = problem.readings, problem.used
+    errors = {name: problem.hold_out_errors(terms) for name, terms in models.items()}
+    errors |= plain_errors(readings, used)
+    cycles = readings.cycle[~used]
+    return {name: error_interval(values, cycles, np.random.default_rng(seed)) for name, values in errors.items()}
 
 
 def examine_remainder(model: ModelFit, seed: int, set_aside: Collection[tuple[int, str]]) -> remainder.Remainder:
@@ -419,8 +435,7 @@ def set_aside_sites(result: LoopResult, sites: Collection[tuple[int, str]], *, s
     sites : (target, direction)
     seed : of the permutations
     """
-    left = examine_remainder(result.after, seed, sites)
-    return replace(result, remainder=left, verdict=verdict(added=bool(result.steps), remains=bool(left.shape)))
+    return replace(result, remainder=examine_remainder(result.after, seed, sites))
 
 
 def on_corrected_fields(
@@ -442,22 +457,21 @@ def on_corrected_fields(
     seed : of the permutations
     """
     effects = library() if effects is None else effects
-    terms = [
-        again(term, readings, result.after.coefficients(), effects)
-        for term in result.after.terms
-        if term.effect not in errors
-    ]
+    kept = [term for term in result.after.terms if term.effect not in errors]
+    terms = [again(term, readings, result.after.coefficients(), effects) for term in kept]
     used, _ = hold_out(readings)
     problem = AxisProblem(readings, used, effects, np.random.default_rng(seed))
     model = fit_model(readings, terms)
-    left = examine_remainder(model, seed, ())
+    late = {id(term) for term, step in zip(result.state.added, result.state.steps, strict=True) if step.is_late_entry}
+    decided = [term for term, old in zip(terms, kept, strict=True) if id(old) not in late]
+    hold_out_now = hold_out_intervals(problem, {"final": decided}, seed)
     return replace(
         result,
         declared_coefficients=declared_coefficients(model, len(result.declared)),
         noise_floor_um=model.fit.sigma,
-        rmse_final_um=problem.hold_out_error(terms),
-        verdict=verdict(added=bool(result.steps), remains=bool(left.shape)),
-        remainder=left,
+        rmse_final_um=hold_out_now["final"].rmse_um,
+        hold_out={**result.hold_out, "final": hold_out_now["final"]},
+        remainder=examine_remainder(model, seed, ()),
         nuisance=nuisance_size(model),
         after=model,
     )

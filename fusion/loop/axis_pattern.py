@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
-from scipy import stats
+from scipy import linalg, stats
 
 from fusion._typing import Array
 from fusion.effects.effect import Effect
@@ -103,21 +103,22 @@ def pattern_p_value(model: ModelFit, term: Term) -> float:
         position may have an anomaly of its own.
     """
     readings = model.readings.subset(model.used)
-    site = readings.site
-    course = _course(model, term)
-    sites = np.unique(site)
-    free = _free_pattern(model, course)
+    sites = np.unique(readings.site)
+    free = _free_pattern(model, _course(model, term))
+    own = np.linalg.lstsq(free, term.candidate.columns[model.used], rcond=None)[0]
     whitened, _ = model.fit.system.whiten(np.column_stack([model.fit.response, model.fit.design, free]))
     p = model.fit.design.shape[1]
     q, _ = np.linalg.qr(whitened[:, 1 : p + 1])
     y, columns = (part - q @ (q.T @ part) for part in (whitened[:, :1], whitened[:, p + 1 :]))
-    own = np.linalg.norm(whitened[:, p + 1 :], axis=0)
-    u, s, vt = np.linalg.svd(columns / np.maximum(own, 1e-12), full_matrices=False)
+    length = np.maximum(np.linalg.norm(whitened[:, p + 1 :], axis=0), 1e-12)
+    # The course is interpolated between visits, so that the term's own pattern times it is not quite in the model: it is no deviation.
+    other = linalg.null_space((own * length[:, None]).T)
+    u, s, vt = np.linalg.svd((columns / length) @ other, full_matrices=False)
     kept = s**2 > _SEPARABLE
     score = (u[:, kept].T @ y)[:, 0] / model.fit.sigma
     # Each site's share of the statistic, from its smallest-norm size.
-    size = vt[kept].T @ (score / s[kept])
-    share = size * (vt[kept].T @ (score * s[kept]))
+    size = other @ (vt[kept].T @ (score / s[kept]))
+    share = size * (other @ (vt[kept].T @ (score * s[kept])))
     per_target = np.bincount(sites // 2, share)
     freedom = int(kept.sum())
     left = float(score @ score) - max(0.0, float(per_target.max()))

@@ -1,8 +1,9 @@
-"""The closed loop: search for what a model lacks, test it, and prove it on the hold-out set.
+"""The closed loop: search the training part for what a model lacks, then open the hold-out set once to report the error before and after.
 
 One procedure for a campaign along an axis and for a record of channels. What differs between them, how candidates are made, fitted, scored
 and predicted, is behind :class:`Problem`. An effect enters only if its gain exceeds what the whole search finds under the null hypothesis,
-if it is admissible, and if it is confirmed on readings that its coefficients were not fitted to. Procedure and error rates:
+if it is admissible, and if it is confirmed on readings of the training part that its coefficients were not fitted to. The hold-out set
+decides nothing: an effect that it does not support is reported as not confirmed (:mod:`fusion.loop.verdict`). Procedure and error rates:
 docs/method/closed-loop.md.
 """
 
@@ -65,15 +66,6 @@ class Problem(Protocol[M]):
     def hold_out_error(self, terms: Sequence[Term]) -> float:
         """Error of predicting the hold-out set from the training part, root mean square, um."""
 
-    def is_judged_by_hold_out(self, score: Score) -> bool:
-        """Whether the hold-out error says anything about an effect."""
-
-    def is_harmless(self, with_it_um: float, without_it_um: float) -> bool:
-        """Whether an effect may stay, given the hold-out errors with and without it."""
-
-    def ask_hold_out(self, state: LoopState[M]) -> LoopState[M]:
-        """Put one question to the hold-out set where the search could not decide, or return the state as it is."""
-
 
 def search(problem: Problem[M], state: LoopState[M], *, progress: Progress = no_progress) -> LoopState[M]:
     """Add effects one by one, without a look at the hold-out set.
@@ -93,13 +85,12 @@ def search(problem: Problem[M], state: LoopState[M], *, progress: Progress = no_
         progress(number, MOST_EFFECTS + 2, f"searching for effect {number}")
         state, score = choose(problem, state.scored(problem.score(state)))
         if score is None:
-            return problem.ask_hold_out(state)
+            return state
         state = drop_superfluous(problem, enter(problem, state, score))
         if state.events > MOST_EVENTS:
             events = [place for place, step in enumerate(state.steps) if step.effect == "step_event"]
-            return withdraw(
-                problem, state, events, [Decision("step_event", Reason.TOO_MANY_EVENTS, {"most": MOST_EVENTS})]
-            )
+            evidence = {"most": MOST_EVENTS, "search_p": state.steps[-1].score.family_wise_p}
+            return withdraw(problem, state, events, [Decision("step_event", Reason.TOO_MANY_EVENTS, evidence)])
     return state
 
 
@@ -126,7 +117,7 @@ def choose(
             continue
         refusal = problem.refuse(score, state.model)
         if refusal is not None:
-            state = state.decide(refusal)
+            state = state.decide(replace(refusal, evidence={**refusal.evidence, "search_p": score.family_wise_p}))
             continue
         # Where a stronger effect could not be confirmed, a much weaker one only stands in for it.
         if unconfirmed is not None and score.excess < unconfirmed.excess - TIE_GAIN:
@@ -174,19 +165,22 @@ def enter(problem: Problem[M], state: LoopState[M], score: Score) -> LoopState[M
     return state.entered(model, score, score.confirmation.way)
 
 
-def drop_superfluous(problem: Problem[M], state: LoopState[M]) -> LoopState[M]:
+def drop_superfluous(problem: Problem[M], state: LoopState[M], *, first: int = 0) -> LoopState[M]:
     """Take out effects that the newest one has made superfluous, one after the other.
 
     Parameters
     ----------
     problem : the data
     state : after an effect was added
+    first : place of the first step that may be taken out
     """
     for place, term in enumerate(state.added[:-1]):
+        if place < first:
+            continue
         loss = problem.loss_without(state.model, term)
         if loss < SUPERFLUOUS_GAIN:
             decision = Decision(term.effect, Reason.SUPERFLUOUS, {"loss": loss})
-            return drop_superfluous(problem, withdraw(problem, state, [place], [decision]))
+            return drop_superfluous(problem, withdraw(problem, state, [place], [decision]), first=first)
     return state
 
 
@@ -195,8 +189,6 @@ def withdraw(
 ) -> LoopState[M]:
     """Take steps out of the model again and fit what is kept.
 
-    Once the hold-out set is open, the errors are those of the chain of effects that remain.
-
     Parameters
     ----------
     problem : the data
@@ -204,27 +196,13 @@ def withdraw(
     places : of the steps that are taken out, from 0
     decisions : the reasons
     """
-    model = problem.refit(state.model, state.kept(places))
-    state = state.without(places, model, decisions)
-    return with_hold_out_errors(problem, state) if state.errors_um else state
-
-
-def with_hold_out_errors(problem: Problem[M], state: LoopState[M]) -> LoopState[M]:
-    """Compute the hold-out error of the declared model and after each step.
-
-    Parameters
-    ----------
-    problem : the data
-    state : any
-    """
-    chain = [[*state.declared, *state.added[:count]] for count in range(len(state.steps) + 1)]
-    return replace(state, errors_um=tuple(problem.hold_out_error(terms) for terms in chain))
+    return state.without(places, problem.refit(state.model, state.kept(places)), decisions)
 
 
 def open_hold_out(problem: Problem[M], state: LoopState[M]) -> LoopState[M]:
-    """Predict the hold-out set with every model in turn, and withdraw effects beside which the others do better without it.
+    """Predict the hold-out set once: with the declared model, after each step, and with the last model without each of its effects.
 
-    Every effect is judged beside all others: alone it may make the error larger, as long as what else is missing bends the drift.
+    Nothing follows from these errors but what is reported.
 
     Parameters
     ----------
@@ -234,37 +212,11 @@ def open_hold_out(problem: Problem[M], state: LoopState[M]) -> LoopState[M]:
     Returns
     -------
     LoopState
-        With the hold-out errors of the effects that remain.
+        With the hold-out errors.
     """
-    state = with_hold_out_errors(problem, state)
-    without = {
-        place: problem.hold_out_error(state.kept([place]))
-        for place, step in enumerate(state.steps)
-        if problem.is_judged_by_hold_out(step.score)
-    }
-    worst = min(without, key=lambda place: without[place], default=None)
-    if worst is None or problem.is_harmless(state.errors_um[-1], without[worst]):
-        return state
-    score = state.steps[worst].score
-    evidence = {"p_value": score.family_wise_p, "without_um": without[worst], "with_um": state.errors_um[-1]}
-    return open_hold_out(
-        problem, withdraw(problem, state, [worst], [Decision(score.name, Reason.HOLD_OUT_ERROR, evidence)])
+    chain = [[*state.declared, *state.added[:count]] for count in range(len(state.steps) + 1)]
+    return replace(
+        state,
+        errors_um=tuple(problem.hold_out_error(terms) for terms in chain),
+        errors_without_um=tuple(problem.hold_out_error(state.kept([place])) for place in range(len(state.steps))),
     )
-
-
-def verdict(*, added: bool, remains: bool) -> str:
-    """Word for the outcome.
-
-    Parameters
-    ----------
-    added : whether effects were added to the declared model
-    remains : whether a shape is left in the residual
-
-    Returns
-    -------
-    str
-        ``complete``, ``explained``, ``partial`` or ``unexplained``.
-    """
-    if added:
-        return "partial" if remains else "explained"
-    return "unexplained" if remains else "complete"

@@ -25,14 +25,13 @@ class Reason(StrEnum):
     TEMPERATURE_NOISE = "temperature noise"
     FOLLOWS_RATE = "follows the rate"
     SMOOTHING = "smoothing"
+    UNLOGGED_HEAT = "unlogged heat"
     NOT_CONFIRMED = "not confirmed"
     NOT_PREDICTED = "later parts not predicted better"
     STANDS_IN = "weaker than an unconfirmed effect"
     #: In the model for a while, and taken out again.
     SUPERFLUOUS = "superfluous"
     TOO_MANY_EVENTS = "too many events"
-    HOLD_OUT_ERROR = "hold-out error"
-    SECOND_LOOK_ERROR = "hold-out error in the second look"
     WRONG_PATTERN = "wrong pattern"
     SHARED_PATTERN = "shared pattern"
     BESIDE_WRONG_PATTERN = "beside a wrong pattern"
@@ -44,17 +43,12 @@ NOT_TRIED = frozenset({Reason.NOT_AVAILABLE, Reason.NOT_COMPUTABLE})
 _NEUTRAL = frozenset({Reason.ENTERED, Reason.NOT_CONFIRMED, Reason.NOT_PREDICTED, Reason.SUPERFLUOUS})
 #: Reasons against the name of an effect.
 BLOCKING = frozenset(Reason) - NOT_TRIED - _NEUTRAL
-#: Reasons that keep an effect out for the rest of the search. A hold-out error does not: with all readings in view the time constant
-#: is known better, and the effect may return.
-FINAL = frozenset(
-    {
-        Reason.SECOND_LOOK_ERROR,
-        Reason.WRONG_PATTERN,
-        Reason.SHARED_PATTERN,
-        Reason.BESIDE_WRONG_PATTERN,
-        Reason.NOT_REPEATED,
-    }
-)
+#: Reasons that keep an effect out for the rest of the search.
+FINAL = frozenset({Reason.WRONG_PATTERN, Reason.SHARED_PATTERN, Reason.BESIDE_WRONG_PATTERN, Reason.NOT_REPEATED})
+#: Reasons for which an effect that had entered was taken out again without another doing its work.
+WITHDRAWN = FINAL | {Reason.TOO_MANY_EVENTS}
+#: Reasons for which a significant effect has no name: it shows that something is missing all the same.
+WITHHELD = (BLOCKING - {Reason.COLLINEAR}) | {Reason.NOT_CONFIRMED, Reason.NOT_PREDICTED}
 
 _SENTENCES: Mapping[Reason, str] = {
     Reason.ENTERED: "added to the model",
@@ -85,6 +79,10 @@ _SENTENCES: Mapping[Reason, str] = {
         "a copy of {series} that is smoothed but not delayed fits as well (log-likelihood {advantage:+.1f}): the gain comes from "
         "denoising, not from a lag"
     ),
+    Reason.UNLOGGED_HEAT: (
+        "nothing that makes heat was logged: the delayed response to a source that is not logged cannot be told from a lag, nor from a "
+        "drift; log duty, speed or load"
+    ),
     Reason.NOT_CONFIRMED: "significant (p = {p_value:.2g}), but not confirmed on readings that its coefficients were not fitted to",
     Reason.NOT_PREDICTED: (
         "significant (p = {p_value:.2g}), but the later parts of the training time are predicted no better with it ({before_um:.3g} to "
@@ -95,17 +93,12 @@ _SENTENCES: Mapping[Reason, str] = {
     ),
     Reason.SUPERFLUOUS: "removed: an effect added later explains the same (log-likelihood lost without it: {loss:.1f})",
     Reason.TOO_MANY_EVENTS: "more than {most} events would be needed: that is a switching, for which the library has no name",
-    Reason.HOLD_OUT_ERROR: (
-        "withdrawn: it was found in the training part (p = {p_value:.2g}), but the error on the hold-out set is not smaller with it "
-        "({without_um:.3g} µm without, {with_um:.3g} µm with)"
-    ),
-    Reason.SECOND_LOOK_ERROR: "withdrawn: the error on the hold-out set rose from {without_um:.3f} to {with_um:.3f} µm with it",
     Reason.WRONG_PATTERN: (
-        "withdrawn: its course in time is present, but the pattern along the axis and by direction is not that of this effect "
+        "its course in time is present, but the pattern along the axis and by direction is not that of this effect "
         "(p = {p_value:.1g})"
     ),
     Reason.SHARED_PATTERN: (
-        "withdrawn: {first} and {second} fit no better than one course in time with a free pattern: together they are one pattern that "
+        "{first} and {second} fit no better than one course in time with a free pattern: together they are one pattern that "
         "the library does not hold"
     ),
     Reason.BESIDE_WRONG_PATTERN: "withdrawn: it was found beside {beside}, whose name was withdrawn afterwards",

@@ -6,15 +6,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion._typing import Array
 from fusion.alignment.readings import Readings
 from fusion.diagnosis.remainder import Remainder
+from fusion.loop.baselines import ErrorInterval
+from fusion.loop.decisions import Decision
 from fusion.loop.parameter_ranges import Range
-from fusion.loop.state import Confirmation, Confirmed, LoopState, Score, Step, rivals
-from fusion.model.fit import ModelFit, Term, unexplained_drift
+from fusion.loop.state import Confirmation, Confirmed, HoldOutQuestion, LoopState, Score, Step, rivals
+from fusion.loop.verdict import doubt_of, verdict
+from fusion.model.cross_prediction import cross_rmse
+from fusion.model.fit import ModelFit, Term, fit_model, unexplained_drift
 from fusion.model.jackknife import coefficient_spread
+from fusion.products.results_loop import Verdict
 
 
 @dataclass(frozen=True)
@@ -27,11 +31,17 @@ class AddedEffect:
     parameter_ranges : values of the parameters that fit as well (profile likelihood, 95 %)
     p_value : probability that the search adds any effect under the null hypothesis
     held_out_p : probability of its gain on unused readings under the null hypothesis
-    rmse_before_um, rmse_after_um : open-loop error on the hold-out set without and with it
+    rmse_before_um, rmse_after_um : open-loop error on the hold-out set before and after it entered; NaN for an effect that entered when
+        the hold-out set had been opened
+    rmse_without_um : open-loop error on the hold-out set of all other effects without it; NaN likewise
+    cross_rmse_before_um, cross_rmse_after_um : error of predicting blocks of all cycles from the others, without it and with it; of an
+        event only the block around it
     rms_um : size of its contribution, root mean square after the static profile is removed
     tied : effects that these data cannot separate from it
     runner_up : the next best effect, its p-value and how far behind it is in log-likelihood
-    confirmed : how it was confirmed
+    confirmed : whether the hold-out set bears it out, or where that says nothing of it, the blocks of cycles that are left out in turn
+    doubt : why it is not confirmed, with both errors; empty where it is
+    confirmed_by : how it was confirmed before it entered
     event_cycle : the cycle in which an event happened, None for an effect that lasts
     """
 
@@ -43,10 +53,15 @@ class AddedEffect:
     held_out_p: float
     rmse_before_um: float
     rmse_after_um: float
+    rmse_without_um: float
+    cross_rmse_before_um: float
+    cross_rmse_after_um: float
     rms_um: float
     tied: list[str]
     runner_up: dict[str, float | str]
-    confirmed: str
+    confirmed: bool
+    doubt: str
+    confirmed_by: str
     event_cycle: int | None
 
     def as_json(self) -> dict[str, object]:
@@ -64,10 +79,11 @@ class LoopResult:
     declared_coefficients : their coefficients with unit and standard uncertainty, in the final model
     held_out : which cycles were held out, in words
     noise_floor_um : standard deviation of one reading beside the final model
-    rmse_persistence_um : hold-out error of repeating every site's last reading of the training part
-    rmse_declared_um, rmse_final_um : hold-out error of the declared and the final model
+    rmse_declared_um, rmse_final_um : hold-out error of the declared model, and with the effects that were decided on the training part
+    hold_out : the same errors with their intervals, as ``declared`` and ``final``, and those of plain predictions
+    skill : whether the model predicts the hold-out cycles better than their last values and means
     steps : effects that were added
-    verdict : ``complete``, ``explained``, ``partial`` or ``unexplained``
+    unnamed : effects that are significant and have no name, with their p-value
     remainder : structure that the final model leaves
     nuisance : size of the unexplained drift
     state : the last state of the loop: every round and every decision
@@ -79,16 +95,33 @@ class LoopResult:
     declared_coefficients: list[dict[str, float | str]]
     held_out: str
     noise_floor_um: float
-    rmse_persistence_um: float
     rmse_declared_um: float
     rmse_final_um: float
+    hold_out: Mapping[str, ErrorInterval]
+    skill: bool
     steps: list[AddedEffect]
-    verdict: str
+    unnamed: Mapping[str, float]
     remainder: Remainder
     nuisance: dict[str, float | str]
     state: LoopState[ModelFit]
     before: ModelFit
     after: ModelFit
+
+    @property
+    def rmse_persistence_um(self) -> float:
+        """Hold-out error of repeating every site's last reading of the training part, um."""
+        return self.hold_out["last_value"].rmse_um
+
+    @property
+    def verdict(self) -> Verdict:
+        """Word for the outcome."""
+        return verdict(
+            confirmed=any(step.confirmed for step in self.steps),
+            doubtful=not all(step.confirmed for step in self.steps),
+            tested=bool(self.unnamed) or self.remainder.is_tested,
+            remains=bool(self.remainder.shape),
+            skill=self.skill,
+        )
 
     def as_json(self) -> dict[str, object]:
         """The ``loop`` part of results.json."""
@@ -101,8 +134,10 @@ class LoopResult:
             "rmse_persistence_um": self.rmse_persistence_um,
             "rmse_declared_um": self.rmse_declared_um,
             "rmse_final_um": self.rmse_final_um,
+            **errors_json(self.hold_out),
             "steps": [step.as_json() for step in self.steps],
             "verdict": self.verdict,
+            "unnamed": dict(self.unnamed),
             "unexplained": {
                 "shape": self.remainder.shape,
                 "rms_um": self.remainder.rms_um,
@@ -110,7 +145,7 @@ class LoopResult:
                 **self._nearest(),
             },
             "nuisance": self.nuisance,
-            "sealed_question": vars(question) | {"parameters": dict(question.parameters)} if question else {},
+            "sealed_question": _question_json(question) if question else {},
             "search": [[_score_json(score) for score in scored.scores] for scored in self.state.rounds],
             "identifiability": [vars(limit) for scored in self.state.rounds for limit in scored.detection_limits],
             "not_tried": self.state.not_tried(),
@@ -133,6 +168,23 @@ class LoopResult:
         }
 
 
+def errors_json(hold_out: Mapping[str, ErrorInterval]) -> dict[str, object]:
+    """Errors on the hold-out set with their intervals, for ``loop.errors``, ``loop.baselines`` and ``loop.best_baseline``.
+
+    Parameters
+    ----------
+    hold_out : of the ``declared`` and the ``final`` model, and of plain predictions
+    """
+    models = {name: vars(hold_out[name]) for name in ("declared", "final")}
+    plain = {name: vars(one) for name, one in hold_out.items() if name not in models}
+    best = min(plain, key=lambda name: hold_out[name].rmse_um)
+    return {"errors": models, "baselines": plain, "best_baseline": best}
+
+
+def _question_json(question: HoldOutQuestion) -> dict[str, object]:
+    return {**vars(question), "parameters": dict(question.parameters), "entered": False}
+
+
 def _score_json(score: Score) -> dict[str, object]:
     confirmation = score.confirmation or Confirmation(False, Confirmed.LATER_CYCLES)
     return {
@@ -148,36 +200,57 @@ def _score_json(score: Score) -> dict[str, object]:
     }
 
 
-def report_steps(state: LoopState[ModelFit]) -> list[AddedEffect]:
+def report_steps(state: LoopState[ModelFit], wrong: Mapping[int, Decision]) -> list[AddedEffect]:
     """Describe the steps of a loop whose hold-out set has been opened.
 
     Parameters
     ----------
-    state : with a model fitted to all readings, and the hold-out errors of its steps
+    state : with a model fitted to all readings, and the hold-out errors of the steps that were decided before
+    wrong : decisions of all cycles against the pattern of a step, by its place
     """
     return [
-        _added_effect(state.model, term, step, state.errors_um[place], state.errors_um[place + 1])
+        _added_effect(state, place, term, step, wrong.get(place))
         for place, (term, step) in enumerate(zip(state.added, state.steps, strict=True))
     ]
 
 
-def _added_effect(model: ModelFit, term: Term, step: Step, before_um: float, after_um: float) -> AddedEffect:
+def _added_effect(
+    state: LoopState[ModelFit], place: int, term: Term, step: Step, wrong: Decision | None
+) -> AddedEffect:
+    model, event_s = state.model, term.candidate.event_s
     tied, runner_up = rivals(step.score, step.round.scores)
-    held_out_p = step.score.confirmation.p_value if step.score.confirmation else 1.0
-    asked = step.confirmed is Confirmed.HOLD_OUT_QUESTION
+    before_um, after_um, without_um = (np.nan,) * 3
+    if not step.is_late_entry:
+        before_um, after_um, without_um = *state.errors_um[place : place + 2], state.errors_without_um[place]
+    without = fit_model(model.readings, state.kept([place]), used=model.used)
+    cross_before_um, cross_after_um = (cross_rmse(one, event_s) for one in (without, model))
+    # The drift that is carried into the hold-out set has learnt an early step by then, and what happened only in the hold-out set makes
+    # every error there larger.
+    held_out_tells = event_s is None and not any(one.is_late_entry for one in state.steps)
+    judged = (state.errors_um[-1], without_um) if held_out_tells else (cross_after_um, cross_before_um)
+    doubt = doubt_of(
+        *judged, model.fit.sigma, "on the hold-out set" if held_out_tells else "of blocks that are left out"
+    )
+    if wrong is not None:
+        doubt = wrong.sentence
     return AddedEffect(
         effect=term.effect,
         parameters=term.candidate.parameters,
         parameter_ranges=step.score.ranges,
         coefficients=coefficients_of(model, term),
-        p_value=held_out_p if asked else step.score.family_wise_p,
-        held_out_p=held_out_p,
+        p_value=step.score.family_wise_p,
+        held_out_p=step.score.confirmation.p_value if step.score.confirmation else 1.0,
         rmse_before_um=before_um,
         rmse_after_um=after_um,
+        rmse_without_um=without_um,
+        cross_rmse_before_um=cross_before_um,
+        cross_rmse_after_um=cross_after_um,
         rms_um=_size(model, term),
         tied=tied,
         runner_up=runner_up,
-        confirmed=str(step.confirmed),
+        confirmed=not doubt,
+        doubt=doubt,
+        confirmed_by=str(step.confirmed),
         event_cycle=_event_cycle(model.readings, term),
     )
 
@@ -247,29 +320,6 @@ def rmse(errors: Array) -> float:
         um
     """
     return float(np.sqrt(np.nanmean(errors**2)))
-
-
-def persistence(readings: Readings, used: NDArray[np.bool_]) -> float:
-    """Hold-out error of repeating every site's last reading of the training part.
-
-    Parameters
-    ----------
-    readings : n readings
-    used : (n,) True for the training part
-
-    Returns
-    -------
-    float
-        Root mean square, um.
-    """
-    site = readings.site
-    errors = []
-    for number in np.unique(site):
-        before = np.flatnonzero((site == number) & used)
-        after = np.flatnonzero((site == number) & ~used)
-        if before.size and after.size:
-            errors.append(readings.response[after] - readings.response[before[-1]])
-    return rmse(np.concatenate(errors))
 
 
 def nuisance_size(model: ModelFit) -> dict[str, float | str]:

@@ -96,7 +96,13 @@ def _check_columns(candidates: Sequence[Candidate], rows: int) -> None:
             )
 
 
-def score_effects(families: Families, gains: Gains, *, level: float) -> tuple[list[Score], list[Decision]]:
+def score_effects(
+    families: Families,
+    gains: Gains,
+    *,
+    level: float,
+    is_admissible: Callable[[Candidate], bool] = lambda candidate: True,
+) -> tuple[list[Score], list[Decision]]:
     """Score every effect by its best candidate.
 
     Parameters
@@ -104,6 +110,8 @@ def score_effects(families: Families, gains: Gains, *, level: float) -> tuple[li
     families : candidates by effect, none of them empty
     gains : of all candidates, in the order of the families
     level : family-wise probability of adding an effect under the null hypothesis
+    is_admissible : whether a candidate could be named if it were the best; one that could not must not hide one that could, and is
+        scored only where an effect has no other
 
     Returns
     -------
@@ -121,6 +129,8 @@ def score_effects(families: Families, gains: Gains, *, level: float) -> tuple[li
             scores.append(Score(name, None, collinear=collinear))
             decisions.append(Decision(name, Reason.COLLINEAR))
             continue
+        admissible = [row for row in usable if is_admissible(candidates[row - int(rows[0])])]
+        usable = np.array(admissible) if admissible else usable
         best = int(usable[np.argmax(gains.gain[usable, 0])])
         null = gains.gain[usable, 1:].max(axis=0)
         gain = float(gains.gain[best, 0])

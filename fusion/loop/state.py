@@ -14,7 +14,7 @@ import numpy as np
 
 from fusion.effects.effect import Candidate
 from fusion.errors import FusionError
-from fusion.loop.decisions import BLOCKING, FINAL, NOT_TRIED, Decision, Reason
+from fusion.loop.decisions import BLOCKING, FINAL, NOT_TRIED, WITHDRAWN, WITHHELD, Decision, Reason
 from fusion.loop.parameter_ranges import Range
 from fusion.model.fit import Term
 
@@ -34,11 +34,7 @@ class Confirmed(StrEnum):
     LATER_CYCLES = "confirmed on later blocks of cycles, coefficients frozen"
     OTHER_TARGETS = "confirmed on the other half of the targets, coefficients frozen"
     BY_EVIDENCE = "confirmed by the evidence of all training cycles; their later blocks alone do not decide"
-    HOLD_OUT_QUESTION = "confirmed by a single question to the hold-out set, asked because the search could not decide"
-    SECOND_LOOK = (
-        "found with the hold-out set in view, coefficients from the cycles before: the error after is optimistic"
-    )
-    LATE_EVENT = "found in the hold-out set; sized on one half of the targets, tested on the other"
+    SECOND_LOOK = "found in all cycles after the hold-out set was opened: it has no held-out error"
     LATER_PARTS = "confirmed on later parts of the training time, each predicted from those before it"
 
 
@@ -186,17 +182,21 @@ class Step:
         """Name of the effect."""
         return self.score.name
 
+    @property
+    def is_late_entry(self) -> bool:
+        """Whether it entered after the hold-out set had been opened."""
+        return self.confirmed is Confirmed.SECOND_LOOK
+
 
 @dataclass(frozen=True)
 class HoldOutQuestion:
-    """The one question to the hold-out set: is this effect present?
+    """What the hold-out set says of the strongest candidate that the search could not decide on; it does not enter, whatever the answer.
 
     Attributes
     ----------
-    effect, parameters : the strongest candidate that the search could not decide on
+    effect, parameters : the candidate
     rmse_before_um, rmse_after_um : hold-out error without and with it, um
     p_value : probability of so small an error after it under the null hypothesis
-    entered : whether it was added
     """
 
     effect: str
@@ -204,7 +204,6 @@ class HoldOutQuestion:
     rmse_before_um: float
     rmse_after_um: float
     p_value: float
-    entered: bool
 
 
 class Model(Protocol):
@@ -228,8 +227,10 @@ class LoopState(Generic[M]):
     steps : the added effects in turn
     decisions : every decision in turn
     rounds : every round of the search in turn
-    errors_um : hold-out error of the declared model and after each step, um; empty until the hold-out set is opened
-    question : what was asked of the hold-out set
+    errors_um : hold-out error of the declared model and after each step that was decided on the training part, um; empty until the
+        hold-out set is opened
+    errors_without_um : hold-out error of the last of these models without each of these steps, um
+    question : what the hold-out set says of an undecided candidate
     """
 
     model: M
@@ -237,6 +238,7 @@ class LoopState(Generic[M]):
     decisions: tuple[Decision, ...] = ()
     rounds: tuple[Round, ...] = ()
     errors_um: tuple[float, ...] = ()
+    errors_without_um: tuple[float, ...] = ()
     question: HoldOutQuestion | None = None
 
     @property
@@ -266,6 +268,20 @@ class LoopState(Generic[M]):
         """Effects against whose name the latest decision speaks, with the reason in words."""
         latest = {decision.effect: decision for decision in self.decisions}
         return {name: decision.sentence for name, decision in latest.items() if decision.reason in BLOCKING}
+
+    def unnamed(self, level: float) -> dict[str, float]:
+        """Effects that are significant and have no name, with their family-wise p-value.
+
+        Significant in the last round at ``level``, or withdrawn for good after they had entered.
+        """
+        last = self.rounds[-1].scores if self.rounds else ()
+        significant = {one.name: one.family_wise_p for one in last if one.candidate and one.family_wise_p <= level}
+        latest = {decision.effect: decision for decision in self.decisions}
+        return {
+            name: significant[name] if name in significant else float(decision.evidence["search_p"])
+            for name, decision in latest.items()
+            if decision.reason in WITHDRAWN or (decision.reason in WITHHELD and name in significant)
+        }
 
     def is_withdrawn(self, effect: str) -> bool:
         """Whether an effect may not enter any more."""

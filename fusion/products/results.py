@@ -69,7 +69,7 @@ __all__ = [
     "results_schema",
 ]
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 
 class ResultsError(FusionError):
@@ -99,7 +99,7 @@ class Results(ResultPart):
 
     model_config = ConfigDict(title="thermofuse results")
 
-    schema_version: Literal[1] = Field(alias="schema")
+    schema_version: Literal[2] = Field(alias="schema")
     """Version of this layout."""
     campaign: str
     """Title of the campaign."""

@@ -7,7 +7,7 @@ from typing import Literal
 
 from fusion.products.results_part import Number, ResultPart
 
-Verdict = Literal["complete", "explained", "partial", "unexplained"]
+Verdict = Literal["complete", "explained", "partial", "unexplained", "no_skill"]
 #: Value of a parameter of an effect: a number in the unit that its name ends with, or a word.
 Parameter = float | int | str
 #: Range of a parameter that fits as well: its ends (None where the data set none), or the other words.
@@ -57,6 +57,41 @@ class DeclaredCoefficient(Coefficient):
     """Standard deviation by which it moves when a target or a part of the test is left out; null where it rests on one of them alone."""
 
 
+class ErrorInterval(ResultPart):
+    """A root mean square error on the hold-out with its 95 % interval."""
+
+    rmse_um: Number
+    """Root mean square error, um."""
+    low_um: Number
+    """Lower end of the interval (block bootstrap over the hold-out), um."""
+    high_um: Number
+    """Upper end of the interval, um."""
+
+
+class ModelErrors(ResultPart):
+    """Errors on the hold-out before and after."""
+
+    declared: ErrorInterval
+    """Of the declared model."""
+    final: ErrorInterval
+    """With the effects that the training part alone decided on."""
+
+
+class Baselines(ResultPart):
+    """Errors of plain predictions of the hold-out from the training part."""
+
+    last_value: ErrorInterval
+    """Repeating the last value."""
+    mean: ErrorInterval
+    """The mean of the training part."""
+    least_squares: ErrorInterval
+    """Least squares on everything that was logged."""
+    ridge: ErrorInterval
+    """Ridge regression on the same."""
+    ridge_with_lags: ErrorInterval
+    """Ridge regression on the same and on lagged copies of it."""
+
+
 class StepPart(ResultPart):
     """An effect that the closed loop added."""
 
@@ -69,17 +104,27 @@ class StepPart(ResultPart):
     p_value: Number
     """p-value that let it in, family-wise over the search."""
     rmse_before_um: Number
-    """Root mean square error on the hold-out without it, um."""
+    """Root mean square error on the hold-out before it entered, um; null for an effect that entered after the hold-out was opened."""
     rmse_after_um: Number
-    """Root mean square error on the hold-out with it, um."""
+    """Root mean square error on the hold-out after it entered, um; larger where the hold-out does not support it."""
+    rmse_without_um: Number
+    """Root mean square error on the hold-out of all other effects without it, um."""
+    cross_rmse_before_um: Number
+    """Error of predicting blocks of the whole test from the others, without it, um; of an event along an axis the block around it."""
+    cross_rmse_after_um: Number
+    """The same with it, um."""
     rms_um: Number
     """Root mean square of its contribution, um."""
     tied: tuple[str, ...]
     """Effects that these data cannot tell from it."""
     runner_up: RunnerUp | Nothing
     """The next best effect."""
-    confirmed: str
-    """How it was confirmed."""
+    confirmed: bool
+    """Whether readings that took no part in finding it bear it out; false: the name is not confirmed."""
+    doubt: str
+    """Why it is not confirmed, with both errors; empty where it is."""
+    confirmed_by: str
+    """How it was confirmed before it entered."""
 
 
 class AxisStep(StepPart):
@@ -172,7 +217,7 @@ class HoldOutQuestion(ResultPart):
     p_value: Number
     """p-value of its gain on the hold-out."""
     entered: bool
-    """Whether it entered the model."""
+    """Always false: the hold-out reports, it does not decide."""
 
 
 class CandidateScore(ResultPart):
@@ -305,11 +350,20 @@ class Loop(ResultPart):
     rmse_declared_um: Number
     """Root mean square error on the hold-out of the declared model, um."""
     rmse_final_um: Number
-    """Root mean square error on the hold-out of the final model, um."""
+    """Root mean square error on the hold-out with the effects that the training part alone decided on, um."""
+    errors: ModelErrors
+    """The errors before and after with their intervals."""
+    baselines: Baselines
+    """Errors of plain predictions with their intervals."""
+    best_baseline: str
+    """Name of the plain prediction with the smallest error, chosen on the hold-out itself."""
     steps: tuple[StepPart, ...]
     """Effects that were added, in turn."""
     verdict: Verdict
-    """complete: nothing lacks; explained: effects were added, nothing is left; partial: something is left; unexplained: no effect fits."""
+    """complete: nothing lacks; explained: effects were added, nothing is left; partial: something is left; unexplained: something is left
+    and no effect is confirmed; no_skill: the model predicts no better than the last value or the mean, these data cannot tell."""
+    unnamed: Mapping[str, Number]
+    """Effects that are significant and were not admitted or not confirmed, with their p-value."""
     unexplained: Unexplained
     """What is left."""
     not_tried: Mapping[str, str]
@@ -365,6 +419,8 @@ class ChainedPart(ResultPart):
     """Start of the part, h."""
     last_h: Number
     """End of the part, h."""
+    in_training: bool
+    """Whether it lies before the hold-out, so that it had a say in what entered."""
     effects: tuple[str, ...]
     """Effects found before it."""
     rmse_persistence_um: Number

@@ -5,6 +5,8 @@ Answers for one sensor and for the load's own course what :mod:`fusion.loop.admi
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from fusion._typing import Array
@@ -20,18 +22,56 @@ _ONE_SWITCHING = 0.99
 
 
 class RecordGrounds:
-    """Grounds of a record: the record and a model of it without the candidate."""
+    """Grounds of a record: the record and a model of it without the candidate.
 
-    def __init__(self, model: RecordFit) -> None:
+    Parameters
+    ----------
+    model : RecordFit
+        Without the candidate.
+    least_gain : float
+        Log-likelihood that an event has to gain beside a shift at a switching, or it only stands in for that one.
+    """
+
+    def __init__(self, model: RecordFit, *, least_gain: float = 0.0) -> None:
         self._model = model
         self._record = model.record
+        self._least_gain = least_gain
+
+    def is_admissible(self, candidate: Candidate) -> bool:
+        """Whether nothing speaks against a candidate before any fit: it is no event at a switching, and no lag of a noisy sensor."""
+        if candidate.event_s is not None:
+            return not self._is_switched(candidate.event_s)
+        if "sensor" not in candidate.parameters:
+            return True
+        _, noise, limit = self.noise_of_lag(candidate)
+        return noise <= limit
+
+    def _is_switched(self, event_s: float) -> bool:
+        return bool(self._record.switched()[np.searchsorted(self._record.seconds, event_s)])
 
     def at_switching(self, candidate: Candidate) -> float | None:
-        """Hours since the start at which a driver was switched together with the candidate's event."""
-        record = self._record
-        if candidate.event_s is None or not record.switched()[np.searchsorted(record.seconds, candidate.event_s)]:
+        """Hours since the start of the switching at which an event happened, or whose response it stands in for."""
+        if candidate.event_s is None:
             return None
-        return candidate.event_s / 3600.0
+        if self._is_switched(candidate.event_s):
+            return candidate.event_s / 3600.0
+        if self._least_gain <= 0.0:
+            return None
+        record = self._record
+        shifts = [
+            Candidate((record.seconds >= instant).astype(float)[:, None], {}, ("um",), float(instant))
+            for instant in record.seconds[record.switched() & self._model.used]
+        ]
+        if not shifts:
+            return None
+        rival = shifts[int(np.argmax(channel_gains(self._model, shifts).gain[:, 0]))]
+        both = replace(candidate, columns=np.column_stack([candidate.columns, rival.columns]), beside=1)
+        gain = float(channel_gains(self._model, [both]).gain[0, 0])
+        return None if gain >= self._least_gain else float(rival.event_s or 0.0) / 3600.0
+
+    def heat_is_logged(self) -> bool:
+        """Whether a driver was logged."""
+        return bool(self._record.drivers)
 
     def noise_of_lag(self, candidate: Candidate) -> tuple[str, float, float]:
         """Noise of a block mean of the delayed sensor over the range of its rise."""
@@ -96,8 +136,10 @@ def _sensor_noise(record: Record, name: str) -> float:
 def _smoothed(record: Record, values: Array, minutes: float) -> Array:
     """Mean over a centred window as wide as the lag's memory, without delay, (blocks,)."""
     half = max(1, round(60.0 * minutes / record.block_s))
-    kernel = np.ones(2 * half + 1)
-    return np.asarray(np.convolve(values, kernel, "same") / np.convolve(np.ones_like(values), kernel, "same"))
+    place = np.arange(values.size)
+    first, last = np.maximum(place - half, 0), np.minimum(place + half + 1, values.size)
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    return np.asarray((total[last] - total[first]) / (last - first))
 
 
 def one_switching_share(driver: Array) -> float:

@@ -1,7 +1,8 @@
 """The closed loop on a record: what the quasi-static model of the temperatures lacks, and the error before and after.
 
-The search, the hold-out set and the withdrawals are those of :mod:`fusion.loop.closed_loop`. In addition every part of the record from the
-third on is predicted by the whole procedure from the time before it; an effect that this did not help is withdrawn.
+Search and hold-out set are those of :mod:`fusion.loop.closed_loop`. In addition every part of the record from the third on is predicted by
+the whole procedure from the time before it; an effect that did not help on the parts of the training time is withdrawn before the hold-out
+set is opened.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ import numpy as np
 from fusion.effects.effect import Effect
 from fusion.loop.closed_loop import MOST_EFFECTS, Progress, no_progress, open_hold_out, withdraw
 from fusion.loop.decisions import Decision, Reason
+from fusion.model.fit import Term
+from fusion.record.baselines import plain_predictions
 from fusion.record.blocks import Record
 from fusion.record.hold_out import declare, hold_out
-from fusion.record.model import fit_record
-from fusion.record.prediction import channel_rmse, persistence_rmse
+from fusion.record.model import columns_of, fit_record
+from fusion.record.prediction import channel_rmse, left_out_rmse
 from fusion.record.problem import EARNED, ChainedPart, RecordProblem, RecordState, chain_forward, search_record
 from fusion.record.remainder import examine
 from fusion.record.result import RecordResult
@@ -57,11 +60,8 @@ def close_record(
     terms = declare(declared, record)
     train, description = hold_out(record)
     problem, state = search_record(record, train, terms, seed=seed, effects=effects, progress=progress)
-    state = open_hold_out(problem, state)
     chained = chain_forward(record, terms, seed=seed, effects=effects, progress=progress)
-    repeated = without_unrepeated(problem, state, chained)
-    if repeated is not state:
-        state = open_hold_out(problem, repeated)
+    state = open_hold_out(problem, without_unrepeated(problem, state, chained))
     progress(MOST_EFFECTS, MOST_EFFECTS, "examining the residual")
     whole = fit_record(record, state.model.terms, np.ones_like(train))
     chain = [[*state.declared, *state.added[:count]] for count in range(len(state.steps) + 1)]
@@ -74,18 +74,31 @@ def close_record(
         held_out=description,
         predictions=predictions,
         errors=errors,
-        persistence_um=persistence_rmse(record, train, ~train),
+        plain=plain_predictions(record, train),
+        cross_um=[cross_rmse(problem, [*state.declared, *state.added])]
+        + [cross_rmse(problem, state.kept([place])) for place in range(len(state.steps))],
         whole=whole,
         remainder=examine(whole, errors[-1], np.random.default_rng(seed)),
         chained=chained,
     )
 
 
+def cross_rmse(problem: RecordProblem, terms: Sequence[Term]) -> float:
+    """Error of predicting every part of the record from all others, um; the penalty is that of the prediction from the training part.
+
+    Parameters
+    ----------
+    problem : the record
+    terms : of the model
+    """
+    record = problem.record
+    return left_out_rmse(record, columns_of(record, terms), problem.predict(terms).penalty)
+
+
 def without_unrepeated(problem: RecordProblem, state: RecordState, chained: Sequence[ChainedPart]) -> RecordState:
     """Withdraw effects that the same procedure also added on earlier time, and predicted no better with.
 
-    A model may suit the hold-out set by chance; where it has been tried on several parts, all of them count. An event happens once and is
-    not judged by other parts.
+    Only parts of the training time count. An event happens once and is not judged by other parts.
 
     Parameters
     ----------
@@ -93,7 +106,7 @@ def without_unrepeated(problem: RecordProblem, state: RecordState, chained: Sequ
     chained : the earlier parts
     """
     for place, step in enumerate(state.steps):
-        tried = [part for part in chained if step.effect in part.effects]
+        tried = [part for part in chained if part.in_training and step.effect in part.effects]
         if not tried or step.score.is_event:
             continue
         before = float(np.nanmean([np.nanmean(part.rmse_declared_um) for part in tried]))
@@ -104,6 +117,7 @@ def without_unrepeated(problem: RecordProblem, state: RecordState, chained: Sequ
                 "parts": len(tried),
                 "without_um": before,
                 "with_um": after,
+                "search_p": step.score.family_wise_p,
             }
             decision = Decision(step.effect, Reason.NOT_REPEATED, evidence)
             return without_unrepeated(problem, withdraw(problem, state, [place], [decision]), chained)

@@ -61,6 +61,21 @@ def predict(record: Record, columns: Array, train: NDArray[np.bool_]) -> Predict
     return Prediction(*_paths(record, columns, train)[best], float(PENALTIES[best]), float(mean[best]))
 
 
+def last_values(record: Record, train: NDArray[np.bool_]) -> Array:
+    """Last training value of every channel.
+
+    Parameters
+    ----------
+    record : on its blocks
+    train : (blocks,) True for the training part
+
+    Returns
+    -------
+    (channels,) ndarray, um
+    """
+    return np.array([column[train & np.isfinite(column)][-1] for column in record.displacement.T])
+
+
 def persistence_rmse(record: Record, train: NDArray[np.bool_], where: NDArray[np.bool_]) -> Array:
     """Error of repeating the last training value of every channel.
 
@@ -74,8 +89,29 @@ def persistence_rmse(record: Record, train: NDArray[np.bool_], where: NDArray[np
     -------
     (channels,) ndarray, um
     """
-    last = np.array([column[train & np.isfinite(column)][-1] for column in record.displacement.T])
-    return channel_rmse(record, np.broadcast_to(last, record.displacement.shape), where)
+    return channel_rmse(record, np.broadcast_to(last_values(record, train), record.displacement.shape), where)
+
+
+def left_out_rmse(record: Record, columns: Array, penalty: float) -> float:
+    """Error of predicting every part of a record from all others, earlier and later ones.
+
+    Parameters
+    ----------
+    record : on its blocks
+    columns : (blocks, p) of the model
+    penalty : one of :data:`PENALTIES`
+
+    Returns
+    -------
+    float
+        Root mean square over all blocks, mean over the channels, um.
+    """
+    predicted = np.full(record.displacement.shape, np.nan)
+    place = int(np.flatnonzero(penalty == PENALTIES)[0])
+    for number in np.unique(record.chained):
+        part = record.chained == number
+        predicted[part] = _paths(record, columns, ~part)[place][0][part]
+    return rmse(record, predicted, np.ones(part.size, bool))
 
 
 def chained_parts(record: Record, train: NDArray[np.bool_]) -> list[int]:

@@ -27,12 +27,13 @@ from fusion.model.null_simulation import DRAWS
 from fusion.record.blocks import Record
 from fusion.record.effects import record_library
 from fusion.record.grounds import RecordGrounds
+from fusion.record.hold_out import hold_out
 from fusion.record.model import RecordFit, channel_gains, columns_of, fit_record, simulate_channels
 from fusion.record.prediction import Prediction, channel_rmse, persistence_rmse, predict
 
 #: Probability of adding an effect where only drift and noise act. A drift that wanders at random is a stand-in for what a real machine
-#: does, so the probability is smaller than along an axis; for an event, which no later part can confirm, it is smaller still.
-ENTRY_LEVEL, EVENT_LEVEL = 0.01, 0.001
+#: does, and its sensors are late, so the probability is smaller than along an axis: that of an error of three standard deviations.
+ENTRY_LEVEL = 0.001
 #: An effect must bring the error of predicting later parts down to this share of what it was, or it only follows chance.
 EARNED = 0.98
 #: An event may make that error larger by this factor: chance, not harm.
@@ -76,17 +77,19 @@ class RecordProblem:
             return Round((), tuple(faults), start)
         draws = simulate_channels(model, self.rng, draws=DRAWS)
         gains = channel_gains(model, [candidate for candidates in families.values() for candidate in candidates], draws)
-        scores, decisions = score_effects(families, gains, level=ENTRY_LEVEL)
+        scores, decisions = score_effects(
+            families, gains, level=ENTRY_LEVEL, is_admissible=RecordGrounds(model).is_admissible
+        )
         return Round(tuple(scores), (*faults, *decisions), start)
 
     def entry_level(self, score: Score) -> float:
-        """Level of entry, smaller for an event."""
-        return EVENT_LEVEL if score.is_event else ENTRY_LEVEL
+        """Level of entry."""
+        return ENTRY_LEVEL
 
     def refuse(self, score: Score, model: RecordFit) -> Decision | None:
         """Refuse an effect that this record does not identify; a user's own effect is only held against the switchings."""
         excited_by = self.effects[score.name].excited_by if score.name in _BUILT_IN else ""
-        return refuse(score.name, excited_by, score.best, RecordGrounds(model))
+        return refuse(score.name, excited_by, score.best, RecordGrounds(model, least_gain=score.critical))
 
     def confirm(self, score: Score, state: RecordState) -> Score:
         """Look at the effect more closely, and predict the later parts of the training time with it."""
@@ -107,18 +110,6 @@ class RecordProblem:
     def hold_out_error(self, terms: Sequence[Term]) -> float:
         """Error of predicting the blocks that may not be used, mean over the channels, um."""
         return float(np.nanmean(channel_rmse(self.record, self.predict(terms).predicted, ~self.train)))
-
-    def is_judged_by_hold_out(self, score: Score) -> bool:
-        """Nothing is re-zeroed at the hold-out set, so every effect has to prove itself there, an event too."""
-        return True
-
-    def is_harmless(self, with_it_um: float, without_it_um: float) -> bool:
-        """An effect may stay only if the error is smaller with it."""
-        return with_it_um < without_it_um
-
-    def ask_hold_out(self, state: RecordState) -> RecordState:
-        """Return the state: a record has too few hold-out parts for a question of its own."""
-        return state
 
     def predict(self, terms: Sequence[Term]) -> Prediction:
         """Predict all blocks from the training part."""
@@ -153,6 +144,7 @@ class ChainedPart:
     Attributes
     ----------
     first_h, last_h : the part, hours since the start
+    in_training : whether it lies before the hold-out set
     effects : what the search on the time before added
     rmse_persistence_um, rmse_declared_um, rmse_final_um : (channels,) errors of repeating the last value, of the declared model, and
         of the model with what was added
@@ -160,6 +152,7 @@ class ChainedPart:
 
     first_h: float
     last_h: float
+    in_training: bool
     effects: tuple[str, ...]
     rmse_persistence_um: Array
     rmse_declared_um: Array
@@ -210,6 +203,7 @@ def chain_forward(
     seed, effects, progress : as for :func:`search_record`
     """
     parts = []
+    train, _ = hold_out(record)
     numbers = np.unique(record.chained)[2:]
     for done, number in enumerate(numbers):
         progress(done, numbers.size, "predicting part after part")
@@ -220,6 +214,7 @@ def chain_forward(
             ChainedPart(
                 float(hours[0]),
                 float(hours[-1]),
+                bool(train[part].all()),
                 tuple(step.effect for step in state.steps),
                 persistence_rmse(record, before, part),
                 channel_rmse(record, problem.predict(state.declared).predicted, part),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,14 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.loop.closed_loop import not_confirmed, verdict
+from fusion.loop.baselines import ErrorInterval, error_interval
+from fusion.loop.closed_loop import not_confirmed
+from fusion.loop.result import errors_json
 from fusion.loop.state import Round, Step, rivals
+from fusion.loop.verdict import doubt_of, has_skill, verdict
 from fusion.model.fit import Term, place_of
+from fusion.products.results_loop import Verdict
 from fusion.record.blocks import Record
 from fusion.record.model import RecordFit
-from fusion.record.prediction import Prediction
-from fusion.record.problem import ChainedPart, RecordState
-from fusion.record.remainder import RecordRemainder
+from fusion.record.prediction import Prediction, channel_rmse, rmse
+from fusion.record.problem import ENTRY_LEVEL, ChainedPart, RecordState
+from fusion.record.remainder import NOISE_SHARE, RecordRemainder
 
 
 @dataclass(frozen=True)
@@ -31,7 +36,8 @@ class RecordResult:
     held_out : which part that is, in words
     predictions : of the declared model and after every added effect, from the training part
     errors : (1 + effects, channels) their errors on the hold-out set, um
-    persistence_um : (channels,) error of repeating the last value of the training part
+    plain : (blocks, channels) each, plain predictions from the training part, by name
+    cross_um : error of predicting every part from all others, um: of the final model, then without each of its effects
     whole : the final model fitted to all blocks, for its residual
     remainder : structure that the final model leaves
     chained : every part from the third on, predicted by the whole procedure on the time before it
@@ -43,15 +49,59 @@ class RecordResult:
     held_out: str
     predictions: list[Prediction]
     errors: Array
-    persistence_um: Array
+    plain: Mapping[str, Array]
+    cross_um: list[float]
     whole: RecordFit
     remainder: RecordRemainder
     chained: list[ChainedPart]
 
     @property
-    def verdict(self) -> str:
-        """complete, explained, partial or unexplained."""
-        return verdict(added=bool(self.state.steps), remains=bool(self.remainder.shape))
+    def persistence_um(self) -> Array:
+        """Error of repeating the last value of the training part, (channels,) um."""
+        return channel_rmse(self.record, self.plain["last_value"], self.hold_out)
+
+    @property
+    def noise_um(self) -> float:
+        """Noise of a block mean, mean over the channels, um."""
+        return float(np.mean(self.whole.sigma))
+
+    @property
+    def hold_out_intervals(self) -> dict[str, ErrorInterval]:
+        """Errors on the hold-out set with their intervals: of the declared and the final model, and of plain predictions."""
+        predicted = {
+            "declared": self.predictions[0].predicted,
+            "final": self.predictions[-1].predicted,
+            **self.plain,
+        }
+        rows = np.flatnonzero(self.hold_out)
+        errors = {name: (self.record.displacement - values)[rows] for name, values in predicted.items()}
+        return {name: error_interval(one, rows, np.random.default_rng(1)) for name, one in errors.items()}
+
+    @property
+    def skill(self) -> bool:
+        """Whether the final model predicts the hold-out set better than last value and mean of the training part."""
+        last, mean = (rmse(self.record, self.plain[name], self.hold_out) for name in ("last_value", "mean"))
+        return has_skill(float(np.nanmean(self.errors[-1])), last, mean, self.noise_um, NOISE_SHARE)
+
+    @property
+    def doubts(self) -> list[str]:
+        """For every step why the hold-out set does not confirm it; empty where it does."""
+        after = float(np.nanmean(self.errors[-1]))
+        return [
+            doubt_of(after, without, self.noise_um, "on the hold-out set") for without in self.state.errors_without_um
+        ]
+
+    @property
+    def verdict(self) -> Verdict:
+        """Word for the outcome."""
+        doubts = self.doubts
+        return verdict(
+            confirmed=not all(doubts),
+            doubtful=any(doubts),
+            tested=bool(self.state.unnamed(ENTRY_LEVEL)) or self.remainder.is_tested,
+            remains=bool(self.remainder.shape),
+            skill=self.skill,
+        )
 
     def as_json(self) -> dict[str, Any]:
         """The ``loop`` part of results.json; errors are means over the channels."""
@@ -60,12 +110,14 @@ class RecordResult:
         return {
             "declared": [term.effect for term in self.state.declared],
             "held_out": self.held_out,
-            "noise_floor_um": float(np.mean(self.whole.sigma)),
+            "noise_floor_um": self.noise_um,
             "rmse_persistence_um": float(np.nanmean(self.persistence_um)),
             "rmse_declared_um": float(mean[0]),
             "rmse_final_um": float(mean[-1]),
             "steps": [self._step(place) for place in range(len(self.state.steps))],
+            **errors_json(self.hold_out_intervals),
             "verdict": self.verdict,
+            "unnamed": self.state.unnamed(ENTRY_LEVEL),
             "unexplained": {
                 "shape": self.remainder.shape,
                 "rms_um": self.remainder.rms_um,
@@ -88,6 +140,7 @@ class RecordResult:
                 {
                     "first_h": part.first_h,
                     "last_h": part.last_h,
+                    "in_training": part.in_training,
                     "effects": list(part.effects),
                     "rmse_persistence_um": float(np.nanmean(part.rmse_persistence_um)),
                     "rmse_declared_um": float(np.nanmean(part.rmse_declared_um)),
@@ -112,6 +165,9 @@ class RecordResult:
             "p_value": step.score.family_wise_p,
             "rmse_before_um": float(before),
             "rmse_after_um": float(after),
+            "rmse_without_um": self.state.errors_without_um[place],
+            "cross_rmse_before_um": self.cross_um[1 + place],
+            "cross_rmse_after_um": self.cross_um[0],
             "rms_um": float(np.sqrt(np.mean(squares))),
             "rms_by_channel_um": {
                 name: float(np.sqrt(np.mean(squares[:, channel]))) for channel, name in enumerate(self.record.channels)
@@ -121,7 +177,9 @@ class RecordResult:
             "tied": tied,
             "runner_up": runner_up,
             "rejected": _rejected(step.round),
-            "confirmed": str(step.confirmed),
+            "confirmed": not self.doubts[place],
+            "doubt": self.doubts[place],
+            "confirmed_by": str(step.confirmed),
             "event_s": term.candidate.event_s,
         }
 

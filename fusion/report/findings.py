@@ -7,8 +7,8 @@ import numpy as np
 from fusion.diagnosis.causes import CAUSES
 from fusion.products.results_attribution import CorrelationPart
 from fusion.products.results_axis import AnomalyPart, DriftPart, Iso230Part
-from fusion.products.results_loop import Loop
-from fusion.report.wording import join, number, p_value, place, quantity
+from fusion.products.results_loop import Loop, StepPart
+from fusion.report.wording import BASELINES, join, number, p_value, place, quantity
 
 #: Axis values in the terms of ISO 230-2:2014, in the order of the report.
 ISO230_TERMS = {
@@ -104,7 +104,37 @@ def hold_out_errors(loop: Loop) -> str:
     loop : Loop
         The part ``loop`` of the results.
     """
-    return f"{number(loop.rmse_declared_um, 3)} -> {number(loop.rmse_final_um, 3)} µm"
+    declared, final = (
+        f"{number(error.rmse_um, 3)} [{number(error.low_um, 2)}, {number(error.high_um, 2)}]"
+        for error in (loop.errors.declared, loop.errors.final)
+    )
+    return f"{declared} -> {final} µm"
+
+
+def baseline_errors(loop: Loop) -> str:
+    """Return the errors on the hold-out of the last value, of the mean and of the best plain regression, µm.
+
+    Parameters
+    ----------
+    loop : Loop
+        The part ``loop`` of the results.
+    """
+    names = dict.fromkeys(("last_value", "mean", loop.best_baseline))
+    return ", ".join(f"{BASELINES[name]} {number(getattr(loop.baselines, name).rmse_um, 3)}" for name in names) + " µm"
+
+
+def step_errors(step: StepPart) -> str:
+    """Return the errors before and after an effect entered: on the hold-out, and of blocks predicted from the others, µm.
+
+    Parameters
+    ----------
+    step : StepPart
+        One of ``loop.steps``.
+    """
+    cross = f"blocks left out {number(step.cross_rmse_before_um, 3)} -> {number(step.cross_rmse_after_um, 3)} µm"
+    if step.rmse_after_um is None:
+        return f"found after the hold-out was opened, {cross}"
+    return f"held-out error {number(step.rmse_before_um, 3)} -> {number(step.rmse_after_um, 3)} µm, {cross}"
 
 
 def standing_out(anomalies: tuple[AnomalyPart, ...]) -> str:

@@ -11,6 +11,7 @@ from fusion.products.results_axis import Evidence
 from fusion.products.results_loop import (
     AxisLoop,
     Coefficient,
+    ErrorInterval,
     HoldOutQuestion,
     Loop,
     Nothing,
@@ -21,7 +22,7 @@ from fusion.products.results_loop import (
     StepPart,
 )
 from fusion.report.tables import Row, Table, Words, table
-from fusion.report.wording import duration, effect_words, join, measured, number, p_value, print_unit
+from fusion.report.wording import BASELINES, duration, effect_words, join, measured, number, p_value, print_unit
 
 #: Shapes of a residual in the order of the report: name in the results, words.
 _SHAPES = (
@@ -53,8 +54,33 @@ _UNITS = {
 }
 
 
+#: What the hold-out is for, and what it is not.
+DECIDED_BEFORE = (
+    "What enters is decided on the training part alone. The hold-out is opened once, to report: an effect that it does not bear out "
+    "stays in the table as not confirmed, and the error after may exceed the error before."
+)
+
+
+def errors_table(loop: Loop) -> Table:
+    """Return the errors on the hold-out with their intervals: of the model before and after, and of plain predictions.
+
+    Parameters
+    ----------
+    loop : Loop
+        The part ``loop`` of the results.
+    """
+    named = [("declared model", loop.errors.declared), ("with the added effects", loop.errors.final)]
+    rows = [Row(_error_cells(name, one), marked=True) for name, one in named]
+    rows += [Row(_error_cells(words, getattr(loop.baselines, name))) for name, words in BASELINES.items()]
+    return table([Words("Prediction of the hold-out"), "Error / µm", "95 % interval / µm"], rows)
+
+
+def _error_cells(name: str, error: ErrorInterval) -> list[str]:
+    return [name, number(error.rmse_um, 3), f"{number(error.low_um, 2)} to {number(error.high_um, 2)}"]
+
+
 def steps_table(loop: Loop) -> Table:
-    """Return the declared model and every effect that was added, with the error on the hold-out before and after.
+    """Return the declared model and every effect that was added, with the errors before and after: held out, and blocks left out.
 
     Parameters
     ----------
@@ -68,10 +94,13 @@ def steps_table(loop: Loop) -> Table:
         "p",
         "Held-out error before / µm",
         "after / µm",
+        "Blocks left out, before / µm",
+        "after / µm",
+        Words("Confirmed"),
         Words("Runner-up"),
     ]
     declared = join([effect_words(name).name for name in loop.declared]) or "nothing"
-    rows = [Row(["0", f"declared: {declared}", "", "–", "–", number(loop.rmse_declared_um, 3), ""])]
+    rows = [Row(["0", f"declared: {declared}", "", "–", "–", number(loop.rmse_declared_um, 3), "–", "–", "", ""])]
     for turn, step in enumerate(loop.steps, start=1):
         rows.append(Row([str(turn), *_step_cells(step)], marked=True))
     return table(columns, rows)
@@ -84,6 +113,9 @@ def _step_cells(step: StepPart) -> list[str]:
         p_value(step.p_value),
         number(step.rmse_before_um, 3),
         number(step.rmse_after_um, 3),
+        number(step.cross_rmse_before_um, 3),
+        number(step.cross_rmse_after_um, 3),
+        f"not confirmed: {step.doubt}" if step.doubt else "yes",
         _runner_up(step.runner_up),
     ]
 
@@ -117,8 +149,13 @@ def refused_effects(loop: Loop) -> list[tuple[str, str]]:
         The part ``loop`` of the results.
     """
     titled = (("not tried", loop.not_tried), ("not admitted", loop.blocked))
+    rows = [(title, name, reason) for title, reasons in titled for name, reason in reasons.items()]
     return [
-        (f"{title}: {effect_words(name).name}", reason) for title, reasons in titled for name, reason in reasons.items()
+        (
+            f"{title}: {effect_words(name).name}",
+            f"p {p_value(loop.unnamed[name])}; {reason}" if name in loop.unnamed else reason,
+        )
+        for title, name, reason in rows
     ]
 
 
@@ -146,11 +183,10 @@ def _unexplained_drift(left: Nuisance) -> str:
 
 
 def _question(asked: HoldOutQuestion) -> str:
-    """Hold-out test of the strongest undecided candidate and its outcome."""
-    answer = "it entered" if asked.entered else "it did not enter"
+    """What the hold-out says of the strongest undecided candidate."""
     return (
         f"{effect_words(asked.effect).name}: error {number(asked.rmse_before_um, 3)} µm without it and "
-        f"{number(asked.rmse_after_um, 3)} µm with it, predicted from the cycles before; p {p_value(asked.p_value)}; {answer}"
+        f"{number(asked.rmse_after_um, 3)} µm with it, predicted from the cycles before; p {p_value(asked.p_value)}"
     )
 
 

@@ -10,9 +10,9 @@ import xarray as xr
 
 from fusion.products.results import Results
 from fusion.products.results_loop import RecordLoop, RecordScorePart
-from fusion.record.problem import ENTRY_LEVEL, EVENT_LEVEL
+from fusion.record.problem import ENTRY_LEVEL
 from fusion.report import plots_record
-from fusion.report.model_section import parameters, refused_effects, steps_table
+from fusion.report.model_section import DECIDED_BEFORE, errors_table, parameters, refused_effects, steps_table
 from fusion.report.tables import Row, Table, Words, table
 from fusion.report.wording import (
     duration,
@@ -129,6 +129,7 @@ def describe_record(results: Results, provenance: Mapping[str, Any], record: xr.
         "shown": list(enumerate(_shown_channels(record))),
         "omitted": max(0, len(channels) - _MOST_CHANNELS),
         "steps": steps_table(loop),
+        "errors": errors_table(loop),
         "unexplained": loop.unexplained,
         "channels": _channels_table(loop),
         "rejected": _rejected_table(loop),
@@ -272,13 +273,13 @@ def _uncertainty(loop: RecordLoop) -> list[str]:
     sentences = [
         "Whether an effect is present is tested against a drift that wanders at random in every channel. Channels that measure the same "
         "part are not counted twice: the simulated records behind p have the correlation of the measured ones.",
-        f"p is family-wise over the search of one round. An effect enters at p up to {100 * ENTRY_LEVEL:g} %, an event at p up to "
-        f"{100 * EVENT_LEVEL:g} %.",
+        f"p is family-wise over the search of one round. An effect enters at p up to {100 * ENTRY_LEVEL:g} %.",
+        DECIDED_BEFORE,
         "The bands of a prediction (two standard uncertainties) come from parts of the record that the model had not seen. They do not "
         "hold for a machine that is used in a way this record does not contain.",
         "The coefficients of single sensors are not printed: collinear sensors share what they explain, and only their sum is meaningful.",
         "The verdict says what these data can show: a source that was not logged and that no sensor sees looks like drift without a cause.",
     ]
     if loop.steps:
-        sentences.append(f"How the added effects were confirmed: {loop.steps[0].confirmed}.")
+        sentences.append(f"How the added effects were confirmed before they entered: {loop.steps[0].confirmed_by}.")
     return sentences

@@ -10,7 +10,7 @@ import xarray as xr
 
 from fusion.attribution.family_wise import LEVEL as ATTRIBUTION_LEVEL
 from fusion.diagnosis.remainder import LEVEL as REMAINDER_LEVEL
-from fusion.loop.axis import ASKED_LEVEL, ENTRY_LEVEL, SEARCH_LEVEL, SECOND_LEVEL
+from fusion.loop.axis import ENTRY_LEVEL, SEARCH_LEVEL, SECOND_LEVEL
 from fusion.products.grouped import group, has
 from fusion.products.results import Results
 from fusion.products.results_axis import NeighboursPart
@@ -21,11 +21,13 @@ from fusion.products.results_radiometry import RadiometryPart
 from fusion.report.attribution_section import describe_correlation
 from fusion.report.findings import ISO230_TERMS, anomaly_cause, anomaly_place, iso230_values, standing_out
 from fusion.report.model_section import (
+    DECIDED_BEFORE,
     describe_candidates,
     describe_evidence,
     describe_identifiability,
     describe_model,
     describe_residual,
+    errors_table,
     steps_table,
 )
 from fusion.report.tables import Table, Words, table
@@ -436,6 +438,7 @@ def _describe_loop(loop: Loop) -> dict[str, Any]:
     return {
         "numbers": verdict_numbers(loop),
         "steps": steps_table(loop),
+        "errors": errors_table(loop),
         "held_out": loop.held_out,
         "noise": f"{number(loop.noise_floor_um, 2)} µm",
         "shape": loop.unexplained.shape,
@@ -469,9 +472,10 @@ def _uncertainty(results: Results, fields: xr.Dataset | None) -> list[str]:
             "alike, slowly and unlogged, looks like drift without a cause. The errors before and after come from coefficients "
             "fitted without the held-out cycles."
         )
+        sentences.append(DECIDED_BEFORE)
         for step in results.loop.steps:
             name = effect_words(step.effect).name
-            sentences.append(f"{name[0].upper()}{name[1:]}: {step.confirmed}.")
+            sentences.append(f"{name[0].upper()}{name[1:]}: {step.confirmed_by}.")
     return [*sentences, *_levels(results)]
 
 
@@ -481,9 +485,9 @@ def _levels(results: Results) -> list[str]:
     if results.loop is not None:
         sentences.append(
             f"Closed loop: p is family-wise over all candidates of a round. An effect enters at p up to {_percent(SEARCH_LEVEL)} in the "
-            f"search, at p up to {_percent(ASKED_LEVEL)} in the hold-out test of the strongest undecided candidate, and at p up to "
-            f"{_percent(SECOND_LEVEL)} in the search over all cycles that follows: {_percent(ENTRY_LEVEL)} together where nothing is "
-            f"missing. A pattern of positions is reported as left at p up to {_percent(REMAINDER_LEVEL)}, family-wise over its shapes."
+            f"search before the hold-out, and at p up to {_percent(SECOND_LEVEL)} in the search over all cycles that follows: "
+            f"{_percent(ENTRY_LEVEL)} together where nothing is missing. A pattern of positions is reported as left at p up to "
+            f"{_percent(REMAINDER_LEVEL)}, family-wise over its shapes."
         )
         sentences.append(
             "Table of the residual: every shape is tested by itself, its p-value is not corrected for the number of shapes."

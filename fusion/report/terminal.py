@@ -23,10 +23,12 @@ from fusion.report.findings import (
     anomaly_cause,
     anomaly_place,
     attribution_headline,
+    baseline_errors,
     hold_out_errors,
     iso230_values,
     randomised_causes,
     scatter_range,
+    step_errors,
 )
 from fusion.report.tables import Words, print_table, table
 from fusion.report.wording import (
@@ -123,11 +125,13 @@ def _registration(part: RegistrationPart) -> str:
 def _loop_rows(loop: Loop, headline: str) -> list[tuple[str, str]]:
     rows = [("declared", ", ".join(loop.declared) or "nothing")]
     for step in loop.steps:
-        errors = f"{number(step.rmse_before_um, 3)} -> {number(step.rmse_after_um, 3)} µm"
-        rows.append(("added", f"{step.effect} (p {p_value(step.p_value)}), held-out error {errors}"))
+        rows.append(("added", f"{step.effect} (p {p_value(step.p_value)}), {step_errors(step)}"))
+    rows += [("not confirmed", f"{step.effect}: {step.doubt}") for step in loop.steps if step.doubt]
+    rows += [("without a name", f"{name} (p {p_value(p)})") for name, p in loop.unnamed.items()]
     return [
         *rows,
         ("held-out error", hold_out_errors(loop)),
+        ("plain predictions", baseline_errors(loop)),
         ("noise floor", f"{number(loop.noise_floor_um, 3)} µm"),
         ("verdict", f"{loop.verdict}: {headline}"),
     ]

@@ -190,6 +190,16 @@ def join(items: Sequence[str]) -> str:
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}" if items else ""
 
 
+#: Plain predictions of the hold-out in words, by their key in ``loop.baselines``.
+BASELINES = {
+    "last_value": "last value repeated",
+    "mean": "mean of the training part",
+    "least_squares": "least squares on all that was logged",
+    "ridge": "ridge regression on the same",
+    "ridge_with_lags": "ridge regression with lagged copies",
+}
+
+
 def verdict_headline(loop: Loop) -> str:
     """Return one sentence that states what the closed loop found.
 
@@ -198,15 +208,31 @@ def verdict_headline(loop: Loop) -> str:
     loop : Loop
         The part ``loop`` of the results.
     """
-    added = join([effect_words(step.effect).name for step in loop.steps])
-    shape = loop.unexplained.shape or "without a clear shape"
-    noun, pronoun = ("an effect", "it") if len(loop.steps) == 1 else (f"{len(loop.steps)} effects", "them")
+    confirmed = [step for step in loop.steps if step.confirmed]
+    added = join([effect_words(step.effect).name for step in confirmed])
+    noun, pronoun = ("an effect", "it") if len(confirmed) == 1 else (f"{len(confirmed)} effects", "them")
+    lacked = f"The declared model lacked {noun}: {added}. "
     return {
         "complete": "The declared model explains the drift; nothing in these data shows that an effect is missing.",
-        "explained": f"The declared model lacked {noun}: {added}. With {pronoun}, nothing is left that these data can show.",
-        "partial": f"The declared model lacked {noun}: {added}. With {pronoun}, something without a name is left ({shape}).",
-        "unexplained": f"Something is left that no effect of the library explains ({shape}).",
+        "explained": f"{lacked}With {pronoun}, nothing is left that these data can show.",
+        "partial": f"{lacked}With {pronoun}, something without a name is left{_left(loop)}.",
+        "unexplained": f"Something is left that no effect of the library explains{_left(loop)}.",
+        "no_skill": (
+            "The model predicts no better than repeating the last value or the mean: these data cannot tell whether an effect is "
+            f"missing{_left(loop)}."
+        ),
     }[loop.verdict]
+
+
+def _left(loop: Loop) -> str:
+    """What is left, in brackets: a shape, significant effects without a name, effects that were not confirmed."""
+    parts = [loop.unexplained.shape] if loop.unexplained.shape else []
+    parts += [
+        f"{effect_words(name).name} is significant, p {p_value(p)}, and was not admitted"
+        for name, p in loop.unnamed.items()
+    ]
+    parts += [f"{effect_words(step.effect).name} is not confirmed" for step in loop.steps if not step.confirmed]
+    return f" ({'; '.join(parts)})" if parts else ""
 
 
 def verdict_numbers(loop: Loop) -> str:
@@ -221,7 +247,8 @@ def verdict_numbers(loop: Loop) -> str:
     where, noise = ("the held-out part", "a block mean") if record else ("held-out cycles", "single readings")
     declared, final = number(loop.rmse_declared_um, 2), number(loop.rmse_final_um, 2)
     errors = f"{declared} µm with the declared model, {final} µm after" if loop.steps else f"{declared} µm"
-    return f"Error on {where}: {errors}; the noise of {noise} is {number(loop.noise_floor_um, 2)} µm."
+    plain = f"{number(loop.rmse_persistence_um, 2)} µm for repeating the last value"
+    return f"Error on {where}: {errors}, {plain}; the noise of {noise} is {number(loop.noise_floor_um, 2)} µm."
 
 
 def conditional_headline(results: Results) -> str:
@@ -301,7 +328,7 @@ def next_steps(results: Results) -> list[str]:
     steps = [check.remedy for check in results.inputs.doubts] if results.inputs else []
     if results.loop is not None:
         steps += [effect_words(step.effect).remedy for step in results.loop.steps]
-        if results.loop.verdict in {"partial", "unexplained"}:
+        if results.loop.verdict in {"partial", "unexplained", "no_skill"}:
             steps.append(
                 "Log more of what happens at the machine (duty, coolant, doors, air) in the next test: what is left has no name."
             )

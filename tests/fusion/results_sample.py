@@ -21,11 +21,17 @@ STEP = {
     "p_value": 0.001,
     "rmse_before_um": 0.6,
     "rmse_after_um": 0.4,
+    "rmse_without_um": 0.6,
+    "cross_rmse_before_um": 0.7,
+    "cross_rmse_after_um": 0.5,
     "rms_um": 0.3,
     "tied": [],
     "runner_up": {"effect": "dead_path", "behind_by": 4.0, "p_value": 0.2},
-    "confirmed": "on later blocks of cycles",
+    "confirmed": True,
+    "doubt": "",
+    "confirmed_by": "on later blocks of cycles",
 }
+ERROR = {"rmse_um": 0.6, "low_um": 0.5, "high_um": 0.7}
 LOOP = {
     "declared": ["axis_expansion"],
     "held_out": "cycles 41 to 60",
@@ -33,6 +39,14 @@ LOOP = {
     "rmse_persistence_um": 0.9,
     "rmse_declared_um": 0.6,
     "rmse_final_um": 0.4,
+    "errors": {"declared": ERROR, "final": {"rmse_um": 0.4, "low_um": 0.35, "high_um": 0.46}},
+    "baselines": {
+        "last_value": {"rmse_um": 0.9, "low_um": 0.8, "high_um": 1.0},
+        **dict.fromkeys(("mean", "least_squares", "ridge"), ERROR),
+        "ridge_with_lags": {"rmse_um": 0.5, "low_um": 0.4, "high_um": 0.6},
+    },
+    "best_baseline": "ridge_with_lags",
+    "unnamed": {},
     "verdict": "explained",
     "not_tried": {"dead_path": "no air"},
     "blocked": {},
@@ -142,7 +156,7 @@ RECORD_LOOP: dict[str, Any] = {
     ],
     "unexplained": {**LEFT, "p_values": {"rhythm": 0.4}, "variance_share": 0.1},
     "channels": {"X": {**ERRORS, "noise_um": 0.1, "variance_share": 0.1}},
-    "chained": [{"first_h": 6.0, "last_h": 9.0, "effects": [], **ERRORS}],
+    "chained": [{"first_h": 6.0, "last_h": 9.0, "in_training": True, "effects": [], **ERRORS}],
     "search": [
         [{**SCORE, "chained_rmse_before_um": 0.7, "chained_rmse_after_um": 0.5, "chosen": True, "rejected": ""}]
     ],

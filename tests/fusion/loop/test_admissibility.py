@@ -26,11 +26,16 @@ class Stated:
     single: Decision | None = None
     rate: bool = False
     advantage: float = 5.0
+    heat: bool = True
     asked: list[str] = field(default_factory=list)
 
     def at_switching(self, candidate: Candidate) -> float | None:
         self.asked.append("switching")
         return self.hours
+
+    def heat_is_logged(self) -> bool:
+        self.asked.append("heat")
+        return self.heat
 
     def noise_of_lag(self, candidate: Candidate) -> tuple[str, float, float]:
         self.asked.append("noise")
@@ -72,7 +77,20 @@ def test_a_source_is_only_asked_for_its_excitation():
 def test_a_lag_passes_every_check_in_turn():
     grounds = Stated()
     assert refuse("thermal_lag", "field", CANDIDATE, grounds) is None
-    assert grounds.asked == ["switching", "noise", "single field", "rate", "smoothing"]
+    assert grounds.asked == ["switching", "noise", "single field", "rate", "smoothing", "heat"]
+
+
+def test_a_lag_is_not_told_from_heat_that_was_not_logged():
+    decision = refuse("thermal_lag", "field", CANDIDATE, Stated(heat=False))
+    assert decision == Decision("thermal_lag", Reason.UNLOGGED_HEAT)
+    assert refuse("unseen_heat_source", "driver", CANDIDATE, Stated(heat=False)) is None
+    assert refuse("dead_path", "", CANDIDATE, Stated(heat=False)) is None
+
+
+def test_a_campaign_logs_heat_where_it_has_a_driver():
+    for drivers in ((), ("duty",)):
+        readings = campaign(cycles=12, series={"duty": logged(np.arange(60.0), "1")}, drivers=drivers)
+        assert AxisGrounds(model_of(readings)).heat_is_logged() is bool(drivers)
 
 
 @pytest.mark.parametrize(("noise", "refused"), [(0.01, False), (0.0101, True)])

@@ -85,6 +85,16 @@ def test_two_targets_of_their_own_make_a_pattern_wrong():
     assert stats.chi2.sf(statistic, 11) < pattern_p_value(model, model.terms[0]) < stats.chi2.sf(0.25 * statistic, 11)
 
 
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_a_course_that_is_uneven_between_visits_hides_no_wrong_pattern(seed):
+    """Read at one target and interpolated, it is not the term's own course: the difference is no deviation of one target."""
+    course = np.sin(BARE.seconds / 150.0)
+    bending = course * BARE.share**2
+    odd = course * np.select([BARE.target == 3, BARE.target == 6], [0.2, -0.2], 0.0)
+    right, wrong = (fitted(seen, ("angular_growth", bending), seed=seed) for seen in (bending, bending + odd))
+    assert pattern_p_value(wrong, wrong.terms[0]) < LEVEL < pattern_p_value(right, right.terms[0])
+
+
 def test_an_event_has_no_pattern_to_be_tested():
     late = (BARE.seconds > 3000.0) * BARE.share
     readings = replace(BARE, response=np.where(BARE.target == 2, 5.0, 0.0) * (BARE.seconds > 3000.0))

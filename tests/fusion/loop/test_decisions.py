@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import fusion
-from fusion.loop.decisions import BLOCKING, FINAL, NOT_TRIED, Decision, Reason
+from fusion.loop.decisions import BLOCKING, FINAL, NOT_TRIED, WITHDRAWN, WITHHELD, Decision, Reason
 
 #: What is given with each reason where it is decided, as in the code.
 FIELDS = {
@@ -27,8 +27,7 @@ FIELDS = {
     Reason.NOT_CONFIRMED: {"p_value"},
     Reason.SUPERFLUOUS: {"loss"},
     Reason.TOO_MANY_EVENTS: {"most"},
-    Reason.HOLD_OUT_ERROR: {"p_value", "without_um", "with_um"},
-    Reason.SECOND_LOOK_ERROR: {"without_um", "with_um"},
+    Reason.UNLOGGED_HEAT: set(),
     Reason.WRONG_PATTERN: {"p_value"},
     Reason.SHARED_PATTERN: {"first", "second"},
     Reason.BESIDE_WRONG_PATTERN: {"beside"},
@@ -81,15 +80,13 @@ def test_every_reason_has_a_sentence(reason):
 
 
 def test_the_sentences_read_as_they_are_meant():
-    hold_out = Decision(
-        "dead_path", Reason.HOLD_OUT_ERROR, {"p_value": 0.0012, "without_um": 0.41, "with_um": 0.52}
+    repeated = Decision(
+        "dead_path", Reason.NOT_REPEATED, {"p_value": 0.0012, "parts": 2, "without_um": 0.41, "with_um": 0.52}
     ).sentence
-    assert hold_out == (
-        "withdrawn: it was found in the training part (p = 0.0012), but the error on the hold-out set is not smaller with it "
-        "(0.41 µm without, 0.52 µm with)"
+    assert repeated == (
+        "withdrawn: it was found in the training part (p = 0.0012), but the 2 earlier part(s) of the record on which the same procedure "
+        "added it were predicted no better (0.41 to 0.52 µm)"
     )
-    again = Decision("dead_path", Reason.SECOND_LOOK_ERROR, {"without_um": 0.4, "with_um": 0.5}).sentence
-    assert again.endswith("rose from 0.400 to 0.500 µm with it")
     noise = {"series": "t1", "noise_percent": 2.345, "limit_percent": 1.0}
     assert Decision("thermal_lag", Reason.TEMPERATURE_NOISE, noise).sentence.startswith(
         "the noise of t1 is 2.3 % of its range; above 1 % "
@@ -104,12 +101,16 @@ def test_reasons_are_divided_as_the_procedure_needs_them():
     assert set(Reason) - NOT_TRIED - neutral == BLOCKING
     assert not NOT_TRIED & BLOCKING and not neutral & BLOCKING
     assert {
-        Reason.SECOND_LOOK_ERROR,
         Reason.WRONG_PATTERN,
         Reason.SHARED_PATTERN,
         Reason.BESIDE_WRONG_PATTERN,
         Reason.NOT_REPEATED,
     } == FINAL
     assert FINAL < BLOCKING
-    # A better known time constant may bring the effect back.
-    assert Reason.HOLD_OUT_ERROR in BLOCKING - FINAL
+    assert FINAL | {Reason.TOO_MANY_EVENTS} == WITHDRAWN
+
+
+def test_a_name_that_is_withheld_shows_that_something_is_missing():
+    """Not where the model contains the effect already, nor where it could not be tried."""
+    assert BLOCKING - {Reason.COLLINEAR} | {Reason.NOT_CONFIRMED, Reason.NOT_PREDICTED} == WITHHELD
+    assert not WITHHELD & NOT_TRIED

@@ -11,18 +11,19 @@ import pytest
 from fusion.alignment.readings import Readings
 from fusion.diagnosis.remainder import Remainder
 from fusion.effects.effect import Candidate, Prior
+from fusion.loop.baselines import ErrorInterval
 from fusion.loop.decisions import Decision, Reason
 from fusion.loop.result import (
     LoopResult,
     coefficients_of,
     declared_coefficients,
     nuisance_size,
-    persistence,
     report_steps,
     rmse,
 )
 from fusion.loop.state import Confirmation, Confirmed, DetectionLimit, HoldOutQuestion, LoopState, Round, Score, Step
-from fusion.model.fit import ModelFit, unexplained_drift
+from fusion.model.cross_prediction import cross_rmse
+from fusion.model.fit import ModelFit, fit_model, unexplained_drift
 from fusion.model.jackknife import coefficient_spread
 from tests.fusion.small_campaign import RATIOS, campaign, model_of, term
 
@@ -62,6 +63,7 @@ def state(model: ModelFit, *, confirmed: Confirmed = Confirmed.OTHER_TARGETS) ->
         ),
         rounds=(first,),
         errors_um=(0.8, 0.3),
+        errors_without_um=(0.8,),
     )
 
 
@@ -80,6 +82,12 @@ def remainder(shape: str = "", series: np.ndarray | None = None) -> Remainder:
     )
 
 
+HOLD_OUT = {
+    name: ErrorInterval(error, 0.9 * error, 1.1 * error)
+    for name, error in (("declared", 0.8), ("final", 0.3), ("last_value", 0.9), ("mean", 1.2), ("ridge", 0.5))
+}
+
+
 def result(looped: LoopState[ModelFit], left: Remainder) -> LoopResult:
     model = looped.model
     return LoopResult(
@@ -87,11 +95,12 @@ def result(looped: LoopState[ModelFit], left: Remainder) -> LoopResult:
         declared_coefficients=declared_coefficients(model, 1),
         held_out="cycles 11-12 held out",
         noise_floor_um=0.1,
-        rmse_persistence_um=0.9,
         rmse_declared_um=0.8,
         rmse_final_um=0.3,
-        steps=report_steps(looped),
-        verdict="explained",
+        hold_out=HOLD_OUT,
+        skill=True,
+        steps=report_steps(looped, {}),
+        unnamed={},
         remainder=left,
         nuisance=nuisance_size(model),
         state=looped,
@@ -102,18 +111,6 @@ def result(looped: LoopState[ModelFit], left: Remainder) -> LoopResult:
 
 def test_the_rmse_leaves_sites_without_a_prediction_out():
     assert rmse(np.array([3.0, np.nan, -4.0])) == pytest.approx(np.sqrt(12.5))
-
-
-def test_persistence_repeats_the_last_reading_of_every_site():
-    readings = campaign(cycles=4, positions_mm=(100.0, 200.0), both_directions=False)
-    # Target 1 reads 1, 2, 4, 8 and target 2 reads 0, 0, 1, 3; two cycles are held out.
-    readings = replace(readings, response=np.array([1.0, 0.0, 2.0, 0.0, 4.0, 1.0, 8.0, 3.0]))
-    used = readings.cycle <= 2
-    # Errors 4 - 2, 8 - 2, 1 - 0, 3 - 0.
-    assert persistence(readings, used) == pytest.approx(np.sqrt((4.0 + 36.0 + 1.0 + 9.0) / 4.0))
-    # A site that was not used has no last reading, one that is not asked for no error.
-    unseen = used & (readings.target == 1)
-    assert persistence(readings, unseen) == pytest.approx(np.sqrt((4.0 + 36.0) / 2.0))
 
 
 def test_coefficients_are_told_with_their_prior():
@@ -139,13 +136,20 @@ def test_coefficients_are_told_with_their_prior():
 
 def test_a_step_is_reported_with_its_errors_rivals_and_cycle():
     model = fitted()
-    (step,) = report_steps(state(model))
+    (step,) = report_steps(state(model), {})
     assert step.effect == "step_event" and step.parameters == {"time_s": 655.0}
     assert (step.rmse_before_um, step.rmse_after_um) == (0.8, 0.3)
     assert (step.p_value, step.held_out_p) == (1e-3, 0.02)
     assert step.tied == ["dead_path"]
     assert step.runner_up == {"effect": "dead_path", "behind_by": pytest.approx(1.5), "p_value": 0.1}
-    assert step.confirmed == str(Confirmed.OTHER_TARGETS)
+    assert step.confirmed_by == str(Confirmed.OTHER_TARGETS)
+    # The drift has learnt an early step by the time of the hold-out set: the block around it tells.
+    without = fit_model(model.readings, [model.terms[0]])
+    assert (step.cross_rmse_before_um, step.cross_rmse_after_um) == (
+        cross_rmse(without, 655.0),
+        cross_rmse(model, 655.0),
+    )
+    assert step.cross_rmse_after_um < step.cross_rmse_before_um and step.confirmed and step.doubt == ""
     # 655 s lies between the third and the fourth reading of cycle 6.
     assert step.event_cycle == 6
     # A coefficient times a column of zeros and ones, about its mean at every site.
@@ -161,17 +165,45 @@ def test_an_event_belongs_to_the_cycle_of_the_next_reading(event_s, cycle):
     model = fitted()
     later = term(LATE, "step_event", event_s=event_s)
     changed = replace(model, terms=(model.terms[0], later))
-    assert report_steps(state(changed))[0].event_cycle == cycle
+    assert report_steps(state(changed), {})[0].event_cycle == cycle
 
 
 def test_an_effect_that_lasts_belongs_to_no_cycle():
     model = model_of(measured(), [term(WAVE), term(LATE, "step_event")])
-    assert report_steps(state(model))[0].event_cycle is None
+    assert report_steps(state(model), {})[0].event_cycle is None
 
 
-def test_an_effect_that_the_hold_out_set_decided_has_the_p_value_of_that_question():
-    (step,) = report_steps(state(fitted(), confirmed=Confirmed.HOLD_OUT_QUESTION))
-    assert step.p_value == step.held_out_p == 0.02
+@pytest.mark.parametrize(("after", "confirmed"), [(0.3, True), (0.799, False), (0.9, False)])
+def test_what_lasts_is_confirmed_by_the_hold_out_set(after, confirmed):
+    model = model_of(measured(), [term(WAVE), term(LATE, "a")])
+    looped = replace(state(model), errors_um=(0.8, after))
+    (step,) = report_steps(looped, {})
+    assert (step.rmse_after_um, step.rmse_without_um, step.confirmed) == (after, 0.8, confirmed)
+    assert step.doubt == (
+        "" if confirmed else f"the error on the hold-out set is 0.8 µm without it and {after:.3g} µm with it"
+    )
+    found = replace(result(looped, remainder()), steps=[step])
+    assert found.verdict == ("explained" if confirmed else "unexplained")
+
+
+def test_a_pattern_that_all_cycles_contradict_is_not_confirmed():
+    wrong = Decision("step_event", Reason.WRONG_PATTERN, {"p_value": 1e-5})
+    (step,) = report_steps(state(fitted()), {0: wrong})
+    assert not step.confirmed and step.doubt == wrong.sentence
+
+
+def test_an_effect_that_entered_late_has_no_held_out_error():
+    (step,) = report_steps(state(fitted(), confirmed=Confirmed.SECOND_LOOK), {})
+    assert np.isnan([step.rmse_before_um, step.rmse_after_um, step.rmse_without_um]).all()
+    assert step.confirmed and step.cross_rmse_after_um < step.cross_rmse_before_um
+
+
+def test_significant_effects_without_a_name_keep_the_verdict_from_being_complete():
+    found = replace(result(state(fitted()), remainder()), steps=[])
+    assert found.verdict == "complete"
+    assert replace(found, unnamed={"thermal_lag": 1e-34}).verdict == "unexplained"
+    assert replace(found, skill=False).verdict == "no_skill"
+    assert replace(found, skill=False, unnamed={"thermal_lag": 1e-34}).verdict == "unexplained"
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -200,6 +232,10 @@ def test_the_part_of_results_json_has_its_keys():
         "rmse_persistence_um",
         "rmse_declared_um",
         "rmse_final_um",
+        "errors",
+        "baselines",
+        "best_baseline",
+        "unnamed",
         "steps",
         "verdict",
         "unexplained",
@@ -219,10 +255,15 @@ def test_the_part_of_results_json_has_its_keys():
         "held_out_p",
         "rmse_before_um",
         "rmse_after_um",
+        "rmse_without_um",
+        "cross_rmse_before_um",
+        "cross_rmse_after_um",
         "rms_um",
         "tied",
         "runner_up",
         "confirmed",
+        "doubt",
+        "confirmed_by",
         "event_cycle",
     }
     assert written["not_tried"] == {"reflected_source": "no patch"} and set(written["blocked"]) == {"constant"}
@@ -237,6 +278,9 @@ def test_the_part_of_results_json_has_its_keys():
         "note",
     }
     assert (written["rmse_declared_um"], written["rmse_final_um"], written["noise_floor_um"]) == (0.8, 0.3, 0.1)
+    assert written["errors"]["final"] == {"rmse_um": 0.3, "low_um": pytest.approx(0.27), "high_um": pytest.approx(0.33)}
+    assert set(written["baselines"]) == {"last_value", "mean", "ridge"} and written["best_baseline"] == "ridge"
+    assert written["rmse_persistence_um"] == 0.9
 
 
 def test_every_score_of_the_search_is_written():
@@ -258,14 +302,14 @@ def test_every_score_of_the_search_is_written():
 
 
 def test_the_question_to_the_hold_out_set_is_written():
-    asked = replace(state(fitted()), question=HoldOutQuestion("dead_path", {"minutes": 5.0}, 0.4, 0.3, 0.004, True))
+    asked = replace(state(fitted()), question=HoldOutQuestion("dead_path", {"minutes": 5.0}, 0.4, 0.3, 0.004))
     assert result(asked, remainder()).as_json()["sealed_question"] == {
         "effect": "dead_path",
         "parameters": {"minutes": 5.0},
         "rmse_before_um": 0.4,
         "rmse_after_um": 0.3,
         "p_value": 0.004,
-        "entered": True,
+        "entered": False,
     }
 
 

@@ -116,9 +116,10 @@ def test_a_score_is_replaced_in_the_last_round_only():
 def test_an_effect_enters_with_the_round_in_which_it_was_chosen():
     state = searched().scored(Round((score("a"),))).scored(Round((score("air_index"),)))
     chosen, model = score("air_index"), Model(terms("a", "b", "c", "d", "air_index"))
-    after = state.entered(model, chosen, Confirmed.LATE_EVENT)
+    after = state.entered(model, chosen, Confirmed.SECOND_LOOK)
     assert after.steps[:2] == state.steps
-    assert after.steps[2] == Step(chosen, state.rounds[-1], Confirmed.LATE_EVENT)
+    assert after.steps[2] == Step(chosen, state.rounds[-1], Confirmed.SECOND_LOOK)
+    assert after.steps[2].is_late_entry and not after.steps[0].is_late_entry
     assert after.model is model
     assert after.decisions[-1] == Decision("air_index", Reason.ENTERED)
 
@@ -134,7 +135,7 @@ def test_steps_are_taken_out_by_place():
 
 def test_the_latest_decision_counts():
     state = LoopState(Model(())).decide(
-        Decision("a", Reason.HOLD_OUT_ERROR, {"p_value": 0.1, "without_um": 1.0, "with_um": 2.0}),
+        Decision("a", Reason.AT_SWITCHING, {"hours": 1.0}),
         Decision("b", Reason.COLLINEAR),
         Decision("c", Reason.NOT_AVAILABLE, {"because": "no log"}),
         Decision("d", Reason.NOT_CONFIRMED, {"p_value": 0.1}),
@@ -142,7 +143,7 @@ def test_the_latest_decision_counts():
     assert set(state.blocked()) == {"a", "b"}
     assert state.blocked()["b"] == Decision("b", Reason.COLLINEAR).sentence
     assert state.not_tried() == {"c": "no log"}
-    assert state.last("a").reason is Reason.HOLD_OUT_ERROR and state.last("nothing") is None
+    assert state.last("a").reason is Reason.AT_SWITCHING and state.last("nothing") is None
     entered = state.decide(Decision("a", Reason.ENTERED))
     assert set(entered.blocked()) == {"b"} and entered.last("a").reason is Reason.ENTERED
 
@@ -150,7 +151,7 @@ def test_the_latest_decision_counts():
 def test_only_a_final_decision_keeps_an_effect_out():
     state = LoopState(Model(()))
     assert not state.is_withdrawn("a")
-    blocked = state.decide(Decision("a", Reason.HOLD_OUT_ERROR))
+    blocked = state.decide(Decision("a", Reason.AT_SWITCHING))
     assert not blocked.is_withdrawn("a")
     final = blocked.decide(Decision("a", Reason.WRONG_PATTERN))
     assert final.is_withdrawn("a") and not final.is_withdrawn("b")
@@ -195,3 +196,22 @@ def test_a_score_starts_without_evidence():
     bare = Score("constant", None)
     assert (bare.gain, bare.excess, bare.p_value, bare.family_wise_p) == (0.0, 0.0, 1.0, 1.0)
     assert (bare.collinear, bare.critical, bare.drift_place, bare.confirmation) == (0.0, np.inf, 0, None)
+
+
+def test_significant_effects_that_are_withheld_have_no_name():
+    def scored(name: str, p_value: float) -> Score:
+        return Score(name, Candidate(np.zeros((2, 1)), {}, ("um",)), family_wise_p=p_value)
+
+    first = Round((scored("a", 1e-9), scored("b", 1e-4)))
+    last = Round((scored("b", 1e-3), scored("c", 0.002), scored("d", 1e-9), scored("step_event", 1e-5)))
+    state = LoopState(Model(())).scored(first)
+    state = state.decide(
+        Decision("a", Reason.AT_SWITCHING, {"hours": 1.0, "search_p": 1e-9}),
+        Decision("b", Reason.NOT_CONFIRMED, {"p_value": 1e-4}),
+        Decision("c", Reason.NOT_CONFIRMED, {"p_value": 0.002}),
+        Decision("e", Reason.WRONG_PATTERN, {"p_value": 1e-5, "search_p": 1e-12}),
+        Decision("step_event", Reason.ENTERED),
+    )
+    # What was significant before an effect entered counts only where it still is; a withdrawn name counts whatever came later.
+    assert state.scored(last).unnamed(1e-3) == {"b": 1e-3, "e": 1e-12}
+    assert LoopState(Model(())).unnamed(1e-3) == {}

@@ -40,7 +40,7 @@ def test_a_full_document_keeps_the_schema_and_the_order_of_the_design() -> None:
 
 @pytest.mark.parametrize("parts", [PARTS, {"loop": RECORD_LOOP}], ids=["instruments", "record"])
 def test_every_value_comes_back(parts: dict[str, Any]) -> None:
-    document = {"schema": 1, "campaign": "A", "warnings": [], **parts}
+    document = {"schema": 2, "campaign": "A", "warnings": [], **parts}
     assert assemble("A", parts, []).as_json() == document
     assert isinstance(assemble("A", parts, []).loop, AxisLoop if "drift" in parts else RecordLoop)
     validator().validate(document)
@@ -55,7 +55,7 @@ def test_every_value_comes_back(parts: dict[str, Any]) -> None:
         (("anomalies", 0, "direction"), "up"),
         (("iso230", "B_um"), 1.0),
         (("drift", "profile_um"), [1.0]),
-        (("schema",), 2),
+        (("schema",), 1),
         (("hotspots", 0, "colour"), "red"),
     ],
 )
@@ -96,21 +96,19 @@ def test_results_that_cannot_be_read_name_file_and_remedy(tmp_path: Path) -> Non
         ResultsError, match=r"there is no results.json in it; name the results folder of a finished run"
     ):
         read_results(tmp_path)
-    (tmp_path / "results.json").write_text('{"schema": 1, "campaign": "A", "warnings": [], "colour": "red"}')
+    (tmp_path / "results.json").write_text('{"schema": 2, "campaign": "A", "warnings": [], "colour": "red"}')
     with pytest.raises(ResultsError, match=r"results.json: not the results of this version .*; run the campaign again"):
         read_results(tmp_path)
 
 
 @pytest.mark.parametrize(("loop", "kind"), [(PARTS["loop"], "axis"), (RECORD_LOOP, "record")])
 def test_one_wrong_value_is_one_fault_with_its_place(tmp_path: Path, loop: dict[str, Any], kind: str) -> None:
-    document = {"schema": 1, "campaign": "A", "warnings": [], "loop": {**loop, "verdict": "perfect"}}
+    document = {"schema": 2, "campaign": "A", "warnings": [], "loop": {**loop, "verdict": "perfect"}}
     with pytest.raises(ValidationError) as caught:
         Results.model_validate(document)
     assert [fault["loc"] for fault in caught.value.errors()] == [("loop", kind, "verdict")]
     (tmp_path / "results.json").write_text(json.dumps(document))
-    with pytest.raises(
-        ResultsError, match=r"thermofuse \(loop.verdict: Input should be 'complete'.*'unexplained'\); run"
-    ):
+    with pytest.raises(ResultsError, match=r"thermofuse \(loop.verdict: Input should be 'complete'.*'no_skill'\); run"):
         read_results(tmp_path)
 
 

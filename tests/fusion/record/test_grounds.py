@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from fusion.loop.admissibility import refuse
 from fusion.loop.decisions import Decision, Reason
 from fusion.record.blocks import Record, reduce_record
 from fusion.record.effects import MEAN, record_library
-from fusion.record.grounds import RecordGrounds, one_switching_share
+from fusion.record.grounds import RecordGrounds, _smoothed, one_switching_share
 from fusion.record.hold_out import declare
 from fusion.record.model import RecordFit, fit_record
 from tests.fusion.record_tables import record_of, table_of
@@ -75,6 +77,48 @@ def test_an_event_within_two_blocks_of_a_switching_belongs_to_it():
         event = Candidate(np.zeros((BLOCKS, 1)), {}, ("um",), event_s=instant)
         assert grounds.at_switching(event) == (instant / 3600.0 if at else None)
     assert grounds.at_switching(Candidate(np.zeros((BLOCKS, 1)), {}, ("um",))) is None
+
+
+def stepped(at: int, *, beside: int | None = None) -> tuple[RecordFit, Candidate]:
+    """A record whose load is switched once in the middle, with a step at one block and perhaps at another, and the first as an event."""
+    rng = np.random.default_rng(8)
+    level = np.where(np.arange(BLOCKS) < 120, 0.0, 1.0)
+    steps = sum((3.0 * (np.arange(BLOCKS) >= block) for block in (at, beside) if block is not None), np.zeros(BLOCKS))
+    displacement = steps[:, None] + 0.1 * rng.standard_normal((BLOCKS, 2))
+    record = record_of(displacement, 20.0 + rng.normal(0.0, 0.01, (BLOCKS, 1)), drivers={"speed": level})
+    event = Candidate((np.arange(BLOCKS) >= at).astype(float)[:, None], {}, ("um",), float(record.seconds[at]))
+    return fit_record(record, [], np.ones(BLOCKS, bool)), event
+
+
+def test_an_event_beside_a_switching_must_not_stand_in_for_its_response():
+    """Three blocks after the switching an instant is admissible; a shift at the switching explains most of what it would."""
+    model, _ = stepped(120)
+    late = Candidate((np.arange(BLOCKS) >= 123).astype(float)[:, None], {}, ("um",), float(model.record.seconds[123]))
+    grounds = RecordGrounds(model, least_gain=10.0)
+    assert grounds.is_admissible(late)
+    assert grounds.at_switching(late) == pytest.approx(float(model.record.seconds[120]) / 3600.0)
+    for at, beside in ((60, None), (60, 120)):
+        model, event = stepped(at, beside=beside)
+        assert RecordGrounds(model, least_gain=10.0).at_switching(event) is None
+
+
+def test_candidates_that_no_fit_could_save_are_not_admissible():
+    model, event = stepped(119)
+    noisy = replace(model.record, temperature_noise=np.array([0.5]))
+    grounds = RecordGrounds(replace(model, record=noisy))
+    assert not grounds.is_admissible(event)
+    assert not grounds.is_admissible(Candidate(np.zeros((BLOCKS, 1)), {"sensor": "t1"}, ("um/K",)))
+    assert grounds.is_admissible(Candidate(np.zeros((BLOCKS, 1)), {"period_min": 30.0}, ("um", "um")))
+
+
+@pytest.mark.parametrize("minutes", [30.0, 600.0, 6000.0])
+def test_a_smoothed_copy_has_the_length_of_the_record(minutes):
+    """A window longer than the record is the mean of all; at the ends it holds what there is."""
+    record = record_of(np.zeros((BLOCKS, 1)), np.zeros((BLOCKS, 1)))
+    values = np.random.default_rng(3).standard_normal(BLOCKS)
+    half = round(minutes / 5.0)
+    expected = [values[max(0, k - half) : k + half + 1].mean() for k in range(BLOCKS)]
+    np.testing.assert_allclose(_smoothed(record, values, minutes), expected, atol=1e-12)
 
 
 def test_the_noise_of_a_sensor_counts_over_the_range_of_the_used_blocks():

@@ -139,21 +139,8 @@ def score(name: str = "a", columns: np.ndarray = WAVE, *, event_s: float | None 
     return Score(name, Candidate(columns[:, None], {}, ("um",), event_s=event_s), **changes)
 
 
-def test_an_event_enters_at_a_smaller_level():
-    problem = problem_of(small())
-    assert (problem.entry_level(score()), problem.entry_level(score(event_s=5.0))) == (0.01, 0.001)
-
-
-def test_every_effect_has_to_lower_the_hold_out_error():
-    problem = problem_of(small())
-    assert problem.is_judged_by_hold_out(score()) and problem.is_judged_by_hold_out(score(event_s=5.0))
-    assert problem.is_harmless(0.99, 1.0) and not problem.is_harmless(1.0, 1.0)
-
-
-def test_a_record_asks_the_hold_out_set_nothing():
-    problem = problem_of(small())
-    state = problem.start([])
-    assert problem.ask_hold_out(state) is state
+def test_every_effect_enters_at_one_level():
+    assert problem_of(small()).entry_level(score()) == problem_of(small()).entry_level(score(event_s=5.0)) == 0.001
 
 
 def test_the_start_says_what_this_record_cannot_show():

@@ -69,14 +69,32 @@ def test_quick_responses_at_switchings_are_told():
     assert examined(record_with(kick)).p_values["switching"] == 1.0
 
 
-def test_a_drift_that_nothing_follows_counts_from_a_tenth_of_the_variance():
+def test_a_drift_that_nothing_follows_counts_from_three_times_the_noise():
+    """Beside the noise of a block, so that the error is the square root of ten times it."""
     record = record_with()
-    variance = float(np.mean(record.displacement.var(axis=0)))
-    below, above = (examined(record, hold_out_rmse=np.sqrt(share * variance)) for share in (0.099, 0.101))
+    noise = float(np.sqrt(np.mean(quiet_fit(record).sigma ** 2)))
+    below, above = (examined(record, hold_out_rmse=factor * np.sqrt(10.0) * noise) for factor in (0.99, 1.01))
     assert below.shape == ""
     assert above.shape == "a slow drift that neither temperatures nor drivers follow, largest in all channels alike"
-    assert above.rms_um == pytest.approx(np.sqrt(0.101 * variance))
-    np.testing.assert_allclose(above.variance_share, 0.101 * variance / record.displacement.var(axis=0))
+    assert above.rms_um == pytest.approx(1.01 * np.sqrt(10.0) * noise)
+    np.testing.assert_allclose(above.variance_share, above.rms_um**2 / record.displacement.var(axis=0))
+    assert not above.is_tested
+
+
+@pytest.mark.parametrize("height", [0.8, 2.0, 10.0])
+@pytest.mark.parametrize("period", [6.0, 7.2])
+def test_a_strong_rhythm_is_no_course_in_time(height, period):
+    left = examined(record_with(height * np.cos(2.0 * np.pi * BLOCK / period)))
+    assert left.shape == f"a rhythm of about {5.0 * period:.0f} min" and left.is_tested
+
+
+def test_what_a_rhythm_leaves_is_told_beside_it():
+    load = (BLOCK // 24 % 2).astype(float)
+    change = np.flatnonzero(np.diff(load)) + 1
+    kick = np.zeros(BLOCKS)
+    kick[change] = np.random.default_rng(4).choice([-6.0, 6.0], change.size)
+    left = examined(record_with(kick + 1.5 * np.cos(2.0 * np.pi * BLOCK / 6.0), load=load))
+    assert left.shape == "a rhythm of about 30 min and quick responses where a driver is switched"
 
 
 @pytest.mark.parametrize(
@@ -89,18 +107,18 @@ def test_a_drift_that_nothing_follows_counts_from_a_tenth_of_the_variance():
     ],
 )
 def test_the_channels_with_the_larger_errors_are_named(errors, words):
-    left = examine(quiet_fit(record_with(channels=3)), np.array(errors), np.random.default_rng(1))
+    left = examine(quiet_fit(record_with(channels=3)), 5.0 * np.array(errors), np.random.default_rng(1))
     assert left.shape.endswith(f"largest in {words}")
-    assert left.rms_um == pytest.approx(np.nanmean(errors))
+    assert left.rms_um == pytest.approx(5.0 * np.nanmean(errors))
 
 
 def test_a_single_channel_is_named():
-    left = examine(quiet_fit(record_with(channels=1)), np.array([1.0]), np.random.default_rng(1))
+    left = examine(quiet_fit(record_with(channels=1)), np.array([5.0]), np.random.default_rng(1))
     assert left.shape.endswith("largest in ch1")
 
 
 def test_both_remainders_are_told():
-    left = examined(record_with(0.5 * np.cos(2.0 * np.pi * BLOCK / 6.0)), hold_out_rmse=2.0)
+    left = examined(record_with(0.5 * np.cos(2.0 * np.pi * BLOCK / 6.0)), hold_out_rmse=5.0)
     assert left.shape.startswith("a rhythm of about 30 min and a slow drift")
 
 

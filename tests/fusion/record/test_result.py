@@ -44,6 +44,8 @@ def result(*, shape: str = "") -> RecordResult:
             Decision("constant", Reason.COLLINEAR),
         ),
         rounds=(first, second),
+        errors_um=(2.0, 0.5),
+        errors_without_um=(2.0,),
     )
     coefficients = np.array([[9.0, 9.0], [9.0, 9.0], [2.0, -4.0]])
     nothing = np.zeros((4, 2))
@@ -57,12 +59,19 @@ def result(*, shape: str = "") -> RecordResult:
             Prediction(nothing, coefficients, np.zeros(3), 1.0, 0.4),
         ],
         errors=np.array([[1.0, 3.0], [0.5, np.nan]]),
-        persistence_um=np.array([4.0, 6.0]),
+        plain={name: np.full((4, 2), [4.0, 6.0]) for name in ("last_value", "mean", "ridge")},
+        cross_um=[0.6, 1.8],
         whole=SimpleNamespace(sigma=np.array([0.1, 0.3])),
         remainder=RecordRemainder(0.5, {"rhythm": 0.5}, shape, 0.2, np.array([0.1, 0.3])),
         chained=[
             ChainedPart(
-                2.0, 3.0, ("unseen_heat_source",), np.array([4.0, 6.0]), np.array([1.0, 2.0]), np.array([0.5, np.nan])
+                2.0,
+                3.0,
+                True,
+                ("unseen_heat_source",),
+                np.array([4.0, 6.0]),
+                np.array([1.0, 2.0]),
+                np.array([0.5, np.nan]),
             )
         ],
     )
@@ -78,6 +87,10 @@ def test_the_part_of_results_json_has_its_keys_and_means_over_channels():
         "rmse_persistence_um",
         "rmse_declared_um",
         "rmse_final_um",
+        "errors",
+        "baselines",
+        "best_baseline",
+        "unnamed",
         "steps",
         "verdict",
         "unexplained",
@@ -122,7 +135,9 @@ def test_an_added_effect_is_told_with_its_size_and_its_rivals():
             "thermal_lag", Reason.NOT_PREDICTED, {"p_value": 2e-3, "before_um": 0.8, "after_um": 0.9}
         ).sentence
     }
-    assert step["confirmed"] == str(Confirmed.LATER_PARTS) and step["event_s"] is None
+    assert step["confirmed_by"] == str(Confirmed.LATER_PARTS) and step["event_s"] is None
+    assert (step["confirmed"], step["doubt"], step["rmse_without_um"]) == (True, "", 2.0)
+    assert (step["cross_rmse_before_um"], step["cross_rmse_after_um"]) == (1.8, 0.6)
 
 
 def test_a_contribution_is_that_of_the_terms_own_columns():
@@ -139,6 +154,7 @@ def test_parts_and_rounds_are_written():
         {
             "first_h": 2.0,
             "last_h": 3.0,
+            "in_training": True,
             "effects": ["unseen_heat_source"],
             "rmse_persistence_um": 5.0,
             "rmse_declared_um": 1.5,
@@ -164,8 +180,31 @@ def test_parts_and_rounds_are_written():
 )
 def test_the_verdict_follows_from_steps_and_remainder(shape, steps, word):
     of = result(shape=shape)
-    of = replace(of, state=replace(of.state, steps=of.state.steps[:steps]))
+    kept = {"steps": of.state.steps[:steps], "errors_without_um": of.state.errors_without_um[:steps]}
+    of = replace(of, state=replace(of.state, **kept))
     assert of.verdict == word
+
+
+def test_what_the_hold_out_set_does_not_bear_out_is_not_confirmed():
+    of = result()
+    of = replace(of, state=replace(of.state, errors_without_um=(0.505,)))
+    assert of.doubts == ["the error on the hold-out set is 0.505 µm without it and 0.5 µm with it"]
+    assert of.verdict == "unexplained" and not of.as_json()["steps"][0]["confirmed"]
+
+
+def test_a_model_that_the_last_value_beats_has_no_skill():
+    of = replace(result(), errors=np.array([[1.0, 3.0], [9.0, 9.0]]))
+    assert (of.skill, of.verdict) == (False, "no_skill")
+
+
+def test_a_significant_effect_without_a_name_keeps_the_verdict_from_being_complete():
+    of = result()
+    lag = score("thermal_lag", excess=9.0, family_wise_p=9e-35)
+    state = replace(of.state, steps=(), errors_without_um=(), rounds=(Round((lag,)),)).decide(
+        Decision("thermal_lag", Reason.UNLOGGED_HEAT)
+    )
+    of = replace(of, state=state)
+    assert of.verdict == "unexplained" and of.as_json()["unnamed"] == {"thermal_lag": 9e-35}
 
 
 def test_the_nearest_effect_is_the_strongest_of_the_last_round():

@@ -15,6 +15,7 @@ from fusion.products.results import (
     Quantity,
     SourcePart,
 )
+from fusion.products.results_loop import Baselines, ErrorInterval, ModelErrors, StepPart
 from fusion.report import findings
 
 ISO = Iso230Part(window="cycles 1..5", **{f"{symbol}_um": Quantity(value=9.9017, u=1.378) for symbol in "BREMA"})
@@ -65,6 +66,32 @@ def test_randomised_loads_that_are_causes_are_named() -> None:
     assert findings.randomised_causes(correlation("attributable", *loads)) == ["spindle"]
 
 
-def test_errors_are_stated_before_and_after() -> None:
-    loop = Loop.model_construct(rmse_declared_um=1.94, rmse_final_um=0.464)
-    assert findings.hold_out_errors(loop) == "1.94 -> 0.464 \u00b5m"
+def error(rmse_um: float) -> ErrorInterval:
+    return ErrorInterval(rmse_um=rmse_um, low_um=0.9 * rmse_um, high_um=1.1 * rmse_um)
+
+
+def test_errors_are_stated_before_and_after_with_their_intervals() -> None:
+    loop = Loop.model_construct(errors=ModelErrors(declared=error(1.94), final=error(0.464)))
+    assert findings.hold_out_errors(loop) == "1.94 [1.7, 2.1] -> 0.464 [0.42, 0.51] \u00b5m"
+
+
+def test_plain_predictions_are_last_value_mean_and_the_best_regression() -> None:
+    names = ("last_value", "mean", "least_squares", "ridge", "ridge_with_lags")
+    baselines = Baselines(**{name: error(1.0 + place) for place, name in enumerate(names)})
+    told = findings.baseline_errors(Loop.model_construct(baselines=baselines, best_baseline="ridge"))
+    assert told == (
+        "last value repeated 1.00, mean of the training part 2.00, ridge regression on the same 4.00 \u00b5m"
+    )
+    short = findings.baseline_errors(Loop.model_construct(baselines=baselines, best_baseline="mean"))
+    assert short == "last value repeated 1.00, mean of the training part 2.00 \u00b5m"
+
+
+def test_a_step_has_both_pairs_of_errors() -> None:
+    step = StepPart.model_construct(
+        rmse_before_um=0.6, rmse_after_um=0.7, cross_rmse_before_um=0.5, cross_rmse_after_um=0.4
+    )
+    assert findings.step_errors(step) == (
+        "held-out error 0.600 -> 0.700 \u00b5m, blocks left out 0.500 -> 0.400 \u00b5m"
+    )
+    late = step.model_copy(update={"rmse_after_um": None})
+    assert findings.step_errors(late).startswith("found after the hold-out was opened, blocks left out 0.500")

@@ -13,10 +13,46 @@ assert isinstance(LOOP, AxisLoop)
 
 def test_steps_start_with_the_declared_model() -> None:
     declared, added = model_section.steps_table(LOOP).rows
-    assert declared.cells == ["0", "declared: expansion of the axis", "", "\u2013", "\u2013", "0.600", ""]
+    assert declared.cells == [
+        "0",
+        "declared: expansion of the axis",
+        "",
+        "\u2013",
+        "\u2013",
+        "0.600",
+        "\u2013",
+        "\u2013",
+        "",
+        "",
+    ]
     assert added.marked
     assert added.cells[1:3] == ["sudden step", "time / s 1800 (at least 1700), shape flat (or linear)"]
+    assert added.cells[4:9] == ["0.600", "0.400", "0.700", "0.500", "yes"]
     assert added.cells[-1] == "dead path of the laser, 4.0 less in log-likelihood"
+
+
+def test_a_name_that_is_not_confirmed_is_told_with_both_errors() -> None:
+    doubted = LOOP.steps[0].model_copy(
+        update={"confirmed": False, "doubt": "the error is 0.4 µm without it and 0.5 µm with it"}
+    )
+    _, added = model_section.steps_table(LOOP.model_copy(update={"steps": (doubted,)})).rows
+    assert added.cells[8] == "not confirmed: the error is 0.4 µm without it and 0.5 µm with it"
+
+
+def test_errors_stand_beside_those_of_plain_predictions() -> None:
+    rows = [row.cells for row in model_section.errors_table(LOOP).rows]
+    assert rows[:3] == [
+        ["declared model", "0.600", "0.50 to 0.70"],
+        ["with the added effects", "0.400", "0.35 to 0.46"],
+        ["last value repeated", "0.900", "0.80 to 1.0"],
+    ]
+    assert len(rows) == 7
+
+
+def test_a_refused_effect_that_is_significant_has_its_p_value() -> None:
+    refused = LOOP.model_copy(update={"blocked": {"thermal_lag": "noise"}, "unnamed": {"thermal_lag": 9e-35}})
+    (reason,) = (text for name, text in model_section.refused_effects(refused) if name.startswith("not admitted"))
+    assert reason == "p < 0.001; noise"
 
 
 def test_the_model_is_told_in_numbers() -> None:

@@ -19,7 +19,12 @@ def test_the_findings_of_a_run_in_a_few_rows() -> None:
     assert rows["registration"] == "0.10 mm rms"
     assert rows["A (cycles 1 to 5)"] == "1.00 \u00b1 0.20 \u00b5m"
     assert rows["anomalies"] == "position 3, both approaches: scatter of the structure (p 0.01)"
-    assert rows["added"] == "step_event (p 0.001), held-out error 0.600 -> 0.400 \u00b5m"
+    assert (
+        rows["added"]
+        == "step_event (p 0.001), held-out error 0.600 -> 0.400 \u00b5m, blocks left out 0.700 -> 0.500 \u00b5m"
+    )
+    assert rows["held-out error"] == "0.600 [0.50, 0.70] -> 0.400 [0.35, 0.46] \u00b5m"
+    assert rows["plain predictions"].endswith("ridge regression with lagged copies 0.500 \u00b5m")
     assert rows["warning"] == "The clocks disagree."
 
 

@@ -40,7 +40,9 @@ def loop(verdict: Verdict, *effects: str, shape: str = "") -> Loop:
     """The part of a loop that sentences are made of."""
     return Loop.model_construct(
         verdict=verdict,
-        steps=tuple(StepPart.model_construct(effect=name) for name in effects),
+        steps=tuple(StepPart.model_construct(effect=name, confirmed=True) for name in effects),
+        unnamed={},
+        rmse_persistence_um=2.5,
         unexplained=Unexplained.model_construct(shape=shape, rms_um=0.2),
         rmse_declared_um=1.94,
         rmse_final_um=0.66,
@@ -61,7 +63,19 @@ def loop(verdict: Verdict, *effects: str, shape: str = "") -> Loop:
             loop("partial", "step_event", shape="a wave of 37 min"),
             "The declared model lacked an effect: sudden step. With it, something without a name is left (a wave of 37 min).",
         ),
-        (loop("unexplained"), "Something is left that no effect of the library explains (without a clear shape)."),
+        (loop("unexplained"), "Something is left that no effect of the library explains."),
+        (
+            loop("unexplained").model_copy(update={"unnamed": {"dead_path": 9e-35}}),
+            "Something is left that no effect of the library explains (dead path of the laser is significant, p < 0.001, and was not admitted).",
+        ),
+        (
+            loop("unexplained").model_copy(update={"steps": (StepPart.model_construct(effect="step_event", confirmed=False),)}),
+            "Something is left that no effect of the library explains (sudden step is not confirmed).",
+        ),
+        (
+            loop("no_skill", shape="a slow drift"),
+            "The model predicts no better than repeating the last value or the mean: these data cannot tell whether an effect is missing (a slow drift).",
+        ),
     ],
 )  # fmt: skip
 def test_every_verdict_has_its_sentence(found: Loop, sentence: str) -> None:
@@ -95,11 +109,14 @@ def test_places_and_units_are_printed() -> None:
 
 def test_errors_are_those_of_what_was_held_out() -> None:
     assert wording.verdict_numbers(loop("explained", "step_event")) == (
-        "Error on held-out cycles: 1.9 µm with the declared model, 0.66 µm after; the noise of single readings is 0.42 µm."
+        "Error on held-out cycles: 1.9 µm with the declared model, 0.66 µm after, 2.5 µm for repeating the last value; the noise of single readings is 0.42 µm."
     )
-    record = RecordLoop.model_construct(steps=(), rmse_declared_um=1.94, rmse_final_um=1.94, noise_floor_um=0.42)
+    record = RecordLoop.model_construct(
+        steps=(), rmse_declared_um=1.94, rmse_final_um=1.94, noise_floor_um=0.42, rmse_persistence_um=2.5
+    )
     assert (
-        wording.verdict_numbers(record) == "Error on the held-out part: 1.9 µm; the noise of a block mean is 0.42 µm."
+        wording.verdict_numbers(record)
+        == "Error on the held-out part: 1.9 µm, 2.5 µm for repeating the last value; the noise of a block mean is 0.42 µm."
     )
 
 
