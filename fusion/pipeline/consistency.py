@@ -1,4 +1,4 @@
-"""The checks of a run: those before the long work, and those on what was fitted."""
+"""The checks of a run: those before the long work, those of the fields, and those on what was fitted."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from fusion.consistency.coefficients import check_coefficients
 from fusion.consistency.field_series import thin_fields
 from fusion.consistency.frames import check_frames
 from fusion.consistency.logs import check_log
+from fusion.consistency.place import check_place
 from fusion.consistency.readings import check_readings
 from fusion.consistency.signs import check_signs
 from fusion.consistency.temperature import check_material
@@ -85,7 +86,7 @@ def _phase(source: Source) -> list[Check]:
 
 
 def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[Check]:
-    """Check the fields against logs and drift.
+    """Check the fields in themselves, and against logs and drift.
 
     Parameters
     ----------
@@ -99,7 +100,7 @@ def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[
     Returns
     -------
     list of Check
-        Of the clocks, and of rise and level of the camera's temperature.
+        Of the clocks, of rise and level of the camera's temperature, and of what the frames show over the series.
     """
     field = thin_fields(fields)
     interferometry, drivers = source.campaign.interferometry, source.campaign.drivers
@@ -110,6 +111,7 @@ def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[
         *check_material_clock(field, source.environment, file=environment_file, place_mm=place_mm),
         *check_load_clock(field, source.drivers, file=drivers.file if drivers is not None else "the drivers' log"),
         *check_material(field, source.environment, place_mm=place_mm),
+        *check_place(fields),
     ]
 
 
