@@ -1,4 +1,4 @@
-"""The checks of a run: those before the long work, and those on what was fitted."""
+"""The checks of a run: those before the long work, those of the fields, and those on what was fitted."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from fusion.consistency.coefficients import check_coefficients
 from fusion.consistency.field_series import field_at, thin_fields
 from fusion.consistency.frames import check_frames
 from fusion.consistency.logs import check_log
+from fusion.consistency.place import check_place
 from fusion.consistency.readings import check_readings
 from fusion.consistency.registration import check_registration
 from fusion.consistency.signs import check_signs
@@ -86,7 +87,7 @@ def _phase(source: Source) -> list[Check]:
 
 
 def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[Check]:
-    """Check the fields against logs and drift.
+    """Check the fields in themselves, and against logs and drift.
 
     Parameters
     ----------
@@ -100,7 +101,7 @@ def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[
     Returns
     -------
     list of Check
-        Of the clocks, and of rise and level of the camera's temperature.
+        Of the clocks, of rise and level of the camera's temperature, and of what the frames show over the series.
     """
     field, place_mm = thin_fields(fields), source.interferometry.material_sensor_mm
     near = field if place_mm is None else field_at(fields, place_mm)
@@ -111,10 +112,11 @@ def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[
         *check_material_clock(near, source.environment, file=environment_file),
         *check_load_clock(field, source.drivers, file=drivers.file if drivers is not None else "the drivers' log"),
         *check_material(near, source.environment, stated=place_mm is not None),
+        *check_place(fields),
     ]
 
 
-def check_place(source: Source, registration: Mapping[str, Any]) -> list[Check]:
+def check_plan(source: Source, registration: Mapping[str, Any]) -> list[Check]:
     """Check what the registration found.
 
     Parameters

@@ -16,7 +16,7 @@ from fusion.consistency.checks import Check, doubt_notices, inputs_part, refuse_
 from fusion.pipeline import attribution, drift_model, interferometry, thermal
 from fusion.pipeline import record as record_stage
 from fusion.pipeline.camera import camera_corrected
-from fusion.pipeline.consistency import check_fields, check_loop, check_place, check_source
+from fusion.pipeline.consistency import check_fields, check_loop, check_plan, check_source
 from fusion.pipeline.provenance import describe_run, hash_inputs, versions
 from fusion.products.progress import Report, silent
 from fusion.products.results import Notice, Outcome, Results, assemble
@@ -251,7 +251,7 @@ def _run_instruments(run: Run, source: Source, checks: Sequence[Check], *, sched
     accepted = run.campaign.accept.doubts
     checks = [
         *checks,
-        *check_place(source, run.parts["registration"]),
+        *check_plan(source, run.parts["registration"]),
         *check_fields(source, fields, fused),
         *check_loop(run.parts["loop"], source),
     ]

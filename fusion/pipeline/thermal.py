@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,14 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
         camera, registration, override, checkpoint=checkpoint, scheduler=scheduler, report=report
     )
     fields = fields.assign(camera.per_cycle(_bounds(source, clock["value"])))
+    fields = fields.assign_attrs(
+        frames_damaged=json.dumps(
+            [f"{Path(one['file']).name}#{one['index']}" for one in camera.part["frames_damaged"]]
+        ),
+        frames_repeated=json.dumps(
+            [f"{one.path.name}#{one.index}" for one in compress(survey.frames, survey.repeated)]
+        ),
+    )
     fields = fields.assign_coords(cycle=source.deviations["cycle"].values)
     completed = complete_fields(source, fields, override)
     fields = check(completed.dataset, FIELDS, name="the fields")
@@ -300,13 +309,17 @@ _FRAME_ATTRIBUTES = {
         "show that the table moved and did not return; the plan was registered again from there on",
         "Fasten camera and table, and check what happened at that time.",
     ),
-    "frames_shaken": ("are shaken", "Shield the camera from vibration."),
+    "frames_shaken": ("are displaced alone and were left out", "Shield the camera from vibration."),
+    "frames_obstructed": (
+        "differ from those before and after them as if something stood before the table, and were left out",
+        "Keep hands, trays and doors out of the view while a frame is taken.",
+    ),
     "frames_unplaced": (
         "do not show where the table is and were left out",
         "Keep at least three fiducials in view at every axis position.",
     ),
     "frames_unchecked": (
-        "have too little contrast to check the registration, which holds as long as neither camera nor table is touched",
+        "have too little contrast to show whether camera or table moved; a displacement would show in the next frame that has more",
         "",
     ),
 }

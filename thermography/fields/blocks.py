@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thermography._typing import Array
 from thermography.fields.cycle_fields import noise_of_differences
@@ -27,6 +29,8 @@ from thermography.registration.displacement import FiducialMonitor, Registration
 
 #: Largest number of frames of one block: the unit of work of a cluster, and what is lost when a run is interrupted.
 BLOCK_FRAMES = 512
+#: About this number of pixels, evenly spread over the table, is compared from frame to frame.
+_SAMPLED_PIXELS = 250
 #: Largest difference of the corrections within a block, K.
 _CORRECTION_STEP_K = 2e-3
 
@@ -69,6 +73,15 @@ class RegisteredSensor:
     weights: PlanWeights
     monitor: FiducialMonitor
 
+    @cached_property
+    def sampled(self) -> NDArray[np.int64]:
+        """Some hundreds of pixels, as indices into the flattened window, evenly spread over the table beside fiducials and edges."""
+        interior = self.weights.interior
+        step = max(int(np.sqrt(interior.sum() / _SAMPLED_PIXELS)), 1)
+        grid = np.zeros_like(interior)
+        grid[::step, ::step] = True
+        return np.flatnonzero(grid & interior)
+
 
 @dataclass(frozen=True)
 class BlockResult:
@@ -80,15 +93,21 @@ class BlockResult:
         Mean and variance over the frames for the pixels of the window, degC.
     cells : (y, x) ndarray, degC
         Mean temperature on the plan.
-    shift_px : (frames, 2) ndarray, px
-        Shift (column, row) of the fiducials in every frame; NaN where they have no contrast.
+    displacement_px : (frames, 4) ndarray, px
+        Displacement of the fiducials in every frame, see `thermography.registration.displacement`; NaN where they have no contrast.
+    samples : (frames, points) ndarray, degC
+        Temperature of the sampled pixels in every frame.
+    noise_K : float, K
+        Standard deviation of the noise of a pixel.
     statistics : CountStatistics or None
         Sums of the counts, if they are kept.
     """
 
     temperature: MeanTemperature
     cells: Array
-    shift_px: Array
+    displacement_px: Array
+    samples: Array
+    noise_K: float
     statistics: CountStatistics | None = None
 
 
@@ -161,7 +180,7 @@ def reduce_block(
     """
     weights = sensor.weights
     sums = Accumulator(weights.used.shape)
-    shifts, noise = [], np.nan
+    displacements, samples, noise = [], [], np.nan
     # One buffer for all chunks: allocating memory for each costs more than reading into it.
     buffer = np.empty((min(CHUNK_FRAMES, len(frames)), *weights.used.shape), np.uint16)
     with WindowReader(weights.window) as reader:
@@ -169,7 +188,8 @@ def reduce_block(
             counts = reader.read(frames[start : start + CHUNK_FRAMES], buffer)
             sums.add(counts)
             noise = noise_of_differences(counts[0], weights.interior) if start == 0 else noise
-            shifts.append(sensor.monitor.shifts(counts, noise))
+            displacements.append(sensor.monitor.displacements(counts, noise))
+            samples.append(counts.reshape(len(counts), -1)[:, sensor.sampled])
     statistics = sums.statistics()
     if len(frames) == 1:
         temperature = calibrate(buffer[0], parameters).astype(float)
@@ -181,7 +201,22 @@ def reduce_block(
         if varying.any():
             _calibrate_per_frame(mean, varying, frames, parameters, weights.window)
     cells = weights.resample(mean.mean)
-    return BlockResult(mean, cells, np.concatenate(shifts), statistics if keep_statistics else None)
+    sampled = np.concatenate(samples)
+    return BlockResult(
+        mean,
+        cells,
+        np.concatenate(displacements),
+        calibrate(sampled, parameters),
+        noise * _kelvin_per_count(sampled[0], parameters),
+        statistics if keep_statistics else None,
+    )
+
+
+def _kelvin_per_count(counts: Array, parameters: CameraParameters) -> float:
+    """Slope of the calibration at the middle of some counts, K."""
+    middle = np.uint16(np.median(counts)) if counts.size else np.uint16(0)
+    low, high = calibrate(np.array([middle, middle + np.uint16(1)]), parameters)
+    return float(high - low)
 
 
 def _calibrate_per_frame(

@@ -69,12 +69,14 @@ class StoredCycle:
     stack : (blocks, y, x) ndarray of float32, degC
         Field of every block.
     shift_px : (frames,) ndarray, px
-        Shift of every frame against its registration; NaN where unchecked.
+        Displacement of every frame against its registration; NaN where unchecked.
     groups : tuple of ParameterGroup
         Sums of counts.
     shaken : tuple of int
         Frames that were displaced alone.
-    baseline_px : (column, row), px
+    obstructed : tuple of int
+        Frames in which something stands before the table.
+    baseline_px : (column, row, growth, turn), px
         Bias of the fiducial monitor after the last frame.
     """
 
@@ -86,7 +88,8 @@ class StoredCycle:
     shift_px: Array
     groups: tuple[ParameterGroup, ...] = ()
     shaken: tuple[int, ...] = ()
-    baseline_px: tuple[float, float] = (0.0, 0.0)
+    obstructed: tuple[int, ...] = ()
+    baseline_px: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
 
 class Checkpoint:
@@ -136,6 +139,7 @@ class Checkpoint:
             "first_frame": cycle.first_frame,
             "stop_frame": cycle.stop_frame,
             "shaken": cycle.shaken,
+            "obstructed": cycle.obstructed,
             "baseline_px": cycle.baseline_px,
             "groups": [
                 {"parameters": asdict(g.parameters), "frames": g.statistics.frames, "correction_K": g.correction_K}
@@ -153,14 +157,14 @@ class Checkpoint:
         """Headers and arrays that `save_arrays` has written, in the order of the blocks."""
         return [_read(path) for path in sorted(self.folder.glob("blocks_*.sums"))]
 
-    def save_knock(self, index: int, span: int, shift_px: list[float]) -> None:
-        """Store that the table was registered again from frame `index` on: the span before, and the shift (column, row) px."""
-        knocks = self.knocks()
-        if [index, span, shift_px] not in knocks:
-            (self.folder / _KNOCKS).write_text(json.dumps([*knocks, [index, span, shift_px]]), encoding="utf-8")
+    def save_knock(self, index: int, span: int, displacement_px: list[float], by_image: bool) -> None:
+        """Store that the table was registered again from frame `index` on: the span before, the displacement, and what showed it."""
+        knocks, knock = self.knocks(), [index, span, displacement_px, by_image]
+        if knock not in knocks:
+            (self.folder / _KNOCKS).write_text(json.dumps([*knocks, knock]), encoding="utf-8")
 
     def knocks(self) -> list[list[Any]]:
-        """Knocks stored so far: frame, span before, shift (column, row) px."""
+        """Knocks stored so far: frame, span before, displacement (column, row, growth, turn) px, whether the image showed it."""
         path = self.folder / _KNOCKS
         return list(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else []
 
@@ -316,5 +320,6 @@ def _load(path: Path) -> StoredCycle:
         shift_px=arrays["shift_px"],
         groups=groups,
         shaken=tuple(header["shaken"]),
+        obstructed=tuple(header["obstructed"]),
         baseline_px=tuple(header["baseline_px"]),
     )

@@ -67,9 +67,10 @@ class FrameSeries:
         reference = self.references[index]
         return calibrate(reference.read().counts, self.override(reference))
 
-    def mean_time(self, first: int, stop: int) -> np.datetime64:
-        """Mean time of the frames `first` to ``stop - 1``."""
-        mean: np.datetime64 = self.times[first] + (self.times[first:stop] - self.times[first]).mean()
+    def mean_time(self, chosen: slice | Array) -> np.datetime64:
+        """Mean time of the frames with the indices `chosen`."""
+        times = self.times[chosen]
+        mean: np.datetime64 = times[0] + (times - times[0]).mean()
         return mean
 
 

@@ -290,7 +290,7 @@ def _assemble(
             f"no frame in which the table is found lies within a cycle: frames {times[0]} to {times[-1]}, "
             f"cycles {bounds[0, 0]} to {bounds[-1, 1]}; check the time zones and the clock offset"
         )
-    block_times = np.array([frames.mean_time(block.first, block.stop) for block in blocks])
+    block_times = np.array([frames.mean_time(slice(block.first, block.stop)) for block in blocks])
     fields = assemble_fields(
         parts,
         len(frames.bounds),

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,23 +19,14 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from thermography._typing import Array
-from thermography.fields.blocks import Block, BlockResult, RegisteredSensor, cut_blocks, reduce_block
+from thermography.fields.blocks import Block, BlockResult, cut_blocks, reduce_block
 from thermography.fields.checkpoint import Checkpoint, ParameterGroup, StoredCycle, describe_reduction
-from thermography.fields.cycle_fields import CyclePart, assemble_fields, position_covariance
+from thermography.fields.cycle_fields import CyclePart, assemble_fields
+from thermography.fields.following import Displacements, Knock, Obstructions, Registrations
 from thermography.fields.inputs import NO_CYCLE, FrameSeries, Override, ReductionError, make_frame_series
-from thermography.fields.resampling import plan_weights, plan_window
 from thermography.fields.scheduling import Pool, in_order, open_pool
 from thermography.io.flir import FrameReference
-from thermography.registration.displacement import (
-    KNOCK_PX,
-    SUSPECT_PX,
-    RegistrationSpan,
-    fiducial_shift,
-    image_shift,
-    monitor_fiducials,
-    register_after_knock,
-    shift_registration,
-)
+from thermography.registration.displacement import RegistrationSpan, zoom_and_turn
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration
 
@@ -43,8 +34,6 @@ from thermography.registration.register import Registration
 BLOCK_S = 10.0
 #: The open cycle is stored whenever it has grown by this number of frames: the most that an interrupted run has to repeat.
 STORED_FRAMES = 4096
-#: Number of frames whose mean is registered after a knock.
-_RENEWAL_FRAMES = 8
 
 
 def reduce_frames(
@@ -96,8 +85,9 @@ def reduce_frames(
         Variables of `thermography.contract.FIELDS` with dimensions (cycle, y, x) in degC and K, coordinates in mm, but for the total
         uncertainties, which `thermography.fields.total_uncertainty.evaluate_uncertainty` adds; further `temperature_rate`,
         `quality_flag`, `position_u`, and as JSON texts the attributes `frames_outside_cycles` (their fields are in the stack),
-        `knocks` (frame and shift in px), `frames_shaken` (displaced alone) and `frames_unchecked` (too little
-        contrast to locate the fiducials).
+        `knocks` (frame, shift in px, zoom, turn), `frames_shaken` (displaced alone, left out), `frames_obstructed` (something before
+        the table, left out), `frames_unchecked` (too little contrast to locate the fiducials) and `unchecked_stretches` (of such
+        frames, after which no frame shows that the registration held).
 
     Raises
     ------
@@ -161,134 +151,15 @@ def _reduce_until_knock(
     )
     with closing(in_order(pool, tasks)) as results:
         for block, result in results:
-            knock = reduction.displacement.find_knock(block, result.shift_px)
+            knock = reduction.displacement.find_knock(block, result.displacement_px)
             if knock is not None:
                 reduction.register_again(knock)
                 return block.first
+            reduction.obstructions.examine(block, result)
             reduction.gather(block, result)
             if progress is not None:
                 progress(block.stop - block.first)
     return len(frames)
-
-
-@dataclass(frozen=True)
-class _Knock:
-    """A lasting displacement from a frame on: the registration span in which it occurs, and the shift (column, row) px."""
-
-    frame: int
-    span: int
-    shift_px: Array
-
-
-class _Registrations:
-    """Registration spans in the order of time, and what is derived from each of them.
-
-    Attributes
-    ----------
-    spans : list of RegistrationSpan
-    sensors : list of RegisteredSensor
-        Weights and fiducial monitor for the reduction of blocks.
-    covariances : list of (y, x, 2, 2) ndarray, mm2
-        Of the position of every cell.
-    """
-
-    def __init__(self, spans: Sequence[RegistrationSpan], grid: PlanGrid) -> None:
-        self.grid = grid
-        self.spans: list[RegistrationSpan] = []
-        self.sensors: list[RegisteredSensor] = []
-        self.covariances: list[Array] = []
-        for index, span in enumerate(spans):
-            self.insert(index, span)
-
-    def insert(self, index: int, span: RegistrationSpan) -> None:
-        """Insert a span before the one at `index`."""
-        registration, grid = span.registration, self.grid
-        # In parallel: the weights are compiled loops over pixels, the others many small steps of the interpreter.
-        with ThreadPoolExecutor(1) as executor:
-            monitor = executor.submit(monitor_fiducials, registration, grid, plan_window(registration, grid))
-            covariance = executor.submit(position_covariance, registration, grid)
-            sensor = RegisteredSensor(plan_weights(registration, grid), monitor.result())
-        self.spans.insert(index, span)
-        self.sensors.insert(index, sensor)
-        self.covariances.insert(index, covariance.result())
-
-    def stop_frame(self, index: int) -> int | None:
-        """First frame of the span after the one at `index`; None for the last."""
-        return self.spans[index + 1].first_frame if index + 1 < len(self.spans) else None
-
-
-class _Displacement:
-    """Displacement of every frame against its registration.
-
-    Attributes
-    ----------
-    shift_px : (frames,) ndarray, px
-        Length of the shift of every frame; NaN where it is not measured.
-    shaken : set of int
-        Frames that are displaced alone.
-    baseline_px : (2,) ndarray, px
-        Bias (column, row) of the fiducial monitor against the exact shift, from temperature gradients on the table.
-    """
-
-    def __init__(self, frames: FrameSeries, registrations: _Registrations) -> None:
-        self.frames, self.registrations = frames, registrations
-        self.shift_px = np.full(len(frames), np.nan)
-        self.shaken: set[int] = set()
-        self.baseline_px = np.zeros(2)
-
-    def find_knock(self, block: Block, monitored_px: Array) -> _Knock | None:
-        """Measure the frames of a block up to the first one of a lasting displacement.
-
-        Frames for which the monitor shows a shift, (frames, 2) px, or nothing are measured exactly. A displacement that the next
-        frame shares is a knock; otherwise the frame is shaken.
-        """
-        for i, monitored in zip(range(block.first, block.stop), monitored_px, strict=True):
-            shift = monitored - self.baseline_px
-            if np.isnan(monitored).any() or np.hypot(*shift) > SUSPECT_PX:
-                exact = self._exact_shift(i, block.span)
-                if np.hypot(*exact) > KNOCK_PX:
-                    if i + 1 == len(self.frames) or _alike(self._exact_shift(i + 1, block.span), exact):
-                        return _Knock(i, block.span, exact)
-                    self.shaken.add(i)
-                elif np.isfinite(exact + monitored).all():
-                    self.baseline_px = monitored - exact
-                shift = exact
-            self.shift_px[i] = np.hypot(*shift)
-        return None
-
-    def span_after(self, knock: _Knock) -> RegistrationSpan:
-        """Register the plan again on the mean of the frames after a knock; the baseline starts anew."""
-        temperature = np.mean([self.frames.temperature(i) for i in self._frames_after(knock)], axis=0, dtype=float)
-        old, grid = self.registrations.spans[knock.span].registration, self.registrations.grid
-        if np.isfinite(fiducial_shift(temperature, old, grid)).all():
-            name = self.frames.name(knock.frame)
-            registration = register_after_knock(temperature, old, knock.shift_px, grid, frame_name=name)
-        else:
-            registration = shift_registration(old, knock.shift_px)
-        self.baseline_px = np.zeros(2)
-        return RegistrationSpan(knock.frame, registration, (float(knock.shift_px[0]), float(knock.shift_px[1])))
-
-    def _frames_after(self, knock: _Knock) -> list[int]:
-        """The first displaced frame and those of the next few, up to the next span, that share its displacement."""
-        stop = self.registrations.stop_frame(knock.span)
-        stop = min(knock.frame + _RENEWAL_FRAMES, len(self.frames), *([] if stop is None else [stop]))
-        following = range(knock.frame + 1, stop)
-        return [knock.frame, *(i for i in following if _alike(self._exact_shift(i, knock.span), knock.shift_px))]
-
-    def _exact_shift(self, i: int, span: int) -> Array:
-        """Shift of a frame, (column, row) px, by the fiducials, or where they have no contrast by the image of the table."""
-        first, registration = self.registrations.spans[span].first_frame, self.registrations.spans[span].registration
-        temperature = self.frames.temperature(i)
-        shift = fiducial_shift(temperature, registration, self.registrations.grid)
-        if np.isnan(shift).any() and i != first:
-            shift = image_shift(self.frames.temperature(first), temperature, registration, self.registrations.grid)
-        return shift
-
-
-def _alike(shift_px: Array, other_px: Array) -> bool:
-    """Whether a shift is a displacement, and the same as another one."""
-    difference = np.hypot(*(shift_px - other_px))
-    return bool(np.hypot(*shift_px) > KNOCK_PX and difference < max(KNOCK_PX, 0.3 * np.hypot(*other_px)))
 
 
 class _FrameStack:
@@ -298,13 +169,13 @@ class _FrameStack:
         self.blocks: list[Block] = []
         self.fields: list[NDArray[np.float32]] = []
 
-    def variables(self, shift_px: Array) -> dict[str, Any]:
-        """Variables along ``time``, from the shift of every frame, (frames,) px."""
-        shifts = np.array([_largest(shift_px[b.first : b.stop]) for b in self.blocks], np.float32)
+    def variables(self, size_px: Array, kept: Callable[[Block], Array]) -> dict[str, Any]:
+        """Variables along ``time``, from the displacement of every frame, (frames,) px, and the frames of each block that are used."""
+        shifts = np.array([_largest(size_px[kept(b)]) for b in self.blocks], np.float32)
         return {
             "frame_temperature": (("time", "y", "x"), np.stack(self.fields)),
             "frame_cycle": ("time", np.array([b.cycle + 1 for b in self.blocks], np.int32)),
-            "frame_count": ("time", np.array([b.stop - b.first for b in self.blocks], np.int32)),
+            "frame_count": ("time", np.array([len(kept(b)) for b in self.blocks], np.int32)),
             "frame_shift": ("time", shifts),
         }
 
@@ -370,35 +241,38 @@ class StillReduction:
 
     Attributes
     ----------
-    registrations, displacement, stack, cycles
-        Registrations including those after knocks; shift of every frame; blocks with their fields; cycles with their sums.
-    stored_blocks, stored_frames : int
-        Blocks of finished cycles, and frames, that the checkpoint holds.
+    registrations, displacement, obstructions, stack, cycles
+        Registrations including those after knocks; displacement of every frame; frames that do not show the table; blocks with their
+        fields; cycles with their sums.
+    stored_blocks, stored_frames, finished_frames : int
+        Blocks of finished cycles, frames, and frames up to the end of the last finished cycle that the checkpoint holds.
     """
 
     def __init__(
         self, frames: FrameSeries, grid: PlanGrid, spans: Sequence[RegistrationSpan], checkpoint: Checkpoint | None
     ) -> None:
         self.frames, self.grid, self.checkpoint = frames, grid, checkpoint
-        self.registrations = _Registrations(spans, grid)
-        self.displacement = _Displacement(frames, self.registrations)
+        self.registrations = Registrations(spans, grid)
+        self.displacement = Displacements(frames, self.registrations)
+        self.obstructions = Obstructions(frames, self.registrations)
         self.stack = _FrameStack()
         self.cycles = _Cycles()
         self.stored_blocks = 0
         self.stored_frames = 0
+        self.finished_frames = 0
 
     def resume(self) -> int:
         """Load what an earlier run has stored; the first frame that is not done."""
         done = 0
         if self.checkpoint is None:
             return done
-        for index, span, shift in self.checkpoint.knocks():
-            self.register_again(_Knock(index, span, np.array(shift)))
+        for index, span, displacement_px, by_image in self.checkpoint.knocks():
+            self.register_again(Knock(index, span, np.array(displacement_px), by_image))
         for cycle in self.checkpoint.load():
             if cycle.first_frame != done:
                 break
             done = self._restore(cycle)
-        self.stored_blocks = len(self.stack.blocks)
+        self.stored_blocks, self.finished_frames = len(self.stack.blocks), done
         unfinished = self.checkpoint.load_open()
         if unfinished is not None and unfinished.first_frame == done:
             done = self._restore(unfinished)
@@ -413,28 +287,46 @@ class StillReduction:
             self.stack.blocks.append(Block(first, stop, number, span, parameters))
         self.stack.fields.extend(cycle.stack)
         self.cycles.parts.append(cycle.part)
-        self.displacement.shift_px[cycle.first_frame : cycle.stop_frame] = cycle.shift_px
+        self.displacement.size_px[cycle.first_frame : cycle.stop_frame] = cycle.shift_px
         self.displacement.shaken.update(cycle.shaken)
+        self.obstructions.found.update(cycle.obstructed)
         self.displacement.baseline_px = np.array(cycle.baseline_px)
         return cycle.stop_frame
 
-    def register_again(self, knock: _Knock) -> None:
+    def register_again(self, knock: Knock) -> None:
         """Register the plan again from the frame of a knock on."""
         span = self.displacement.span_after(knock)
         if self.checkpoint is not None:
-            self.checkpoint.save_knock(knock.frame, knock.span, knock.shift_px.tolist())
+            self.checkpoint.save_knock(knock.frame, knock.span, knock.displacement_px.tolist(), knock.by_image)
         self.registrations.insert(knock.span + 1, span)
+
+    def kept(self, block: Block) -> Array:
+        """Indices of the frames of a block that show the table where it is registered."""
+        left_out = self.left_out
+        return np.array([i for i in range(block.first, block.stop) if i not in left_out], int)
+
+    @property
+    def left_out(self) -> set[int]:
+        """Frames so far that are shaken or obstructed."""
+        return self.displacement.shaken | self.obstructions.found
 
     def gather(self, block: Block, result: BlockResult) -> None:
         """Add a block to the stack and to its cycle; the first block of another cycle or registration closes the open cycle."""
+        kept = self.kept(block)
+        if not len(kept):
+            return
+        if len(kept) < block.stop - block.first:
+            chosen = [self.frames.references[i] for i in kept]
+            sensor = self.registrations.sensors[block.span]
+            result = reduce_block(chosen, block.parameters, sensor, self.checkpoint is not None)
         if not self.cycles.holds(block):
             self.close()
-        correction = float(self.frames.correction_K[block.first : block.stop].mean())
+        correction = float(self.frames.correction_K[kept].mean())
         self.stack.blocks.append(block)
         self.stack.fields.append((result.cells + correction).astype(np.float32))
         if block.cycle == NO_CYCLE:
             return
-        self.cycles.add(block, result, self.frames.times[block.first : block.stop], correction)
+        self.cycles.add(block, result, self.frames.times[kept], correction)
         if self.checkpoint is not None and block.stop - self.stored_frames >= STORED_FRAMES:
             self._store(self.checkpoint)
 
@@ -446,14 +338,14 @@ class StillReduction:
         part.finish(self.registrations.sensors[part.span].weights)
         if self.checkpoint is not None:
             self._store(self.checkpoint)
-            self.stored_blocks = len(self.stack.blocks)
+            self.stored_blocks, self.finished_frames = len(self.stack.blocks), self.stored_frames
         self.cycles.sums = []
 
     def _store(self, checkpoint: Checkpoint) -> None:
         """Store the last cycle with all blocks since the previous one."""
         blocks = self.stack.blocks[self.stored_blocks :]
-        first, stop = blocks[0].first, blocks[-1].stop
-        baseline = self.displacement.baseline_px
+        first, stop = self.finished_frames, blocks[-1].stop
+        column, row, growth, turn = self.displacement.baseline_px.tolist()
         checkpoint.save(
             StoredCycle(
                 part=self.cycles.parts[-1],
@@ -461,10 +353,11 @@ class StillReduction:
                 stop_frame=stop,
                 blocks=np.array([(b.first, b.stop, b.cycle, b.span) for b in blocks]),
                 stack=np.stack(self.stack.fields[self.stored_blocks :]),
-                shift_px=self.displacement.shift_px[first:stop],
+                shift_px=self.displacement.size_px[first:stop],
                 groups=tuple(self.cycles.sums),
                 shaken=tuple(sorted(i for i in self.displacement.shaken if first <= i < stop)),
-                baseline_px=(float(baseline[0]), float(baseline[1])),
+                obstructed=tuple(sorted(i for i in self.obstructions.found if first <= i < stop)),
+                baseline_px=(column, row, growth, turn),
             )
         )
         self.stored_frames = stop
@@ -472,24 +365,42 @@ class StillReduction:
     def dataset(self) -> xr.Dataset:
         """Finish the open cycle and assemble the fields, the frame stack and the lists of frames with remarks."""
         self.close()
-        frames, spans, shift_px = self.frames, self.registrations.spans, self.displacement.shift_px
-        times = np.array([frames.mean_time(block.first, block.stop) for block in self.stack.blocks])
+        frames, displacement = self.frames, self.displacement
+        left_out = np.isin(np.arange(len(frames)), [*self.left_out])
+        if not self.cycles.parts:
+            raise ReductionError(
+                "no frame within a cycle shows the table where it is registered; check that nothing stands before the table"
+            )
+        times = np.array([frames.mean_time(self.kept(block)) for block in self.stack.blocks])
         fields = assemble_fields(
             self.cycles.parts,
             len(frames.bounds),
             self.grid,
             self.registrations.covariances,
             [sensor.weights.coverage for sensor in self.registrations.sensors],
-            frames=self.stack.variables(shift_px),
+            frames=self.stack.variables(displacement.size_px, self.kept),
             frame_coordinates={"time": times},
         )
         remarks = {
             "frames_outside_cycles": frames.names(frames.cycles == NO_CYCLE),
-            "knocks": [
-                {"frame": frames.name(s.first_frame), "index": s.first_frame, "shift_px": list(s.shift_px)}
-                for s in spans[1:]
+            "knocks": [self._knock(span, before) for before, span in pairwise(self.registrations.spans)],
+            "frames_shaken": [frames.name(i) for i in sorted(displacement.shaken)],
+            "frames_obstructed": [frames.name(i) for i in sorted(self.obstructions.found)],
+            "frames_unchecked": frames.names(np.isnan(displacement.size_px) & ~left_out),
+            "unchecked_stretches": [
+                {"first": frames.name(s.first), "last": frames.name(s.stop - 1), "frames": s.stop - s.first}
+                for s in displacement.unchecked_stretches(left_out)
             ],
-            "frames_shaken": [frames.name(i) for i in sorted(self.displacement.shaken)],
-            "frames_unchecked": frames.names(np.isnan(shift_px)),
         }
         return fields.assign_attrs({name: json.dumps(value) for name, value in remarks.items()})
+
+    def _knock(self, span: RegistrationSpan, before: RegistrationSpan) -> dict[str, Any]:
+        """What is reported of the knock before a registration span."""
+        zoom, turn_deg = zoom_and_turn(span.displacement_px, before.registration)
+        return {
+            "frame": self.frames.name(span.first_frame),
+            "index": span.first_frame,
+            "shift_px": list(span.displacement_px[:2]),
+            "zoom": zoom,
+            "turn_deg": turn_deg,
+        }

@@ -1,10 +1,14 @@
-"""Displacement of a still table in the frames against its registration (a knock to camera or table), and registration after it.
+"""Displacement of a still table in the frames against its registration (a knock to camera or table, a zoom, a turn), and registration
+after it.
 
-The displacement is measured in three ways, from fast to robust:
+A displacement is a similarity of the image, given by four lengths in px: (column, row) by which the middle of the fiducials is shifted,
+and by how much a fiducial at their root mean square distance from the middle moves outwards (growth: zoom) and sideways (turn). Its norm
+is the root mean square displacement of the fiducials. It is measured in four ways, from fast to robust:
 
 * `FiducialMonitor`: centroids of the fiducials from linear sums of raw counts, for every frame;
-* `fiducial_shift`: fiducials located in the calibrated frame as in a registration, for frames that the monitor suspects;
-* `image_shift`: the image of the whole table, where the fiducials have no contrast.
+* `fiducial_displacement`: fiducials located near their registered places in the calibrated frame, for frames that the monitor suspects;
+* `search_displacement`: the plan registered anew anywhere in the frame;
+* `image_displacement`: the image of the whole table, where the fiducials have no contrast; a shift only.
 
 After a knock, `register_after_knock` registers the table again; without contrast of the fiducials, `shift_registration` moves the
 old registration.
@@ -12,24 +16,44 @@ old registration.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import cv2
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from skimage.registration import phase_cross_correlation
 
 from thermography._typing import Array
+from thermography.registration.discs import LocatedDisc
 from thermography.registration.plan import Fiducial, PlanGrid
-from thermography.registration.projection import Projection
+from thermography.registration.projection import Projection, parameter_jacobian
 from thermography.registration.register import Registration, RegistrationError, locate_fiducials, register
 
-#: A common shift of the fiducials by more than this is a knock, px.
+#: A displacement by more than this is a knock, px.
 KNOCK_PX = 0.5
-#: Shift on the monitor above which a frame is measured exactly, px: temperature gradients move the monitor's centroids by some tenths.
+#: Displacement on the monitor above which a frame is measured exactly, px: temperature gradients move its centroids by some tenths.
 SUSPECT_PX = 0.3
-#: Largest distance of a fiducial from its registered position in `fiducial_shift`, px.
+#: A frame whose displacement is not known, px.
+UNMEASURED = (np.nan, np.nan, np.nan, np.nan)
+#: Largest distance of a fiducial from its registered position in `fiducial_displacement`, px.
 _REACH_PX = 12.0
+#: A displacement is known if its standard uncertainty is below this, px: a fifth of what counts as a knock.
+_LARGEST_U_PX = KNOCK_PX / 5
+#: Least share of the registered fiducials that must agree on a displacement: fewer may be taken in by other spots.
+_LEAST_SHARE = 0.5
+#: Largest change of scale between two registrations of one camera: beyond it, other spots were taken for the fiducials.
+_LARGEST_ZOOM = 1.5
+#: Largest residual of a registration after a search, px rms: fiducials assigned to their neighbours' spots miss them by more.
+_LARGEST_RESIDUAL_PX = 0.5
+#: Images are searched for a displaced table at this fraction of their resolution.
+_SEARCH_STEP = 4
+#: Least share of the image in which two images must overlap to be compared.
+_LEAST_OVERLAP = 0.3
+#: Standard uncertainty of a shift by the image of the table, px.
+_IMAGE_SHIFT_U_PX = 0.1
 #: A disc shows on the monitor if its sum exceeds this many standard deviations of its noise.
 _LEAST_SIGNIFICANCE = 10
 #: Least correlation of two images for a shift between them to be accepted.
@@ -50,18 +74,18 @@ class RegistrationSpan:
         Index of the first frame.
     registration : Registration
         Of the still table in these frames.
-    shift_px : (column, row), px
-        Shift of the fiducials that made the registration necessary; zeros for the first one.
+    displacement_px : (column, row, growth, turn), px
+        Displacement that made the registration necessary; zeros for the first one.
     """
 
     first_frame: int
     registration: Registration
-    shift_px: tuple[float, float] = (0.0, 0.0)
+    displacement_px: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class FiducialMonitor:
-    """Shift of the fiducials in many frames at the cost of three weighted sums over the pixels around every disc.
+    """Displacement of the fiducials in many frames at the cost of three weighted sums over the pixels around every disc.
 
     Between the table around a disc (a plane through its ring) and the disc itself, the sum of the coverage and its first moments
     are linear in the pixels; their ratio is the centroid. Raw counts serve as well as temperatures.
@@ -74,14 +98,17 @@ class FiducialMonitor:
         For the sum and the first moments along columns and rows, patch after patch, row by row.
     noise_gain : (discs,) ndarray
         Standard deviation of a disc's sum for pixels of unit noise.
+    arms : (discs, 2) ndarray
+        Place (column, row) of every disc from the middle of all registered fiducials, over their root mean square distance.
     """
 
     places: NDArray[np.int64]
     weights: NDArray[np.float32]
     noise_gain: Array
+    arms: Array
 
-    def shifts(self, counts: NDArray[np.uint16], noise_counts: float) -> Array:
-        """Median shift of the fiducials in every frame.
+    def displacements(self, counts: NDArray[np.uint16], noise_counts: float) -> Array:
+        """Displacement of the fiducials in every frame: the shift by medians over the discs, growth and turn by their mean.
 
         Parameters
         ----------
@@ -92,12 +119,11 @@ class FiducialMonitor:
 
         Returns
         -------
-        (time, 2) ndarray, px
-            (column, row); NaN where fewer than three discs show.
+        (time, 4) ndarray, px
+            (column, row, growth, turn); NaN where fewer than three discs show.
         """
-        return _shifts(
-            _disc_sums(counts, self.places, self.weights), _LEAST_SIGNIFICANCE * noise_counts * self.noise_gain
-        )
+        least = _LEAST_SIGNIFICANCE * noise_counts * self.noise_gain
+        return _displacements(_disc_sums(counts, self.places, self.weights), least, self.arms)
 
 
 def monitor_fiducials(registration: Registration, grid: PlanGrid, window: tuple[slice, slice]) -> FiducialMonitor:
@@ -115,7 +141,8 @@ def monitor_fiducials(registration: Registration, grid: PlanGrid, window: tuple[
     -------
     FiducialMonitor
     """
-    places, weights, gains, start = [], [np.empty((3, 0), np.float32)], [], 0
+    places, weights, gains, arms, start = [], [np.empty((3, 0), np.float32)], [], [], 0
+    middle, radius = _middle(registration)
     origin = np.array([window[1].start, window[0].start])
     shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
     for name, disc in registration.fiducials.items():
@@ -130,8 +157,14 @@ def monitor_fiducials(registration: Registration, grid: PlanGrid, window: tuple[
         places.append((top, left, *patch.shape[1:], start))
         weights.append(patch.reshape(3, -1).astype(np.float32))
         gains.append(float(np.linalg.norm(patch[0])))
+        arms.append((centre + origin - middle) / radius)
         start += patch[0].size
-    return FiducialMonitor(np.array(places, np.int64).reshape(-1, 5), np.concatenate(weights, axis=1), np.array(gains))
+    return FiducialMonitor(
+        np.array(places, np.int64).reshape(-1, 5),
+        np.concatenate(weights, axis=1),
+        np.array(gains),
+        np.array(arms).reshape(-1, 2),
+    )
 
 
 def _disc_weights(
@@ -196,50 +229,178 @@ def _dot(a: Array, b: Array) -> np.float32:
 
 
 @numba.njit(cache=True, nogil=True)
-def _shifts(sums: Array, least: Array) -> Array:
-    """Median over the discs whose sum exceeds `least`, (frames, 2) px; NaN where those are fewer than three."""
-    shifts = np.full((len(sums), 2), np.nan)
+def _displacements(sums: Array, least: Array, arms: Array) -> Array:
+    """Displacement by the discs whose sum exceeds `least`, (frames, 4) px; NaN where those are fewer than three."""
+    displacements = np.full((len(sums), 4), np.nan)
     for frame in range(len(sums)):
         shows = np.abs(sums[frame, :, 0]) > least
-        if shows.sum() >= 3:
-            for k in range(2):
-                shifts[frame, k] = np.median(sums[frame, shows, k + 1] / sums[frame, shows, 0])
-    return shifts
+        if shows.sum() < 3:
+            continue
+        column = sums[frame, shows, 1] / sums[frame, shows, 0]
+        row = sums[frame, shows, 2] / sums[frame, shows, 0]
+        displacements[frame, 0], displacements[frame, 1] = np.median(column), np.median(row)
+        across, down = arms[shows, 0] - arms[shows, 0].mean(), arms[shows, 1] - arms[shows, 1].mean()
+        column, row = column - displacements[frame, 0], row - displacements[frame, 1]
+        squares = (across**2 + down**2).sum()
+        displacements[frame, 2] = (across * column + down * row).sum() / squares
+        displacements[frame, 3] = (across * row - down * column).sum() / squares
+    return displacements
 
 
-def fiducial_shift(temperature: Array, registration: Registration, grid: PlanGrid) -> Array:
-    """Median shift of the fiducials of one frame, each located as in a registration.
+def _middle(registration: Registration) -> tuple[Array, float]:
+    """Middle of the located fiducials, (column, row) px, and their root mean square distance from it, px."""
+    places = np.array([(disc.column_px, disc.row_px) for disc in registration.located.values()])
+    middle = places.mean(axis=0)
+    return middle, float(np.sqrt(((places - middle) ** 2).sum(axis=1).mean()))
+
+
+def _fit_displacement(places: Array, moved: Array, registration: Registration) -> Array:
+    """Displacement, (4,) px, that brings places to moved places, both (n, 2) px, by least squares."""
+    middle, radius = _middle(registration)
+    arms, shifts = ((points[:, 0] + 1j * points[:, 1]) for points in ((places - middle) / radius, moved - places))
+    (shift, stretch), *_ = np.linalg.lstsq(np.column_stack([np.ones(len(arms)), arms]), shifts, rcond=None)
+    return np.array([shift.real, shift.imag, stretch.real, stretch.imag])
+
+
+def _displaced(places: Array, displacement_px: Array, registration: Registration) -> Array:
+    """Places (n, 2) px after a displacement."""
+    middle, radius = _middle(registration)
+    column, row, growth, turn = displacement_px
+    arms = (places - middle) / radius
+    moved: Array = places + (column, row) + arms @ np.array([[growth, turn], [-turn, growth]])
+    return moved
+
+
+def zoom_and_turn(displacement_px: Sequence[float] | Array, registration: Registration) -> tuple[float, float]:
+    """Change of scale and rotation of a displacement.
+
+    Parameters
+    ----------
+    displacement_px : (4,) ndarray or sequence, px
+        (column, row, growth, turn) against `registration`.
+    registration : Registration
+        Before the displacement.
+
+    Returns
+    -------
+    zoom : float
+        Scale over that before; 1 for no change.
+    turn_deg : float, deg
+        Rotation from the columns' axis to the rows' axis (clockwise in the image).
+    """
+    stretch = 1 + complex(*displacement_px[2:]) / _middle(registration)[1]
+    return float(abs(stretch)), float(np.angle(stretch, deg=True))
+
+
+def fiducial_displacement(temperature: Array, registration: Registration, grid: PlanGrid) -> Array:
+    """Displacement of the fiducials of one frame, each located near its registered place.
 
     Parameters
     ----------
     temperature : (row, column) ndarray, degC
         One frame.
     registration : Registration
-        Against which the shift is measured.
+        Against which the displacement is measured.
     grid : PlanGrid
         The plan.
 
     Returns
     -------
-    (2,) ndarray, px
-        (column, row); NaN where fewer than three fiducials are located within 12 px.
+    (4,) ndarray, px
+        (column, row, growth, turn); NaN where fewer than half of the registered fiducials (or three) are located within 12 px and
+        agree, or where they are so faint that the displacement is uncertain by more than 0.1 px.
+
+    Notes
+    -----
+    Least median of squares (P. J. Rousseeuw, J. Am. Stat. Assoc. 79 (1984) 871-880) finds the fiducials that agree, so that some that
+    are covered, or taken for other spots, have no influence.
     """
     listed = list(registration.fiducials.values())
     located, _ = locate_fiducials(temperature, listed, registration.projection, grid=grid, reach_px=_REACH_PX)
-    if len(located) < 3:
-        return np.full(2, np.nan)
     before = registration.located
-    shifts = [(d.column_px - before[name].column_px, d.row_px - before[name].row_px) for name, d in located.items()]
-    return np.asarray(np.median(shifts, axis=0))
+    least = max(3, int(np.ceil(_LEAST_SHARE * len(before))))
+    if len(located) < least:
+        return np.array(UNMEASURED)
+    places = np.array([(before[name].column_px, before[name].row_px) for name in located])
+    moved = np.array([(disc.column_px, disc.row_px) for disc in located.values()])
+    _, agree = cv2.estimateAffinePartial2D(places, moved, method=cv2.LMEDS)
+    kept = np.zeros(len(places), bool) if agree is None else agree.ravel().astype(bool)
+    if kept.sum() < least or _displacement_u(compress(located.values(), kept)) > _LARGEST_U_PX:
+        return np.array(UNMEASURED)
+    return _fit_displacement(places[kept], moved[kept], registration)
 
 
-def image_shift(reference: Array, temperature: Array, registration: Registration, grid: PlanGrid) -> Array:
-    """Shift of the image of the table between two frames.
+def _displacement_u(located: Iterable[LocatedDisc]) -> float:
+    """Standard uncertainty of the norm of a displacement, px: four parameters of about the same uncertainty from n discs."""
+    u_px = np.array([disc.u_px for disc in located])
+    return float(2 * np.sqrt(np.mean(u_px**2) / len(u_px)))
+
+
+def search_displacement(reference: Array, temperature: Array, registration: Registration, grid: PlanGrid) -> Array:
+    """Displacement of the table by any distance: the plan is registered anew, near where the image as a whole has moved to.
 
     Parameters
     ----------
     reference, temperature : (row, column) ndarray, degC
-        The registered frame, and the frame whose shift is wanted.
+        A frame for which the registration holds, and the frame whose displacement is wanted.
+    registration : Registration
+        Of the reference.
+    grid : PlanGrid
+        The plan.
+
+    Returns
+    -------
+    (4,) ndarray, px
+        (column, row, growth, turn); NaN where the plan is not located, or fewer than half of its fiducials, or not as this plan.
+
+    Notes
+    -----
+    The start is the maximum of the masked normalised cross-correlation (D. Padfield, IEEE Trans. Image Process. 21 (2012) 2706-2718)
+    of the band-passed images.
+    """
+    start = np.array([*_coarse_shift(reference, temperature), 0.0, 0.0])
+    try:
+        found = register(temperature, _moved_hints(registration, start), grid=grid)
+    except RegistrationError:
+        return np.array(UNMEASURED)
+    centres = np.array([(disc.x_mm, disc.y_mm) for disc in registration.fiducials.values()])
+    before, after = registration.to_sensor(centres), found.to_sensor(centres)
+    displacement = _fit_displacement(before, after, registration)
+    pixel_mm = 1 / np.sqrt(abs(np.linalg.det(found.projection.jacobian(centres[0]))))
+    zoom, _ = zoom_and_turn(displacement, registration)
+    trusted = (
+        len(found.located) >= max(4, _LEAST_SHARE * len(registration.located))
+        and found.rms_mm < max(_LARGEST_RESIDUAL_PX * pixel_mm, 2 * registration.rms_mm)
+        and 1 / _LARGEST_ZOOM < zoom < _LARGEST_ZOOM
+        and _displacement_u(found.located.values()) <= _LARGEST_U_PX
+    )
+    return displacement if trusted else np.array(UNMEASURED)
+
+
+def _coarse_shift(reference: Array, temperature: Array) -> Array:
+    """Shift (column, row) px of the image as a whole, to some px."""
+    small = [
+        cv2.resize(_band_pass(frame), None, fx=1 / _SEARCH_STEP, fy=1 / _SEARCH_STEP, interpolation=cv2.INTER_AREA)
+        for frame in (reference, temperature)
+    ]
+    whole = np.ones(small[0].shape, bool)
+    back, *_ = phase_cross_correlation(*small, reference_mask=whole, moving_mask=whole, overlap_ratio=_LEAST_OVERLAP)
+    return -_SEARCH_STEP * np.asarray(back, float)[::-1]
+
+
+def _band_pass(frame: Array) -> NDArray[np.float32]:
+    """A frame without changes over tens of pixels: a table that has warmed at one end would be taken for one that has moved."""
+    values = np.nan_to_num(np.asarray(frame, np.float32), nan=float(np.nanmean(frame)))
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), _FINE_PX) - cv2.GaussianBlur(values, (0, 0), _COARSE_PX))
+
+
+def image_displacement(reference: Array, temperature: Array, registration: Registration, grid: PlanGrid) -> Array:
+    """Displacement of the image of the table between two frames, as a shift.
+
+    Parameters
+    ----------
+    reference, temperature : (row, column) ndarray, degC
+        The registered frame, and the frame whose displacement is wanted.
     registration : Registration
         Of the reference. Its discs are masked, because the reflections on them may change.
     grid : PlanGrid
@@ -247,8 +408,8 @@ def image_shift(reference: Array, temperature: Array, registration: Registration
 
     Returns
     -------
-    (2,) ndarray, px
-        (column, row); NaN where the images correlate by less than 0.8.
+    (4,) ndarray, px
+        (column, row, 0, 0); NaN where the images correlate by less than 0.8.
 
     Notes
     -----
@@ -256,20 +417,21 @@ def image_shift(reference: Array, temperature: Array, registration: Registration
     masked images. Phase correlation fails on smooth thermal fields: it returns no shift whatever the shift is.
     """
     mask = _table_mask(registration, grid)
-    images = []
-    for frame in (reference, temperature):
-        values = np.nan_to_num(np.asarray(frame, np.float32), nan=float(np.nanmean(frame)))
-        values -= values[mask > 0].mean()
-        # Without changes over tens of pixels: a table that has warmed at one end would be taken for one that has moved.
-        images.append(cv2.GaussianBlur(values, (0, 0), _FINE_PX) - cv2.GaussianBlur(values, (0, 0), _COARSE_PX))
-    start = np.eye(2, 3, dtype=np.float32)
+    images = [_band_pass(frame) for frame in (temperature, reference)]
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-6)
-    try:
-        correlation, warp = cv2.findTransformECC(images[0], images[1], start, cv2.MOTION_TRANSLATION, criteria, mask, 5)
-    except cv2.error:
-        # The iteration diverged: the images have nothing in common.
-        return np.full(2, np.nan)
-    return np.asarray(warp[:, 2], float) if correlation >= _LEAST_CORRELATION else np.full(2, np.nan)
+    for start in (np.zeros(2), _coarse_shift(reference, temperature)):
+        # From the displaced frame back to the reference, on whose pixels the mask is.
+        back = np.column_stack([np.eye(2), -start]).astype(np.float32)
+        try:
+            correlation, warp = cv2.findTransformECC(
+                images[0], images[1], back, cv2.MOTION_TRANSLATION, criteria, mask, 5
+            )
+        except cv2.error:
+            # The iteration diverged: from here, the images have nothing in common.
+            continue
+        if correlation >= _LEAST_CORRELATION:
+            return np.array([*-np.asarray(warp)[:, 2], 0.0, 0.0])
+    return np.array(UNMEASURED)
 
 
 def _table_mask(registration: Registration, grid: PlanGrid) -> NDArray[np.uint8]:
@@ -288,9 +450,9 @@ def _table_mask(registration: Registration, grid: PlanGrid) -> NDArray[np.uint8]
 
 
 def register_after_knock(
-    temperature: Array, old: Registration, shift_px: Array, grid: PlanGrid, *, frame_name: str
+    temperature: Array, old: Registration, displacement_px: Array, grid: PlanGrid, *, frame_name: str
 ) -> Registration:
-    """Register the table again after a knock; the old positions, moved by the shift, are the hints.
+    """Register the table again after a knock; the old positions, displaced, are the hints.
 
     Parameters
     ----------
@@ -298,8 +460,8 @@ def register_after_knock(
         First frame after the knock, or the mean of several.
     old : Registration
         Before the knock.
-    shift_px : (2,) ndarray, px
-        Shift (column, row) of the fiducials against `old`.
+    displacement_px : (4,) ndarray, px
+        Displacement (column, row, growth, turn) against `old`.
     grid : PlanGrid
         The plan.
     frame_name : str
@@ -314,17 +476,21 @@ def register_after_knock(
     RegistrationError
         The plan is not located any more.
     """
-    places = old.to_sensor(np.array([(disc.x_mm, disc.y_mm) for disc in old.masked])) + shift_px
-    hinted = [
-        replace(disc, column_px=float(c), row_px=float(r)) for disc, (c, r) in zip(old.masked, places, strict=True)
-    ]
     try:
-        return register(temperature, hinted, grid=grid, lens=old.lens)
+        return register(temperature, _moved_hints(old, displacement_px), grid=grid, lens=old.lens)
     except RegistrationError as error:
+        column, row = displacement_px[:2]
         raise RegistrationError(
-            f"{frame_name}: the fiducials moved by ({shift_px[0]:.1f}, {shift_px[1]:.1f}) px and the plan is not located again: "
+            f"{frame_name}: the fiducials moved by ({column:.1f}, {row:.1f}) px and the plan is not located again: "
             f"{error}; leave out the frames from here on, or give them a fiducial file of their own"
         ) from error
+
+
+def _moved_hints(old: Registration, displacement_px: Array) -> list[Fiducial]:
+    """The fiducials on the table, with their displaced places as pixel hints."""
+    places = old.to_sensor(np.array([(disc.x_mm, disc.y_mm) for disc in old.masked]))
+    moved = _displaced(places, displacement_px, old)
+    return [replace(disc, column_px=float(c), row_px=float(r)) for disc, (c, r) in zip(old.masked, moved, strict=True)]
 
 
 def shift_registration(registration: Registration, shift_px: Array) -> Registration:
@@ -339,7 +505,7 @@ def shift_registration(registration: Registration, shift_px: Array) -> Registrat
     Returns
     -------
     Registration
-        Its uncertainty remains that of the old one.
+        Its covariance contains the standard uncertainty of the shift, 0.1 px in either coordinate.
     """
     shift = (float(shift_px[0]), float(shift_px[1]))
     move = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]], [0.0, 0.0, 1.0]])
@@ -356,4 +522,15 @@ def shift_registration(registration: Registration, shift_px: Array) -> Registrat
         homography=np.linalg.inv(projection.plan_to_sensor),
         located=located,
         model=f"{registration.model}, shifted by the image of the table",
+        covariance=registration.covariance + _shift_covariance(registration),
     )
+
+
+def _shift_covariance(registration: Registration) -> Array:
+    """Covariance of the fitted parameters that moves all fiducials together by `_IMAGE_SHIFT_U_PX`, independently in both coordinates."""
+    centres = np.array([(disc.x_mm, disc.y_mm) for disc in registration.fiducials.values()])
+    by_parameter = parameter_jacobian(registration.projection, centres, len(registration.covariance) - 8)(centres)
+    both = np.tile(_IMAGE_SHIFT_U_PX * np.eye(2), (len(centres), 1))
+    parameters, *_ = np.linalg.lstsq(by_parameter.reshape(2 * len(centres), -1), both, rcond=None)
+    covariance: Array = parameters @ parameters.T
+    return covariance

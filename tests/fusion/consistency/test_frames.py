@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from fusion.consistency.checks import Severity
 from fusion.consistency.frames import check_frames
 from thermography.io.flir import FrameReference, index_frames
 from thermography.io.frame import CalibratedRange
@@ -64,3 +65,12 @@ def test_kelvin_stored_as_celsius_is_doubted_unless_it_is_stated(frames: list[Fr
 def test_frames_of_two_cameras_are_doubted(frames: list[FrameReference]) -> None:
     other = [replace(one, camera=replace(one.camera, serial="other")) for one in frames[3:]]
     assert failed([*frames[:3], *other], STATED) == {"camera_settings": "The file holds frames of 2 cameras."}
+
+
+def test_a_frozen_camera_contradicts_the_test(frames: list[FrameReference]) -> None:
+    held = [replace(frames[0], time=one.time) for one in frames]
+    (check,) = (check for check in check_frames(held, overridden=STATED) if not check.passed)
+    assert (check.code, check.severity) == ("frozen_camera", Severity.CONTRADICTION)
+    assert "hold the same image, count for count: the camera was frozen" in check.evidence
+    # Two frames may be alike by a copied file.
+    assert failed(held[:2], STATED) == {}

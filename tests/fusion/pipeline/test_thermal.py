@@ -14,7 +14,7 @@ from compliance_checker.runner import CheckSuite
 
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import read_source
-from fusion.pipeline.consistency import check_place
+from fusion.pipeline.consistency import check_plan
 from fusion.pipeline.thermal import clock_notices, pixel_notices, reduce_thermography
 from fusion.products.progress import silent
 from fusion.products.store import read_dataset
@@ -98,7 +98,7 @@ def test_points_picked_by_hand_and_a_calibrated_lens_serve_a_campaign(tmp_path: 
         source = read_source(load_campaign(campaign))
         outcome = reduce_thermography(source, checkpoint=tmp_path / "cycles", scheduler=None, report=silent)
         part: dict[str, Any] = outcome.parts["registration"]
-        assert [check.code for check in check_place(source, part) if not check.passed] == []
+        assert [check.code for check in check_plan(source, part) if not check.passed] == []
         return part
 
     by_discs = registered(fiducials)

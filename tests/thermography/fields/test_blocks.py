@@ -76,7 +76,7 @@ def test_a_block_is_the_mean_of_its_calibrated_frames(registration, rng, tmp_pat
     assert result.temperature.mean[hot] == pytest.approx(each.mean(axis=0)[hot], abs=2e-6)
     assert result.temperature.variance[hot] == pytest.approx(each.var(axis=0)[hot], rel=1e-6)
     np.testing.assert_allclose(result.cells, weights.resample(result.temperature.mean))
-    np.testing.assert_allclose(result.shift_px, [(0.4, 0.0)] + [(0.0, 0.0)] * 9, atol=0.08)
+    np.testing.assert_allclose(result.displacement_px[:, :2], [(0.4, 0.0)] + [(0.0, 0.0)] * 9, atol=0.08)
     assert result.statistics.frames == 10
     single = reduce_block(frames[:1], SC660, sensor)
     np.testing.assert_array_equal(single.temperature.mean, each[0])

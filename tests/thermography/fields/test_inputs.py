@@ -29,7 +29,7 @@ def test_names_times_and_temperatures_of_frames(references):
     frames = series(references, START + np.array([0, 6]) * SECOND)
     assert len(frames) == 6
     assert frames.names(np.array([False, True, False, False, False, True])) == ["a.seq#1", "a.seq#5"]
-    assert frames.mean_time(1, 5) == START + 2.5 * np.timedelta64(1000, "ms")
+    assert frames.mean_time(slice(1, 5)) == START + 2.5 * np.timedelta64(1000, "ms")
     np.testing.assert_array_equal(
         frames.temperature(3), calibrate(references[3].read().counts, references[3].parameters)
     )

@@ -98,7 +98,7 @@ def test_guard_calibrates_a_transient_frame_by_frame(scene, tmp_path):
     image, registration, _ = scene
 
     def spark(x, y):
-        return smooth_field(x, y) + 40.0 * ((np.abs(x - 250) < 20) & (np.abs(y - 90) < 20))
+        return smooth_field(x, y) + 40.0 * ((np.abs(x - 250) < 15) & (np.abs(y - 90) < 15))
 
     images = [Scene(disc_K=-4.0, field=spark).render() if i == 4 else image for i in range(10)]
     frames = record(tmp_path / "a.seq", images)

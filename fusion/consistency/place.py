@@ -1,0 +1,192 @@
+"""Checks of what the frames show over the series: the place of the camera, frames left out, and parts of the table that change abruptly."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import xarray as xr
+
+from fusion._typing import Array
+from fusion.consistency.checks import Check
+
+#: Largest share of the frames over which the registration may stay unchecked up to the end of the series or up to a knock.
+_UNCHECKED_SHARE = 0.05
+#: Largest lasting change of a moving table's place across its axis, mm: guideways err by hundredths.
+_ACROSS_MM = 0.25
+#: Fewest frames before and after such a change.
+_ACROSS_FRAMES = 5
+#: Largest share of the frames that may be left out: beyond it, most fields lie next to one that is missing.
+_LEFT_OUT_SHARE = 1 / 3
+#: Largest share of the frames that may hold the image of the frame before: single copies do little harm, a frozen camera does.
+_REPEATED_SHARE = 0.05
+#: A cell jumps if its change from one frame to the next exceeds its changes before and after by more than this, K, ...
+_JUMP_K = 0.3
+#: ... and by more than this many standard deviations of its noise.
+_JUMP_SIGMAS = 8.0
+#: Share of the cells that must jump together.
+_JUMP_SHARE = 0.02
+_LEFT_OUT = {
+    "frames_damaged": "damaged, or unlike those before and after them",
+    "frames_obstructed": "with something before the table",
+    "frames_shaken": "displaced alone",
+    "frames_unplaced": "in which the moving table is not located",
+}
+_FIGURES = "temperature fields, hotspots, and every cause that follows the field"
+
+
+def check_place(fields: xr.Dataset) -> list[Check]:
+    """Check whether the frames show the table, where it is registered, over the whole series.
+
+    Parameters
+    ----------
+    fields : Dataset
+        Fields of the table with the frame stack and the lists of frames with remarks, from the thermal stage.
+
+    Returns
+    -------
+    list of Check
+        ``camera_place``, ``frames_left_out``, ``frames_repeated``, and ``scene_change`` for a table that stands still.
+    """
+    if "frames_repeated" not in fields.attrs:
+        return []
+    left_out = {name: json.loads(fields.attrs.get(name, "[]")) for name in _LEFT_OUT}
+    total = int(fields["frame_count"].sum()) + sum(len(names) for names in left_out.values())
+    common = [_left_out(left_out, total), _repeated(fields, total)]
+    if "table_across" in fields:
+        return [_across(fields), *common]
+    return [_unchecked(fields, total), *common, _jump(fields)]
+
+
+def _unchecked(fields: xr.Dataset, total: int) -> Check:
+    """Share of frames in stretches after which no frame shows that the registration held."""
+    stretches = json.loads(fields.attrs["unchecked_stretches"])
+    knocks = json.loads(fields.attrs["knocks"])
+    share = sum(stretch["frames"] for stretch in stretches) / total
+    passed = share <= _UNCHECKED_SHARE
+    named = "; ".join(f"{one['first']} to {one['last']} ({one['frames']} frames)" for one in stretches)
+    followed = f"The registration was followed through {len(knocks)} displacements of camera or table."
+    evidence = f"Neither fiducials nor the table's outline show whether camera or table moved: {named}."
+    return Check(
+        "camera_place",
+        share,
+        _UNCHECKED_SHARE,
+        passed,
+        evidence if stretches else followed,
+        ""
+        if passed
+        else "Fasten camera and table, and use fiducials that stay visible: low emissivity, warm or cold surroundings.",
+        _FIGURES,
+    )
+
+
+def _across(fields: xr.Dataset) -> Check:
+    """Largest lasting change of the place of a moving table across its axis: the axis cannot move it so, but a knock can."""
+    across = fields["table_across"].dropna("frame_time")
+    place, times = across.values, across["frame_time"].values
+    parts = np.arange(_ACROSS_FRAMES, len(place) - _ACROSS_FRAMES + 1)
+    change, at = 0.0, 0
+    if parts.size:
+        # The division into two means that leaves the smallest squares.
+        before = np.cumsum(place)[parts - 1] / parts
+        after = (place.sum() - parts * before) / (len(place) - parts)
+        at = int(parts[np.argmax((after - before) ** 2 * parts * (len(place) - parts))])
+        change = float(np.median(place[at:]) - np.median(place[:at]))
+    passed = abs(change) <= _ACROSS_MM
+    when = "" if passed else f", from {np.datetime_as_string(times[at], unit='s')}Z on"
+    return Check(
+        "camera_place",
+        abs(change),
+        _ACROSS_MM,
+        passed,
+        f"The table in the frames is displaced across its axis by {change:+.2f} mm{when}{'' if passed else ': camera or table moved'}.",
+        "" if passed else "Fasten camera and table; give the frames before and after as two campaigns.",
+        _FIGURES,
+    )
+
+
+def _left_out(left_out: dict[str, list[str]], total: int) -> Check:
+    """Share of the frames that were left out because they do not show the table."""
+    share = sum(len(names) for names in left_out.values()) / total
+    passed = share <= _LEFT_OUT_SHARE
+    named = ", ".join(f"{len(names)} {_LEFT_OUT[name]}" for name, names in left_out.items() if names)
+    return Check(
+        "frames_left_out",
+        share,
+        _LEFT_OUT_SHARE,
+        passed,
+        f"{100 * share:.0f} % of {total} frames were left out{f': {named}' if named else ''}.",
+        ""
+        if passed
+        else "Keep the view of the table free and the camera fixed and running; record these cycles again.",
+        _FIGURES,
+    )
+
+
+def _repeated(fields: xr.Dataset, total: int) -> Check:
+    """Share of the frames that hold the image of the frame before."""
+    repeated = json.loads(fields.attrs["frames_repeated"])
+    share = len(repeated) / total
+    passed = share <= _REPEATED_SHARE
+    span = f", {repeated[0]} to {repeated[-1]}" if repeated else ""
+    return Check(
+        "frames_repeated",
+        share,
+        _REPEATED_SHARE,
+        passed,
+        f"{len(repeated)} of {total} frames hold the image of the frame before{span}{'' if passed else ': the camera was frozen'}.",
+        "" if passed else "Leave these frames out, and check that the camera ran and that no file was copied.",
+        _FIGURES,
+    )
+
+
+def _jump(fields: xr.Dataset) -> Check:
+    """Largest jump that a part of the table makes between two frames while the rest does not."""
+    excess, share = _jumps(fields)
+    times = fields["time"].values
+    at = int(np.argmax(share)) if share.size else 0
+    passed = not share.size or float(share[at]) <= _JUMP_SHARE
+    value = float(share[at]) if share.size else 0.0
+    if passed:
+        evidence = "No part of the table changes from one frame to the next by more than its changes before and after."
+    else:
+        cells = excess[at] > 0
+        y, x = (float(fields[axis].values[np.nonzero(cells)[k]].mean()) for k, axis in enumerate(("y", "x")))
+        before, after = fields["frame_temperature"].values[at + 1 : at + 3].astype(float)
+        size = float(np.median((after - before)[cells]) - np.nanmedian(after - before))
+        instants = np.datetime_as_string(times[np.flatnonzero(share > _JUMP_SHARE) + 2], unit="s")
+        strongest = instants[np.argmax(share[share > _JUMP_SHARE])]
+        evidence = (
+            f"{100 * value:.0f} % of the table around x = {x:.0f} mm, y = {y:.0f} mm jumps by {size:+.1f} K against the rest from one "
+            f"frame to the next, at {strongest}Z: a reflection, an object on the table or a blurred view, but no warming"
+            + (f" ({len(instants)} jumps in all)." if len(instants) > 1 else ".")
+        )
+    return Check(
+        "scene_change",
+        value,
+        _JUMP_SHARE,
+        passed,
+        evidence,
+        ""
+        if passed
+        else "Shield the table from sun and lamps, keep it free of objects and liquids, or leave these frames out.",
+        _FIGURES,
+    )
+
+
+def _jumps(fields: xr.Dataset) -> tuple[Array, Array]:
+    """Excess of every change over what is allowed, (changes, y, x) K, for all but the first and last one, and the share of cells above."""
+    stack = fields["frame_temperature"].values.astype(float)
+    if len(stack) < 4:
+        return np.empty((0, *stack.shape[1:])), np.empty(0)
+    seconds = np.diff(fields["time"].values) / np.timedelta64(1, "s")
+    change = np.diff(stack, axis=0)
+    change -= np.nanmedian(change, axis=(1, 2), keepdims=True)
+    rate = np.abs(change) / seconds[:, None, None]
+    # A source that is switched on bends the temperature, so that the change exceeds only the one before, or only the one after.
+    excess = np.abs(change[1:-1]) - seconds[1:-1, None, None] * np.maximum(rate[:-2], rate[2:])
+    noise_K = 1.4826 * float(np.nanmedian(np.abs(np.diff(change, axis=0)))) / np.sqrt(6.0)
+    excess -= max(_JUMP_K, _JUMP_SIGMAS * noise_K)
+    seen = np.isfinite(excess)
+    share = ((excess > 0) & seen).sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1)
+    return excess, share
