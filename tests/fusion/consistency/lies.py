@@ -80,14 +80,6 @@ def axis_the_other_way_round(folder: Path) -> None:
     path.write_text(text.replace("direction = [-1, 0]", "direction = [1, 0]"), encoding="utf-8")
 
 
-def aluminium(folder: Path) -> None:
-    """The expansion coefficient of aluminium for a table of steel."""
-    path = folder / "campaign.toml"
-    text = path.read_text(encoding="utf-8")
-    line = next(line for line in text.splitlines() if line.startswith("expansion_coefficient"))
-    path.write_text(text.replace(line, 'expansion_coefficient = "23.8 ppm/K"'), encoding="utf-8")
-
-
 def emissivity_of_half(folder: Path) -> None:
     """An emissivity of 0.5 for a painted table."""
     path = folder / "campaign.toml"

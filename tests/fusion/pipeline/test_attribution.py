@@ -22,7 +22,6 @@ from fusion.products.store import read_dataset
 from fusion.report.attribution_section import describe_correlation
 from fusion.twin.machine.recipe import Duty
 from fusion.twin.machine.schedule import duty_levels
-from interferometry.io.readers import read_deviations
 
 
 @pytest.fixture(scope="module")
@@ -52,14 +51,14 @@ def campaign(campaign_folder: Path, tmp_path_factory: pytest.TempPathFactory) ->
 def outcome(campaign: Path, results_folder: Path) -> tuple[xr.DataTree, dict[str, object], xr.Dataset]:
     source = read_source(load_campaign(campaign / "campaign.toml"))
     fields = read_dataset(results_folder / "fields.nc")
-    fused, _ = align_recordings(source, fields, read_deviations(campaign / "laser.csv"))
+    fused, _ = align_recordings(source, fields, read_dataset(results_folder / "deviations.nc"))
     found = correlate_field(source, fields, fused, report=silent)
     return found.dataset, dict(found.parts), fused
 
 
 def test_the_part_of_the_results_keeps_the_schema(outcome) -> None:
     _, parts, _ = outcome
-    document = {"schema": 1, "campaign": "x", "warnings": [], **json.loads(json.dumps(parts))}
+    document = {"schema": 2, "campaign": "x", "warnings": [], **json.loads(json.dumps(parts))}
     jsonschema.Draft202012Validator(results_schema()).validate(document)
 
 

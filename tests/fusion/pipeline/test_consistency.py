@@ -47,7 +47,6 @@ def test_a_contradiction_is_refused_before_a_folder_is_made(
         (lies.copied_cycle, "copied_cycles"),
         (lies.new_datum, "datum"),
         (lies.drivers_end_early, "drivers_coverage"),
-        (lies.aluminium, "expansion_coefficient"),
         (lies.emissivity_of_half, "material_rise"),
     ],
 )
