@@ -131,7 +131,7 @@ def test_a_pixel_without_a_temperature_in_one_frame_empties_nothing(scene, rng, 
     data[place : place + 2] = bytes(2)
     path.write_bytes(data)
     fields = reduce_frames(frames, registration, GRID, edges(0, per_cycle, 2 * per_cycle), block_s=block_s)
-    for name in ("temperature", "temperature_rise", "temperature_u", "count"):
+    for name in ("temperature", "temperature_rise", "temperature_noise_u", "count"):
         np.testing.assert_array_equal(np.isfinite(fields[name]), np.isfinite(whole[name]))
     difference = (fields["temperature"] - whole["temperature"]).values
     # One of 22 pixels of 50 mK takes no part, or a pixel has one frame less: a few millikelvin.
