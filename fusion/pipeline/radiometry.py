@@ -150,19 +150,25 @@ def _emissivity_region(
 def _two_parts(fields: xr.Dataset) -> dict[str, dict[str, float]]:
     """Noise, common part and total of temperature and rise, root mean squares over the cells of the last cycle."""
     parts = {}
-    last = fields.isel(cycle=int(np.flatnonzero(np.isfinite(fields["temperature"].values).any(axis=(1, 2)))[-1]))
+    last = _last_field(fields)
     for key, name in (("temperature_u", "temperature"), ("rise_u", "temperature_rise")):
         noise, total = (float(np.sqrt((last[f"{name}{end}"] ** 2).mean())) for end in ("_noise_u", "_u"))
         parts[key] = {"noise_K": noise, "common_K": float(np.sqrt(max(total**2 - noise**2, 0.0))), "total_K": total}
     return parts
 
 
+def _last_field(fields: xr.Dataset) -> xr.Dataset:
+    """The last cycle with a field."""
+    return fields.isel(cycle=int(np.flatnonzero(np.isfinite(fields["temperature"].values).any(axis=(1, 2)))[-1]))
+
+
 def _budget(
     table: ThermographyTable, fields: xr.Dataset, camera: CameraParameters, inputs: InputUncertainty
 ) -> list[dict[str, Any]]:
     """Every input that all frames share, with its contributions on the main surface at the mean of the last field."""
-    mean = float(fields["temperature"].mean(("y", "x")).dropna("cycle")[-1])
-    middle = mean - 0.5 * float(fields["temperature_rise"].mean(("y", "x")).dropna("cycle")[-1])
+    last = _last_field(fields)
+    mean = float(last["temperature"].mean())
+    middle = mean - 0.5 * float(last["temperature_rise"].mean())
     to_temperature = common_contributions(mean, camera, inputs)
     to_rise = rise_scale_contributions(middle, camera, inputs)
     entries = []

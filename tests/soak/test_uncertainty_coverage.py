@@ -37,8 +37,9 @@ from thermography.radiometry.uncertainty import (
 
 pytestmark = pytest.mark.slow
 
-#: Nominal values and standard uncertainties: large enough for the scale of the rise to outweigh the fit.
-EMISSIVITY, REFLECTED, AIR, HUMIDITY = (0.90, 0.03), (22.0, 2.0), (24.0, 2.0), (0.45, 0.1)
+#: Nominal values and standard uncertainties: large enough for the scale of the rise to outweigh the fit. The discs of bare metal need
+#: surroundings of another temperature to be seen.
+EMISSIVITY, REFLECTED, AIR, HUMIDITY = (0.90, 0.03), (16.0, 2.0), (24.0, 2.0), (0.45, 0.1)
 STATED = f"""emissivity = "{EMISSIVITY[0]} +- {EMISSIVITY[1]}"
 reflected_temperature = "{REFLECTED[0]} +- {REFLECTED[1]} degC"
 atmospheric_temperature = "{AIR[0]} +- {AIR[1]} degC"
@@ -61,7 +62,12 @@ def draw(seed: int) -> Recipe:
         "relative_humidity": float(np.clip(humidity, 0.05, 1.0)),
     }
     return Recipe().vary(
-        campaign={"seed": seed}, test={"cycles": 24, "targets": 8}, laser={"noise_um": 0.1}, camera={**CAMERA, **true}
+        campaign={"seed": seed},
+        test={"cycles": 24, "targets": 8},
+        laser={"noise_um": 0.1},
+        # Without a drift beside the expansion the fit is as good as it says, and the scale of the rise shows.
+        drift={"walk": "none"},
+        camera={**CAMERA, **true},
     )
 
 
@@ -76,8 +82,9 @@ def errors_over_u(seed: int, folder: Path) -> list[float]:
     fields = reduce_thermography(source, checkpoint=folder / "cycles", scheduler=None, report=silent).dataset
     true = truth.temperature(truth.session.frame_s, fields["x"].values, fields["y"].values, cell_mm=5.0)
     last = fields.isel(cycle=-1)
-    # One cell of the warm part: the errors of all others go with it.
-    y, x = np.unravel_index(int(np.nanargmax(last["temperature_rise"].values)), last["temperature"].shape)
+    # The cell that is truly the warmest of those that are seen: the errors of all others go with it.
+    warming = np.where(np.isfinite(last["temperature_rise"].values), true[-1] - true[0], -np.inf)
+    y, x = np.unravel_index(int(warming.argmax()), warming.shape)
     cell, at = last.isel(y=y, x=x), true[:, y, x]
     temperature = float(cell["temperature"] - at[-1]) / float(cell["temperature_u"])
     rise = float(cell["temperature_rise"]) - float(at[-1] - at[0])
@@ -140,7 +147,7 @@ def test_first_order_against_an_independent_monte_carlo(
     black = override(PARAMETERS, emissivity=1.0, object_distance_m=0.0)
     rng, errors = np.random.default_rng(5), []
     reading = temperature_from_counts(counts_from_temperature([celsius, celsius + 5.0], nominal), black)
-    for _ in range(20_000):
+    for _ in range(5_000):
         drawn = {}
         for key, high in (
             ("emissivity", 1.0), ("relative_humidity", 1.0), ("window_transmission", 1.0), ("object_distance_m", np.inf),
@@ -163,9 +170,9 @@ def test_first_order_against_an_independent_monte_carlo(
             f"\n{name}: temperature {first[0]:.4f} K, Monte Carlo / first order {half[0] / first[0]:.3f}; "
             f"rise of 5 K {first[1]:.4f} K, {half[1] / first[1]:.3f}"
         )
-    # Two sets of 20,000 draws: 0.7 % each, more in the long tail of metal.
-    assert of_temperature[0] == pytest.approx(half[0] / first[0], rel=0.03)
-    assert of_rise == pytest.approx(half[1] / first[1], rel=0.05)
+    # 5,000 draws give the half-width to 1.5 %, and to 3 % in the long tail of metal.
+    assert of_temperature[0] == pytest.approx(half[0] / first[0], rel=0.06)
+    assert of_rise == pytest.approx(half[1] / first[1], rel=0.1)
 
 
 def _truncated(rng: np.random.Generator, value: float, u: float, high: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import xarray as xr
@@ -70,14 +71,21 @@ def compare_with_monte_carlo(
     RadiometryError
         Where an input is too uncertain for a temperature to be stated.
     """
-    low, high = float(temperature.min()), float(temperature.max())
-    compared = np.linspace(low, max(high, low + 1.0), _COMPARED)
-    if not common_contributions(compared, parameters, inputs):
-        return Nonlinearity(compared, np.ones(_COMPARED), 1.0)
     start = float(np.mean(temperature - rise))
     # Without a rise there is nothing to compare; one of 1 K stands for what would be measured.
     far = start + max(float(rise.max()), 1.0) if rise.max() >= -rise.min() else start + min(float(rise.min()), -1.0)
-    return Nonlinearity(compared, *monte_carlo_ratio(compared, (start, far), parameters, inputs))
+    return _compare(float(temperature.min()), float(temperature.max()), (start, far), parameters, inputs)
+
+
+@lru_cache(maxsize=64)
+def _compare(
+    low: float, high: float, rise: tuple[float, float], parameters: CameraParameters, inputs: InputUncertainty
+) -> Nonlinearity:
+    """As `compare_with_monte_carlo`; kept, because fields and results ask for the same."""
+    compared = np.linspace(low, max(high, low + 1.0), _COMPARED)
+    if not common_contributions(compared, parameters, inputs):
+        return Nonlinearity(compared, np.ones(_COMPARED), 1.0)
+    return Nonlinearity(compared, *monte_carlo_ratio(compared, rise, parameters, inputs))
 
 
 def evaluate_uncertainty(
