@@ -143,7 +143,7 @@ def _axis_line(line: Mapping[str, Any]) -> Check:
         passed,
         "No other line on the plan, order of the targets or sign of the deviations explains the readings better."
         if passed
-        else f"The field explains the readings better {line['alternative']} than as declared (log-likelihood {line['gain']:+.0f}, limit "
+        else f"The field explains the readings better {line['alternative']} than as declared (log-likelihood {line['gain']:+.1f}, limit "
         f"{limit:g}), with an expansion of {line['expansion_ppm_per_K']:.3g} ± {line['expansion_u_ppm_per_K']:.2g} ppm/K{without}.",
         ""
         if passed
