@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import rich.table
+from rich.markup import escape
 import xarray as xr
 
 from fusion.attribution.duty_plan import DutyPlanError, Machine, plan_duty, switchings
@@ -61,7 +62,8 @@ def summary_table(results: Results) -> rich.table.Table:
     printed.add_column(no_wrap=True)
     printed.add_column(overflow="fold")
     for name, text in summary_rows(results):
-        printed.add_row(name, text)
+        # Names of keys stand in brackets, which rich would take for styles.
+        printed.add_row(escape(name), escape(text))
     return printed
 
 

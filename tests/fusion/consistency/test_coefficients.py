@@ -79,3 +79,22 @@ def test_the_coefficients_of_added_effects_are_held_against_physics_as_well() ->
     loop = {**declared(11.5, 0.2), "steps": [{"effect": "thermal_lag", "coefficients": [lag]}]}
     check = by_code(loop)["sensitivity"]
     assert not check.passed and check.evidence.startswith("thermal lag has 60 ppm/K")
+
+
+@pytest.mark.parametrize(
+    ("gain", "superfluous", "passed"),
+    [(9.0, (), True), (11.0, (), False), (5.0, ("angular_growth",), True), (7.0, ("angular_growth",), False)],
+)
+def test_a_line_that_does_away_with_a_named_cause_needs_less(
+    gain: float, superfluous: tuple[str, ...], passed: bool
+) -> None:
+    line = {
+        "alternative": "along a line that runs the other way round from x 200 mm, y 90 mm",
+        "gain": gain,
+        "expansion_ppm_per_K": 11.5,
+        "expansion_u_ppm_per_K": 0.2,
+        "superfluous": superfluous,
+    }
+    check = by_code({"axis_line": line})["axis_line"]
+    assert check.passed is passed
+    assert ("without angular growth" in check.evidence) is (bool(superfluous) and not passed)
