@@ -130,6 +130,8 @@ def evaluate_uncertainty(
     """
     inputs = inputs or InputUncertainty()
     temperature, rise = (fields[name].values.astype(float) for name in ("temperature", "temperature_rise"))
+    # A cell that the first cycle does not show has a temperature and no rise: the noise of its rise stays NaN, and so does the total.
+    rise = np.where(np.isfinite(rise), rise, 0.0)
     common, rise_common = np.full(temperature.shape, np.nan), np.full(temperature.shape, np.nan)
     scale_u = np.full(temperature.shape[1:], np.nan)
     drift_K = _drift(fields, parameters, inputs)

@@ -49,6 +49,22 @@ def test_an_uncertain_emissivity_is_its_share_of_every_rise() -> None:
     assert float(done["temperature_rise_u"][0].max()) == 0.0
 
 
+def test_a_cell_that_the_first_cycle_does_not_show_leaves_the_others_their_uncertainty() -> None:
+    whole = fields()
+    hidden = whole.copy(deep=True)
+    hidden["temperature"][0, 2, 2] = np.nan
+    for name in ("temperature_rise", "temperature_rise_noise_u"):
+        hidden[name][:, 2, 2] = np.nan
+    full, done = (evaluate_uncertainty(one, [CAMERA] * 3) for one in (whole, hidden))
+    assert np.isfinite(done["rise_scale_u"]).all()
+    np.testing.assert_allclose(done["rise_scale_u"], full["rise_scale_u"], rtol=0.01)
+    assert np.isnan(done["temperature_rise_u"][:, 2, 2]).all()
+    others = {"y": [0, 1], "x": [0, 1]}
+    np.testing.assert_allclose(
+        done["temperature_rise_u"].isel(others), full["temperature_rise_u"].isel(others), rtol=1e-3
+    )
+
+
 def test_without_uncertain_inputs_the_noise_is_left() -> None:
     done = evaluate_uncertainty(fields(), [CAMERA] * 3, NONE)
     np.testing.assert_allclose(done["temperature_u"], done["temperature_noise_u"])
