@@ -40,7 +40,7 @@ from fusion.loop.closed_loop import (
 from fusion.loop.confirmation import CandidateScorer, ask_hold_out
 from fusion.loop.decisions import FINAL, Decision, Reason
 from fusion.loop.detectability import detection_limits
-from fusion.loop.result import LoopResult, declared_coefficients, nuisance_size, report_steps, rmse
+from fusion.loop.result import AddedEffect, LoopResult, declared_coefficients, nuisance_size, report_steps, rmse
 from fusion.loop.scoring import WORTH_CONFIRMING, Families, collect_candidates, of_same_kind, refine, score_effects
 from fusion.loop.state import Confirmed, HoldOutQuestion, LoopState, Round, Score
 from fusion.loop.verdict import has_skill
@@ -114,16 +114,17 @@ def close_loop(
     progress(MOST_EFFECTS + 1, MOST_EFFECTS + 2, "second look, at all cycles")
     state = keep_right_patterns(problem, look_again(problem, state))
     left = examine_remainder(state.model, seed, set_aside)
+    steps = report_steps(state, wrong_patterns(state.model, state.added, effects))
     result = LoopResult(
         declared=list(declared),
-        declared_coefficients=declared_coefficients(state.model, len(terms)),
+        declared_coefficients=declared_coefficients(without_doubtful(state, steps), len(terms)),
         held_out=description,
         noise_floor_um=state.model.fit.sigma,
         rmse_declared_um=state.errors_um[0],
         rmse_final_um=state.errors_um[-1],
         hold_out=hold_out_intervals(problem, {"declared": terms, "final": decided}, seed),
         skill=problem.has_skill(state),
-        steps=report_steps(state, wrong_patterns(state.model, state.added, effects)),
+        steps=steps,
         unnamed=state.unnamed(SECOND_LEVEL),
         remainder=left,
         nuisance=nuisance_size(state.model),
@@ -393,6 +394,18 @@ def keep_right_patterns(problem: AxisProblem, state: AxisState) -> AxisState:
         for place, decision in zip(places, decisions, strict=True)
     ]
     return keep_right_patterns(problem, withdraw(problem, state, places, decisions))
+
+
+def without_doubtful(state: AxisState, steps: Sequence[AddedEffect]) -> ModelFit:
+    """The final model without the effects that are not confirmed: those must not move the coefficients of the declared ones.
+
+    Parameters
+    ----------
+    state : after the second look
+    steps : its steps as they are reported
+    """
+    doubtful = [place for place, step in enumerate(steps) if not step.confirmed]
+    return state.model if not doubtful else fit_model(state.model.readings, state.kept(doubtful))
 
 
 def hold_out_intervals(

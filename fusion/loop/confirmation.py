@@ -37,6 +37,10 @@ from interferometry.drift.state_space import DriftSystem
 CONFIRMATION_LEVEL = 0.1
 #: Evidence so strong that an inconclusive confirmation does not stop it: few switchings of a load leave early blocks undecided.
 STRONG_LEVEL = 0.001
+#: A confirmation with a larger p-value is not inconclusive, it speaks against the effect: half of the campaigns without it gain as much.
+#: Then the evidence must be that of five standard deviations.
+_CONTRADICTED = 0.5
+_FIVE_SIGMA = 2.9e-7
 #: Share of the cycles from which the later ones are predicted.
 _EARLY_SHARE = 0.5
 
@@ -195,7 +199,8 @@ def _judged(score: Score, gain: float, p_value: float) -> Confirmation:
     """Whether an effect passes its confirmation, or has evidence so strong that it needs none."""
     if p_value <= CONFIRMATION_LEVEL:
         return Confirmation(True, Confirmed.OTHER_TARGETS if score.is_event else Confirmed.LATER_CYCLES, gain, p_value)
-    return Confirmation(score.family_wise_p <= STRONG_LEVEL, Confirmed.BY_EVIDENCE, gain, p_value)
+    level = STRONG_LEVEL if p_value <= _CONTRADICTED else _FIVE_SIGMA
+    return Confirmation(score.family_wise_p <= level, Confirmed.BY_EVIDENCE, gain, p_value)
 
 
 def ask_hold_out(model: ModelFit, candidate: Candidate, rng: np.random.Generator) -> tuple[float, float, float]:

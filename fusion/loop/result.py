@@ -76,7 +76,7 @@ class LoopResult:
     Attributes
     ----------
     declared : names of the declared effects
-    declared_coefficients : their coefficients with unit and standard uncertainty, in the final model
+    declared_coefficients : their coefficients with unit and standard uncertainty, beside the effects that are confirmed
     held_out : which cycles were held out, in words
     noise_floor_um : standard deviation of one reading beside the final model
     rmse_declared_um, rmse_final_um : hold-out error of the declared model, and with the effects that were decided on the training part

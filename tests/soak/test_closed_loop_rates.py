@@ -61,7 +61,7 @@ def show(title: str, found: list[Outcome], missing: int) -> None:
     """Print one row of the table."""
     verdicts = {
         name: sum(one.found.verdict == name for one in found)
-        for name in ("complete", "explained", "partial", "unexplained")
+        for name in ("complete", "explained", "partial", "unexplained", "no_skill")
     }
     after = [one.after_over_floor for one in found]
     before = [one.before_over_floor for one in found]
@@ -84,7 +84,7 @@ def test_one_missing_effect_is_named(name):
     assert not asked or wilson(right, len(asked))[1] >= LIBRARY[name]
     assert wilson(sum(one.wrong > 0 for one in found), RUNS)[0] <= 0.05
     named = [one.after_over_floor for one in found if one.right]
-    # A step before the seal is known to the carried drift, and one behind it can only be sized on half of the targets.
+    # A step before the hold-out is known to the carried drift, and what is found in all cycles has no held-out error.
     assert not named or np.median(named) <= 1.05
 
 

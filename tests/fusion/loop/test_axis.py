@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -481,6 +482,14 @@ def test_right_patterns_leave_the_state_as_it_is(monkeypatch):
     monkeypatch.setattr(axis, "wrong_patterns", lambda model, terms, effects: {})
     state = state_of(problem_of(), "a")
     assert keep_right_patterns(problem_of(), state) is state
+
+
+def test_an_effect_that_is_not_confirmed_does_not_move_the_declared_coefficients():
+    problem = problem_of(WAVE)
+    state = state_of(problem, "a", "b")
+    steps = [SimpleNamespace(confirmed=True), SimpleNamespace(confirmed=False)]
+    assert [one.effect for one in axis.without_doubtful(state, steps).terms] == ["a"]
+    assert axis.without_doubtful(state, [steps[0], steps[0]]) is state.model
 
 
 def second_look(problem: AxisProblem, monkeypatch, *rounds: Round) -> LoopState[ModelFit]:

@@ -58,6 +58,10 @@ def test_priors_are_rows_in_units_of_the_noise(rng):
         (0.101, 0.01, False, Confirmed.BY_EVIDENCE),
         (0.101, 0.001, True, Confirmed.BY_EVIDENCE),
         (0.101, 0.00101, False, Confirmed.BY_EVIDENCE),
+        # Where half of the campaigns without the effect gain as much, the confirmation is not inconclusive any more.
+        (0.5, 0.0001, True, Confirmed.BY_EVIDENCE),
+        (0.501, 3e-7, False, Confirmed.BY_EVIDENCE),
+        (0.501, 2.9e-7, True, Confirmed.BY_EVIDENCE),
     ],
 )
 def test_an_effect_passes_at_a_tenth_or_by_strong_evidence(p_value, family_wise_p, passed, way):
