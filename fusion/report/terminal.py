@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import rich.table
-from rich.markup import escape
 import xarray as xr
+from rich.markup import escape
 
 from fusion.attribution.duty_plan import DutyPlanError, Machine, plan_duty, switchings
 from fusion.campaign.config import CampaignError
