@@ -40,6 +40,7 @@ CODES = (
     "fiducials_found",
     "fiducials_unchecked",
     "fiducial_hints",
+    "fiducial_diameters",
     "plan_mirrored",
     "frozen_camera",
     "camera_place",

@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from fusion.consistency.checks import Check
 
 #: Least share of the listed fiducials that must agree: of a list of this table, most are in view.
 _LEAST_FOUND = 0.5
 #: Largest share of the fiducials in use that may lie far from their hints: hints are read off a screen, and single ones go wrong.
 _LARGEST_CONTRADICTED = 0.5
+#: Ratio of imaged to listed area of the discs beyond which scale and diameters disagree: five times what noise and a sharp lens do to it,
+#: 2.5 % of the scale of the plan.
+_LARGEST_AREA_RATIO = 1.05
 _FIGURES = (
     "the place of every temperature on the plan, rises along the measured line, and every cause that follows the field"
 )
@@ -29,7 +34,8 @@ def check_registration(registration: Mapping[str, Any], *, file: str) -> list[Ch
     Returns
     -------
     list of Check
-        Of the share that agrees, of fiducials that the others do not check, of hints, and of a plan seen as in a mirror.
+        Of the share that agrees, of fiducials that the others do not check, of hints, of diameters against the scale of the places, and
+        of a plan seen as in a mirror.
     """
     used, listed = list(registration["leave_one_out_mm"]), int(registration["fiducials_listed"])
     unchecked, hints = list(registration["unchecked"]), list(registration["contradicted_hints"])
@@ -71,6 +77,7 @@ def check_registration(registration: Mapping[str, Any], *, file: str) -> list[Ch
             else f"Read column_px, row_px of {file} off a frame of this series, or remove them; check that the names belong to the places.",
             _FIGURES,
         ),
+        _diameters(registration["area_ratio"], file),
         Check(
             "plan_mirrored",
             float(mirrored),
@@ -85,3 +92,18 @@ def check_registration(registration: Mapping[str, Any], *, file: str) -> list[Ch
             "place and direction of the measured line on the plan, and every cause that follows the field",
         ),
     ]
+
+
+def _diameters(area_ratio: float | None, file: str) -> Check:
+    """Diameters of the discs against the scale of their places; points without a disc pass."""
+    ratio = 1.0 if area_ratio is None or not np.isfinite(area_ratio) else float(area_ratio)
+    agree = abs(np.log(ratio)) <= np.log(_LARGEST_AREA_RATIO)
+    return Check(
+        "fiducial_diameters",
+        ratio,
+        _LARGEST_AREA_RATIO,
+        bool(agree),
+        f"By the scale of x_mm, y_mm the discs in view have {ratio:.3f} times the area that diameter_mm of {file} says.",
+        "" if agree else f"Measure a disc and a distance between two of them, and correct {file}; focus the camera.",
+        _FIGURES,
+    )

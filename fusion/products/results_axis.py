@@ -38,6 +38,8 @@ class RegistrationPart(ResultPart):
     """Fiducials whose place the others do not check."""
     contradicted_hints: tuple[str, ...] = ()
     """Fiducials that lie far from their rough pixel positions."""
+    area_ratio: Number = None
+    """Median ratio of the imaged to the listed area of the discs; null for points."""
     mirrored: bool = False
     """Whether the plan appears as in a mirror."""
     model: str = ""

@@ -1,6 +1,6 @@
-"""Registration on rendered views of a table: error over stated uncertainty, discs that are named, and what is refused.
+"""Registration on rendered views of a table: error over stated uncertainty, discs that are named, what is refused and what is doubted.
 
-Reproduces the table of docs/measured.md. ``THERMOFUSE_RUNS`` sets the number of views per case.
+Reproduces the table of docs/measured.md: nothing may be silently wrong. ``THERMOFUSE_RUNS`` sets the number of views per case.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
+from fusion.consistency.registration import check_registration
 from tests.soak.table_views import DISCS, GRID, Table, View, draw_view, hinted
 from thermography.errors import ThermographyError
-from thermography.registration.evidence import area_ratio
 from thermography.registration.plan import Fiducial
 from thermography.registration.register import Registration, register
 
@@ -135,13 +135,15 @@ def listed_as(discs: tuple[Fiducial, ...], hints: bool = True) -> Listing:
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the table: what is painted and seen, and what is listed."""
+    """One row of the table: what is painted and seen, what is listed, and whether it is refused (None: either)."""
 
     name: str
     listing: Listing = plain
     table: Callable[[np.random.Generator], Table] = lambda rng: Table()
     view: dict = field(default_factory=dict)
     frames: int = 1
+    places_wrong: bool = False
+    refused: bool | None = False
 
 
 def fewer(count: int, **kwargs: object) -> Callable[[np.random.Generator], Table]:
@@ -192,38 +194,38 @@ CASES = (
     Case("6 more equal spots, no hints", without_hints, table=extra_spots),
     Case("3 discs half covered", table=lambda rng: Table(covered=tuple(f"F{i + 1}" for i in rng.permutation(12)[:3]))),
     Case("6 of 12 left", table=fewer(6)),
-    Case("6 of 12 left, no hints", without_hints, table=fewer(6)),
-    Case("5 of 12 left", table=fewer(5)),
-    Case("4 of 12 left", table=fewer(4)),
-    Case("3 of 12 left", table=fewer(3)),
-    Case("bare table", table=lambda rng: Table(discs=())),
+    Case("6 of 12 left, no hints", without_hints, table=fewer(6), refused=None),
+    Case("5 of 12 left", table=fewer(5), refused=None),
+    Case("4 of 12 left", table=fewer(4), refused=None),
+    Case("3 of 12 left", table=fewer(3), refused=True),
+    Case("bare table", table=lambda rng: Table(discs=()), refused=True),
     Case("lattice", listed_as(LATTICE), table=lambda rng: Table(discs=LATTICE)),
-    Case("lattice, no hints", listed_as(LATTICE, hints=False), table=lambda rng: Table(discs=LATTICE)),
+    Case("lattice, no hints", listed_as(LATTICE, hints=False), table=lambda rng: Table(discs=LATTICE), refused=True),
     Case("all hints off by 60 px", with_shifted_hints),
     Case("hints turned by 180 deg", with_turned_hints),
     Case("hints of two exchanged", with_exchanged_hints),
-    Case("1 place off by 20 mm", moved(1, 20)),
-    Case("1 place off by 3 mm", moved(1, 3)),
-    Case("1 place off by 0.9 mm", moved(1, 0.9)),
-    Case("2 places off by 3 mm", moved(2, 3)),
-    Case("3 places off by 5 mm", moved(3, 5)),
-    Case("4 places off by 5 mm", moved(4, 5)),
+    Case("1 place off by 20 mm", moved(1, 20), places_wrong=True),
+    Case("1 place off by 3 mm", moved(1, 3), places_wrong=True),
+    Case("1 place off by 0.9 mm", moved(1, 0.9), places_wrong=True),
+    Case("2 places off by 3 mm", moved(2, 3), places_wrong=True),
+    Case("3 places off by 5 mm", moved(3, 5), places_wrong=True),
+    Case("4 places off by 5 mm", moved(4, 5), places_wrong=True, refused=None),
     Case("places measured to 0.2 mm", measured(0.2)),
-    Case("diameter listed 18 mm", scaled(diameter=18 / 14)),
-    Case("diameter listed 20 mm", scaled(diameter=20 / 14)),
-    Case("diameter listed 28 mm", scaled(diameter=2.0)),
-    Case("diameter listed 11 mm", scaled(diameter=11 / 14)),
+    Case("diameter listed 18 mm", scaled(diameter=18 / 14), refused=True),
+    Case("diameter listed 20 mm", scaled(diameter=20 / 14), refused=True),
+    Case("diameter listed 28 mm", scaled(diameter=2.0), refused=True),
+    Case("diameter listed 11 mm", scaled(diameter=11 / 14), refused=True),
     Case("places 3 % too far apart", scaled(plan=1.03)),
-    Case("places in inch", scaled(plan=1 / 25.4)),
+    Case("places in inch", scaled(plan=1 / 25.4), refused=True),
     Case("list mirrored, no hints", mirrored),
-    Case("another table of 12, no hints", another_table(12, False)),
-    Case("another table of 8, no hints", another_table(8, False)),
-    Case("another table of 12, hints", another_table(12, True)),
+    Case("another table of 12, no hints", another_table(12, False), refused=True),
+    Case("another table of 8, no hints", another_table(8, False), refused=True),
+    Case("another table of 12, hints", another_table(12, True), refused=True),
     Case("k1 k2 p1 p2", view={"lens": (-0.25, 0.08, 1e-3, -1.5e-3)}),
     Case("63 deg lens", view={"focal_px": 522.0}),
     Case("320 x 240", view={"shape": (240, 320), "focal_px": 450.0, "mm_per_px": (1.7, 2.0)}),
-    Case("160 x 120", view={"shape": (120, 160), "focal_px": 225.0, "mm_per_px": (3.4, 4.0)}),
-    Case("table larger than the frame", view={"mm_per_px": (0.55, 0.6), "centre_mm": (190.0, 120.0)}),
+    Case("160 x 120", view={"shape": (120, 160), "focal_px": 225.0, "mm_per_px": (3.4, 4.0)}, refused=None),
+    Case("table larger than the frame", view={"mm_per_px": (0.55, 0.6), "centre_mm": (190.0, 120.0)}, refused=None),
     Case(
         "contrast of either sign",
         table=lambda rng: Table(contrast_K=tuple(rng.choice([-3.0, 3.0], 12).tolist())),
@@ -231,9 +233,21 @@ CASES = (
     Case("gradient 8 times", table=lambda rng: Table(gradient=8.0)),
     Case("contrasts 0.05 to 1.5 K", table=lambda rng: Table(contrast_K=tuple((-rng.uniform(0.05, 1.5, 12)).tolist()))),
     Case("4 listed", listed_as(CORNERS), table=lambda rng: Table(discs=CORNERS)),
-    Case("4 listed, 1 off by 20 mm", moved(1, 20, CORNERS), table=lambda rng: Table(discs=CORNERS)),
+    Case(
+        "4 listed, 1 off by 20 mm",
+        moved(1, 20, CORNERS),
+        table=lambda rng: Table(discs=CORNERS),
+        places_wrong=True,
+        refused=None,
+    ),
     Case("5 listed", listed_as(FIVE), table=lambda rng: Table(discs=FIVE)),
-    Case("5 listed, 1 off by 20 mm", moved(1, 20, FIVE), table=lambda rng: Table(discs=FIVE)),
+    Case(
+        "5 listed, 1 off by 20 mm",
+        moved(1, 20, FIVE),
+        table=lambda rng: Table(discs=FIVE),
+        places_wrong=True,
+        refused=None,
+    ),
 )
 
 
@@ -243,14 +257,12 @@ class Outcome:
 
     message: str = ""
     rms_mm: float = np.nan
-    largest_mm: float = np.nan
     u_mm: float = np.nan
-    model: str = ""
     wrong_discs: int = 0
-    left_out: dict[str, str] = field(default_factory=dict)
-    unchecked: tuple[str, ...] = ()
+    named: int = 0
+    planted: int = 0
+    accused: int = 0
     doubts: tuple[str, ...] = ()
-    area: float = np.nan
 
 
 def observe(case: Case, seed: int) -> Outcome:
@@ -264,20 +276,30 @@ def observe(case: Case, seed: int) -> Outcome:
         registration = register(frames, listed, grid=GRID)
     except ThermographyError as error:
         return Outcome(str(error))
-    mirror = case.listing is mirrored
     plan = view.in_view(GRID.centres_mm.reshape(-1, 2))
-    listed_plan = np.array([GRID.width_mm, 0]) + plan * (-1, 1) if mirror else plan
-    error = np.linalg.norm(registration.to_plan(view.to_sensor(plan)) - listed_plan, axis=1)
+    as_listed = np.array([GRID.width_mm, 0]) + plan * (-1, 1) if case.listing is mirrored else plan
+    error = np.linalg.norm(registration.to_plan(view.to_sensor(plan)) - as_listed, axis=1)
+    planted = _wrong_places(listed, table) if case.places_wrong else set()
+    misplaced = {name for name, reason in registration.left_out.items() if "misplaced" in reason}
     return Outcome(
         rms_mm=float(np.sqrt(np.mean(error**2))),
-        largest_mm=float(error.max()),
-        u_mm=float(np.sqrt(np.mean(registration.position_u(listed_plan) ** 2))),
-        model=registration.model,
+        u_mm=float(np.sqrt(np.mean(registration.position_u(as_listed) ** 2))),
         wrong_discs=_wrong_discs(registration, table, view),
-        left_out=registration.left_out,
-        unchecked=registration.unchecked,
-        area=area_ratio(registration.located, list(registration.fiducials.values()), registration.projection),
+        named=len(planted & set(registration.left_out)),
+        planted=len(planted),
+        accused=len(misplaced - planted - set(table.covered)),
+        doubts=_doubts(registration, listed),
     )
+
+
+def _wrong_places(listed: list[Fiducial], table: Table) -> set[str]:
+    """Discs that are listed elsewhere than they are painted."""
+    painted = {disc.name: disc for disc in table.discs}
+    return {
+        disc.name
+        for disc in listed
+        if np.hypot(disc.x_mm - painted[disc.name].x_mm, disc.y_mm - painted[disc.name].y_mm) > 0.5
+    }
 
 
 def _wrong_discs(registration: Registration, table: Table, view: View) -> int:
@@ -287,3 +309,42 @@ def _wrong_discs(registration: Registration, table: Table, view: View) -> int:
         name not in painted or np.hypot(*(painted[name] - (place.column_px, place.row_px))) > 3
         for name, place in registration.located.items()
     )
+
+
+def _doubts(registration: Registration, listed: list[Fiducial]) -> tuple[str, ...]:
+    """Codes of the checks that are not passed."""
+    part = {
+        "leave_one_out_mm": registration.leave_one_out_mm,
+        "fiducials_listed": len(listed),
+        "unchecked": registration.unchecked,
+        "contradicted_hints": registration.contradicted_hints,
+        "mirrored": registration.mirrored,
+        "area_ratio": registration.area_ratio,
+    }
+    return tuple(check.code for check in check_registration(part, file="fiducials.csv") if not check.passed)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_every_view_is_right_within_its_uncertainty_or_doubted_or_refused(case: Case) -> None:
+    outcomes = [observe(case, seed) for seed in range(RUNS)]
+    accepted = [outcome for outcome in outcomes if not outcome.message]
+    row = f"| {case.name} | {len(accepted)}/{RUNS} |"
+    if accepted:
+        rms, u = (np.array([getattr(outcome, name) for outcome in accepted]) for name in ("rms_mm", "u_mm"))
+        named, planted, accused, wrong = (
+            sum(getattr(outcome, name) for outcome in accepted)
+            for name in ("named", "planted", "accused", "wrong_discs")
+        )
+        doubts = sorted({code for outcome in accepted for code in outcome.doubts})
+        doubted = sum(bool(outcome.doubts) for outcome in accepted)
+        row += (
+            f" {np.median(rms):.3f} / {rms.max():.3f} | {np.median(u):.3f} | {np.sqrt(np.mean((rms / u) ** 2)):.2f} |"
+            f" {f'{named}/{planted}' if planted else '-'}, {accused} | {f'{doubted}: ' + ', '.join(doubts) if doubts else '-'} |"
+        )
+        assert wrong == 0
+        sure = np.array([not outcome.doubts for outcome in accepted])
+        # The plan shares one fit: its root mean square over u scatters by a third, and by more where blur biases all centroids.
+        assert (rms[sure] < 3.5 * u[sure]).all()
+        assert not sure.any() or np.sqrt(np.mean((rms[sure] / u[sure]) ** 2)) < 2
+    print(f"\n{row}")
+    assert case.refused is None or case.refused == (not accepted)

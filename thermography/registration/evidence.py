@@ -210,24 +210,21 @@ def refuse_picks(scatter_px: float, missed_mm: Mapping[str, float]) -> None:
         )
 
 
-def refuse_sizes(located: Mapping[str, LocatedDisc], fiducials: Sequence[Fiducial], projection: Projection) -> None:
+def refuse_sizes(ratio: float, fiducials: Sequence[Fiducial]) -> None:
     """Refuse a plan whose places say another scale than the diameters of its discs.
 
     Parameters
     ----------
-    located : mapping of str to LocatedDisc
-        Discs that agree, by name.
+    ratio : float
+        `area_ratio` of the discs that agree.
     fiducials : sequence of Fiducial
         Those discs.
-    projection : Projection
-        Fitted to their places.
 
     Raises
     ------
     RegistrationError
-        The median ratio of imaged to listed area is beyond 1.3 or below its inverse.
+        The ratio is beyond 1.3 or below its inverse.
     """
-    ratio = area_ratio(located, fiducials, projection)
     if abs(np.log(ratio)) > np.log(_LARGEST_AREA_RATIO):
         raise RegistrationError(_size_message(float(np.sqrt(ratio)), fiducials))
 
@@ -247,7 +244,10 @@ def area_ratio(located: Mapping[str, LocatedDisc], fiducials: Sequence[Fiducial]
     Returns
     -------
     float
+        NaN for points without a disc.
     """
+    if any(disc.is_point for disc in fiducials):
+        return np.nan
     centres = np.array([(disc.x_mm, disc.y_mm) for disc in fiducials])
     listed_mm2 = np.pi / 4 * np.array([disc.diameter_mm**2 for disc in fiducials])
     listed_px = listed_mm2 * np.abs(np.linalg.det(projection.jacobian(centres)))

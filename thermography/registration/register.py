@@ -13,6 +13,7 @@ from thermography.registration.consensus import fit_agreeing
 from thermography.registration.discs import LocatedDisc, Spot, detect_discs, locate_disc
 from thermography.registration.evidence import (
     RegistrationError,
+    area_ratio,
     contradicted_hints,
     refuse_chance,
     refuse_picks,
@@ -79,6 +80,8 @@ class Registration:
     scatter_mm, scatter_px : float, mm and px
         Standard deviation of the places along either coordinate, on the plan and on the sensor, from the residuals and their degrees
         of freedom; not below the uncertainty of the centroids.
+    area_ratio : float
+        Median ratio of the imaged to the listed area of the discs; NaN for points.
     unchecked : tuple of str
         Fiducials whose place the others predict too badly to notice if it were wrong by a disc's diameter; all of four.
     left_out : dict of str to str
@@ -105,6 +108,7 @@ class Registration:
     rms_mm: float
     scatter_mm: float
     scatter_px: float
+    area_ratio: float
     unchecked: tuple[str, ...]
     left_out: dict[str, str]
     masked: tuple[Fiducial, ...]
@@ -308,7 +312,7 @@ def _by_spots(
         coefficients=0 if lens is not None else dict(LENS_MODELS)[registration.model],
         shape=_shape(frame),
     )
-    refuse_sizes(registration.located, discs, registration.projection)
+    refuse_sizes(registration.area_ratio, discs)
     refuse_scatter(registration.scatter_mm, registration.leave_one_out_mm, discs)
     return replace(registration, left_out=registration.left_out | contradicted_hints(registration.located, discs))
 
@@ -446,6 +450,7 @@ def _registration(
         rms_mm=float(np.sqrt(np.mean(residual**2))) if freedom > 0 else float("nan"),
         scatter_mm=float(np.sqrt(factor) * np.median(observations.u_px / magnification)),
         scatter_px=float(np.sqrt(factor) * np.median(observations.u_px)),
+        area_ratio=area_ratio(located, discs, projection),
         unchecked=_unchecked(observations, projection, coefficients, discs, factor),
         left_out=left_out,
         masked=tuple(observed.get(disc.name, disc) for disc in listed),

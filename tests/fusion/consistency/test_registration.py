@@ -11,6 +11,7 @@ SOUND = {
     "unchecked": [],
     "contradicted_hints": [],
     "mirrored": False,
+    "area_ratio": 1.004,
 }
 
 
@@ -23,6 +24,7 @@ def doubts(**changed):
 
 def test_a_sound_registration_is_not_doubted():
     assert doubts() == []
+    assert doubts(area_ratio=None) == []
     assert doubts(contradicted_hints=["F1", "F2"], leave_one_out_mm={f"F{i}": 0.0 for i in range(6)}) == []
 
 
@@ -36,6 +38,7 @@ def test_a_sound_registration_is_not_doubted():
         ),
         ({"unchecked": ["F1", "F3"]}, "fiducials_unchecked", "If F1, F3 stood elsewhere than fiducials.csv says"),
         ({"contradicted_hints": list("ABCDEFG")}, "fiducial_hints", "7 of 12 fiducials lie more than 25 px"),
+        ({"area_ratio": 1.06}, "fiducial_diameters", "1.060 times the area that diameter_mm of fiducials.csv says"),
         ({"mirrored": True}, "plan_mirrored", "appears mirrored"),
     ],
 )

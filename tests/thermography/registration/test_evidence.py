@@ -7,6 +7,7 @@ from tests.thermography.plan_scene import DISCS, Scene
 from thermography.registration.discs import LocatedDisc, Spot
 from thermography.registration.evidence import (
     RegistrationError,
+    area_ratio,
     chance_of_arrangement,
     chance_of_hints,
     contradicted_hints,
@@ -100,9 +101,11 @@ def test_places_that_contradict_one_another_are_refused():
 
 
 def test_diameters_and_scale_must_agree():
-    refuse_sizes(located(ratio=1.2), DISCS, PROJECTION)
+    assert area_ratio(located(ratio=1.2), DISCS, PROJECTION) == pytest.approx(1.2, rel=0.01)
+    assert np.isnan(area_ratio({}, [Fiducial("P1", 1.0, 2.0, 0.0, 3.0, 4.0)], PROJECTION))
+    refuse_sizes(1.2, DISCS)
     with pytest.raises(RegistrationError, match=r"the discs in view measure 11\.3 mm, diameter_mm says 16 mm"):
-        refuse_sizes(located(ratio=0.5), DISCS, PROJECTION)
+        refuse_sizes(0.5, DISCS)
 
 
 def test_spots_of_another_size_at_the_hints_are_named():
