@@ -35,6 +35,7 @@ CODES = (
     "camera_clock",
     "environment_clock",
     "drivers_clock",
+    "material_course",
     "material_rise",
     "material_level",
     "fiducials_found",

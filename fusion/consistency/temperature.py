@@ -26,6 +26,8 @@ _UNKNOWN_PLACE = 0.07
 _CAMERA_DRIFT_K = 0.05
 #: Smallest change of the logged temperature that can tell a slope, K.
 _LEAST_CHANGE_K = 1.0
+#: Correlation with the log that the cell most like it has at least; below, with most of the variance, all of the table runs against it.
+_AGAINST = -0.5
 #: Differences over this time show the slope without a slow drift of the camera, s.
 _SHORT_TERM_S = 1200.0
 #: A cell is as good as the best one where the misfit is no larger by this many units of log-likelihood.
@@ -87,7 +89,7 @@ def check_material(near: FieldSeries | None, log: xr.Dataset | None, *, stated: 
     Returns
     -------
     list of Check
-        ``material_rise`` and ``material_level``; empty where nothing was logged or no field is there.
+        ``material_course``, ``material_rise`` and ``material_level``; empty where nothing was logged or no field is there.
     """
     if near is None or log is None or "material_temperature" not in log:
         return []
@@ -96,7 +98,43 @@ def check_material(near: FieldSeries | None, log: xr.Dataset | None, *, stated: 
     if inside.sum() < 2:
         return []
     logged = np.interp(near.seconds[inside], at, log["material_temperature"].values)
-    return [_rise(near, inside, logged, stated=stated), _level(near.temperature[inside], logged)]
+    return [
+        _same_course(near, inside, logged),
+        _rise(near, inside, logged, stated=stated),
+        _level(near.temperature[inside], logged),
+    ]
+
+
+def _same_course(near: FieldSeries, inside: Array, logged: Array) -> Check:
+    """A table that cools while its sensor warms was filmed in another order, at another time, or is not what the sensor measures."""
+    change = float(np.ptp(logged))
+    likeness = 1.0
+    if change >= _LEAST_CHANGE_K and float(np.ptp(near.temperature[inside], axis=0).max()) >= _LEAST_CHANGE_K:
+        likeness = max(_largest_correlation(near.lagged(lag_s)[inside], logged) for lag_s in SENSOR_LAGS_S)
+    passed = likeness >= _AGAINST
+    return Check(
+        "material_course",
+        likeness,
+        _AGAINST,
+        passed,
+        f"The logged material temperature changes by {change:.2g} K; "
+        + (
+            "the table does not run against it."
+            if passed
+            else "every part of the table that the camera shows runs against it."
+        ),
+        ""
+        if passed
+        else "Check the order and the times of the frames, the clock of the log, and whether the sensor sits on the table.",
+        _FIGURES,
+    )
+
+
+def _largest_correlation(cells: Array, logged: Array) -> float:
+    """Correlation of the log with the cell that is most like it."""
+    centred, target = cells - cells.mean(axis=0), logged - logged.mean()
+    size = np.sqrt((centred**2).sum(axis=0) * (target @ target))
+    return float((target @ centred / np.maximum(size, 1e-12)).max())
 
 
 def _rise(near: FieldSeries, inside: Array, logged: Array, *, stated: bool) -> Check:
@@ -121,8 +159,8 @@ def _rise(near: FieldSeries, inside: Array, logged: Array, *, stated: bool) -> C
         ""
         if passed
         else (
-            "Check emissivity and reflected_temperature (a rise that is too large comes from an emissivity that is too small), the "
-            "drift of the camera, and whether the sensor sits on the table (material_sensor under [interferometry])."
+            "Check emissivity, object_distance and reflected_temperature (a rise that is too large comes from an emissivity that is too "
+            "small), the drift of the camera, and whether the sensor sits on the table (material_sensor under [interferometry])."
         ),
         _FIGURES,
     )

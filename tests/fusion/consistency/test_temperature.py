@@ -35,6 +35,20 @@ def test_a_wrong_emissivity_is_doubted(factor: float) -> None:
     assert "emissivity" in found["material_rise"].remedy
 
 
+def test_pictures_in_reverse_order_run_against_the_log() -> None:
+    test = recorded()
+    reverse = test.fields.copy(deep=True)
+    reverse["frame_temperature"] = reverse["frame_temperature"].copy(data=reverse["frame_temperature"].values[::-1])
+    (course,) = (
+        check
+        for check in check_material(thin_fields(reverse), test.environment, stated=False)
+        if check.code == "material_course"
+    )
+    assert not course.passed and course.value < -0.5
+    assert "order and the times of the frames" in course.remedy
+    assert checks(stated=False)["material_course"].passed
+
+
 def test_a_reflection_changes_the_level_and_not_the_rise() -> None:
     found = checks(offset_K=-22.0)
     assert found["material_rise"].passed and not found["material_level"].passed
