@@ -9,8 +9,10 @@ from fusion.consistency.conditions import condition_of
 
 
 @pytest.mark.parametrize("code", CODES)
-def test_a_cause_needs_both_instruments(code: str) -> None:
-    assert "causes" in condition_of(code).figures
+def test_every_check_says_what_has_to_be_right_and_a_cause_needs_all_of_it(code: str) -> None:
+    condition = condition_of(code)
+    assert condition.premise != condition_of("no such check").premise
+    assert "causes" in condition.figures
 
 
 @pytest.mark.parametrize(
