@@ -53,6 +53,7 @@ _CONDITIONS = {
     "scene_change": Condition("the frames show one table throughout", _CAMERA),
     "camera_place": Condition("the camera stayed in its place", _CAMERA),
     "fiducials_found": Condition("the plan is registered right", _CAMERA),
+    "fiducial_diameters": Condition("the places of the fiducials are right", _CAMERA),
     "fiducials_unchecked": Condition("the plan is registered right", _CAMERA),
     "fiducial_hints": Condition("the plan is registered right", _CAMERA),
     "plan_mirrored": Condition("the plan is not mirrored", _CAMERA),

@@ -7,6 +7,7 @@ import numpy as np
 from fusion.diagnosis.causes import CAUSES
 from fusion.products.results_attribution import CorrelationPart
 from fusion.products.results_axis import AnomalyPart, DriftPart, Iso230Part
+from fusion.products.results_inputs import Figures
 from fusion.products.results_loop import Loop, StepPart
 from fusion.report.wording import BASELINES, join, number, p_value, place, quantity
 
@@ -64,6 +65,17 @@ def anomaly_cause(anomaly: AnomalyPart) -> str:
         An entry of ``anomalies`` in the results.
     """
     return CAUSES[anomaly.cause].words
+
+
+def anomaly_figures(anomaly: AnomalyPart) -> tuple[Figures, ...]:
+    """Return what the statement on an anomaly rests on: the laser, and the camera where the cause is a temperature.
+
+    Parameters
+    ----------
+    anomaly : AnomalyPart
+        An entry of ``anomalies`` in the results.
+    """
+    return ("positions", "field") if anomaly.cause == "local_temperature" else ("positions",)
 
 
 def attribution_headline(correlation: CorrelationPart) -> str:

@@ -19,7 +19,14 @@ from fusion.products.results_loop import AxisLoop, Loop
 from fusion.products.results_part import Quantity
 from fusion.products.results_radiometry import RadiometryPart
 from fusion.report.attribution_section import describe_correlation
-from fusion.report.findings import ISO230_TERMS, anomaly_cause, anomaly_place, iso230_values, standing_out
+from fusion.report.findings import (
+    ISO230_TERMS,
+    anomaly_cause,
+    anomaly_figures,
+    anomaly_place,
+    iso230_values,
+    standing_out,
+)
 from fusion.report.model_section import (
     DECIDED_BEFORE,
     describe_candidates,
@@ -43,6 +50,7 @@ from fusion.report.wording import (
     next_steps,
     number,
     p_value,
+    premise,
     quantity,
     untouched,
     verdict_numbers,
@@ -86,6 +94,17 @@ _SECTIONS = (
     ("correlation", "correlation", "Correlation"),
     ("loop", "loop", "Model"),
 )
+#: Section of the report -> what its figures rest on.
+_RESTS_ON: dict[str, tuple[Figures, ...]] = {
+    "registration": ("field",),
+    "fields": ("field",),
+    "drift": ("positions",),
+    "paper": ("positions",),
+    "iso230": ("positions",),
+    "anomalies": ("positions",),
+    "correlation": ("attribution",),
+    "loop": ("causes",),
+}
 #: Axis values among the key figures.
 _KEY_VALUES = ("A", "R", "B")
 _SIGNS = {"positive": "+", "negative": "−"}
@@ -118,6 +137,7 @@ def describe_campaign(
         "headline": conditional_headline(results),
         "doubts": results.inputs.doubts if results.inputs else (),
         "untouched": untouched(results.inputs),
+        "premises": {section: premise(results.inputs, *figures) for section, figures in _RESTS_ON.items()},
         "sentences": sentences,
         "numbers": _numbers(results, deviations, fields),
         "next": next_steps(results)[:6],
@@ -169,9 +189,8 @@ def _sentences(results: Results, deviations: xr.Dataset | None) -> list[str]:
     if results.loop is not None:
         sentences.append(verdict_numbers(results.loop))
     if results.anomalies is not None:
-        local = any(anomaly.cause == "local_temperature" for anomaly in results.anomalies)
-        rests_on: tuple[Figures, ...] = ("positions", "field") if local else ("positions",)
-        sentences.append(conditional(standing_out(results.anomalies), results.inputs, *rests_on))
+        rests_on = {figure for anomaly in results.anomalies for figure in anomaly_figures(anomaly)} or {"positions"}
+        sentences.append(conditional(standing_out(results.anomalies), results.inputs, *sorted(rests_on)))
     return sentences
 
 

@@ -18,10 +18,12 @@ from fusion.campaign.inputs import counted, left_out_notices
 from fusion.campaign.quantities import read_quantity
 from fusion.products.results import Results
 from fusion.products.results_axis import RegistrationPart
+from fusion.products.results_inputs import Figures
 from fusion.products.results_loop import Loop
 from fusion.products.store import write_atomically
 from fusion.report.findings import (
     anomaly_cause,
+    anomaly_figures,
     anomaly_place,
     attribution_headline,
     baseline_errors,
@@ -84,25 +86,17 @@ def summary_rows(results: Results) -> list[tuple[str, str]]:
         rows.append(("registration", _registration(results.registration)))
     if results.iso230 is not None:
         values = iso230_values(results.iso230)
-        where = condition(results.inputs, "positions")
         rows += [
-            (f"{symbol} ({results.iso230.window})", f"{values[symbol]} {where}".rstrip()) for symbol in ("A", "R", "B")
+            (f"{symbol} ({results.iso230.window})", _under(values[symbol], results, "positions"))
+            for symbol in ("A", "R", "B")
         ]
     if results.drift is not None:
-        rows.append(("scatter per position", scatter_range(results.drift)))
+        rows.append(("scatter per position", _under(scatter_range(results.drift), results, "positions")))
     if results.anomalies is not None:
-        named = [
-            f"{anomaly_place(anomaly)}: {anomaly_cause(anomaly)} (p {p_value(anomaly.p_value)})"
-            for anomaly in results.anomalies
-        ]
-        rows.append(("anomalies", "\n".join(named) or "none"))
+        rows.append(("anomalies", "\n".join(_anomaly_lines(results)) or _under("none", results, "positions")))
     if results.correlation is not None:
         causes = randomised_causes(results.correlation)
-        shown = (
-            [f"cause by randomised duty: {join(causes)} {condition(results.inputs, 'causes')}".rstrip()]
-            if causes
-            else []
-        )
+        shown = [_under(f"cause by randomised duty: {join(causes)}", results, "causes")] if causes else []
         rows.append(
             (
                 "drift and field",
@@ -112,7 +106,7 @@ def summary_rows(results: Results) -> list[tuple[str, str]]:
             )
         )
     if results.loop is not None:
-        rows += _loop_rows(results.loop, conditional_headline(results))
+        rows += _loop_rows(results, results.loop)
     return rows + [("warning", warning.message) for warning in results.warnings]
 
 
@@ -124,19 +118,38 @@ def _registration(part: RegistrationPart) -> str:
     return f"{number(part.rms_mm, 2)} mm rms"
 
 
-def _loop_rows(loop: Loop, headline: str) -> list[tuple[str, str]]:
+def _anomaly_lines(results: Results) -> list[str]:
+    return [
+        _under(
+            f"{anomaly_place(anomaly)}: {anomaly_cause(anomaly)} (p {p_value(anomaly.p_value)})",
+            results,
+            *anomaly_figures(anomaly),
+        )
+        for anomaly in results.anomalies or ()
+    ]
+
+
+def _loop_rows(results: Results, loop: Loop) -> list[tuple[str, str]]:
     rows = [("declared", ", ".join(loop.declared) or "nothing")]
     for step in loop.steps:
-        rows.append(("added", f"{step.effect} (p {p_value(step.p_value)}), {step_errors(step)}"))
+        text = f"{step.effect} (p {p_value(step.p_value)}), {step_errors(step)}"
+        rows.append(("added", _under(text, results, "causes")))
     rows += [("not confirmed", f"{step.effect}: {step.doubt}") for step in loop.steps if step.doubt]
-    rows += [("without a name", f"{name} (p {p_value(p)})") for name, p in loop.unnamed.items()]
+    rows += [
+        ("without a name", _under(f"{name} (p {p_value(p)})", results, "causes")) for name, p in loop.unnamed.items()
+    ]
     return [
         *rows,
-        ("held-out error", hold_out_errors(loop)),
-        ("plain predictions", baseline_errors(loop)),
-        ("noise floor", f"{number(loop.noise_floor_um, 3)} µm"),
-        ("verdict", f"{loop.verdict}: {headline}"),
+        ("held-out error", _under(hold_out_errors(loop), results, "causes")),
+        ("plain predictions", _under(baseline_errors(loop), results, "positions")),
+        ("noise floor", _under(f"{number(loop.noise_floor_um, 3)} µm", results, "positions")),
+        ("verdict", f"{loop.verdict}: {conditional_headline(results)}"),
     ]
+
+
+def _under(text: str, results: Results, *figures: Figures) -> str:
+    """Return a finding with the conditions under which it holds."""
+    return f"{text} {condition(results.inputs, *figures)}".rstrip()
 
 
 def iso230_tables(path: Path, cycles: str | None) -> list[rich.table.Table]:

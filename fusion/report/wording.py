@@ -275,8 +275,8 @@ def conditional(sentence: str, inputs: InputsPart | None, *figures: Figures) -> 
     *figures : Figures
         What the sentence rests on.
     """
-    premise = _premise(inputs, figures)
-    return f"Only if {premise}: {sentence[0].lower()}{sentence[1:]}" if premise else sentence
+    right = premise(inputs, *figures)
+    return f"Only if {right}: {sentence[0].lower()}{sentence[1:]}" if right else sentence
 
 
 def condition(inputs: InputsPart | None, *figures: Figures) -> str:
@@ -289,11 +289,20 @@ def condition(inputs: InputsPart | None, *figures: Figures) -> str:
     *figures : Figures
         What the number rests on.
     """
-    premise = _premise(inputs, figures)
-    return f"(only if {premise})" if premise else ""
+    right = premise(inputs, *figures)
+    return f"(only if {right})" if right else ""
 
 
-def _premise(inputs: InputsPart | None, figures: tuple[Figures, ...]) -> str:
+def premise(inputs: InputsPart | None, *figures: Figures) -> str:
+    """Return what has to be right for some figures to hold, as it follows "only if"; empty where no doubt touches them.
+
+    Parameters
+    ----------
+    inputs : InputsPart or None
+        The part ``inputs`` of the results.
+    *figures : Figures
+        What is concluded.
+    """
     premises = inputs.premises(*figures) if inputs else ()
     return join(premises) if len(premises) <= 2 else f"{len(premises)} doubted inputs are right"
 

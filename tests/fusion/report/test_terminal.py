@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fusion.campaign.config import CampaignError
+from fusion.consistency.checks import Check, inputs_part
 from fusion.products.results import Notice, assemble
 from fusion.report.terminal import describe_file, read_window, summary_rows
 from interferometry.deviations import build_deviations
@@ -26,6 +27,23 @@ def test_the_findings_of_a_run_in_a_few_rows() -> None:
     assert rows["held-out error"] == "0.600 [0.50, 0.70] -> 0.400 [0.35, 0.46] \u00b5m"
     assert rows["plain predictions"].endswith("ridge regression with lagged copies 0.500 \u00b5m")
     assert rows["warning"] == "The clocks disagree."
+
+
+def test_a_doubt_stands_beside_every_finding_that_rests_on_it() -> None:
+    checks = [Check("datum", 1.0, 0.5, False, "It is off.", "Check it.", "figures")]
+    rows = dict(summary_rows(assemble("A", {**PARTS, "inputs": inputs_part(checks, ())}, [])))
+    condition = "(only if the datum of the laser stayed the same)"
+    touched = {name for name, text in rows.items() if text.endswith(condition)}
+    iso = {f"{symbol} (cycles 1 to 5)" for symbol in "ARB"}
+    assert touched == iso | {
+        "scatter per position",
+        "anomalies",
+        "added",
+        "held-out error",
+        "plain predictions",
+        "noise floor",
+    }
+    assert condition[1:-1] in rows["verdict"].lower()
 
 
 def test_an_exact_fit_is_not_printed_as_accuracy() -> None:
