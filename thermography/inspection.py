@@ -244,7 +244,7 @@ def _warn_rejected(rejected: Sequence[RejectedFrame]) -> Iterator[FileWarning]:
 
 
 def _warn_times(references: Sequence[FrameReference]) -> Iterator[FileWarning]:
-    """Warn about missing or implausible times, and about frames of several cameras."""
+    """Warn about missing or implausible times, and about frames of several cameras or lenses."""
     without = sum(bool(np.isnat(frame.time)) for frame in references)
     if without:
         yield FileWarning("no_time", f"{without} frames have no time.", "They cannot be matched with laser readings.")
@@ -262,6 +262,17 @@ def _warn_times(references: Sequence[FrameReference]) -> Iterator[FileWarning]:
             f"the file holds frames of {len(cameras)} cameras.",
             "Store the frames of each camera in a separate file.",
         )
+        return
+    lenses = {
+        (camera.lens_model, camera.lens_part, camera.lens_serial, camera.field_of_view_deg)
+        for camera in (frame.camera for frame in references)
+    }
+    if len(lenses) > 1:
+        yield FileWarning(
+            "several_lenses",
+            f"the frames were taken through {len(lenses)} lenses.",
+            "Use one lens: another one shows the table elsewhere and at another scale.",
+        )
 
 
 def check_series(references: Sequence[FrameReference], *, overridden: Collection[str] = ()) -> list[FileWarning]:
@@ -277,7 +288,7 @@ def check_series(references: Sequence[FrameReference], *, overridden: Collection
     Returns
     -------
     list of FileWarning
-        About frames of several cameras, parameters that vary within the series, and implausible parameters.
+        About frames of several cameras or lenses, parameters that vary within the series, and implausible parameters.
 
     Notes
     -----
@@ -285,7 +296,7 @@ def check_series(references: Sequence[FrameReference], *, overridden: Collection
     """
     if not references:
         return []
-    cameras = [warning for warning in _warn_times(references) if warning.code == "several_cameras"]
+    cameras = [warning for warning in _warn_times(references) if warning.code in ("several_cameras", "several_lenses")]
     return [*cameras, *_warn_parameters(references[0].parameters, references, overridden)]
 
 

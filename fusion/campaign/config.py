@@ -16,14 +16,12 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
-    NonNegativeInt,
-    PositiveInt,
     ValidationError,
     ValidationInfo,
     WithJsonSchema,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
+from pydantic_core import ErrorDetails, PydanticCustomError
 
 from fusion.campaign.messages import Place, describe, find_line, key_lines, suggest
 from fusion.campaign.quantities import QuantityError, read_quantity, split_uncertainty
@@ -64,6 +62,16 @@ def _within(low: float, high: float, meaning: str) -> AfterValidator:
         return value
 
     return AfterValidator(validate)
+
+
+def _share_u(value: float) -> float:
+    """Accept a standard uncertainty that is a share: 0 to 1."""
+    if not 0.0 <= value <= 1.0:
+        text = (
+            f'the standard uncertainty {value:g} of a share lies outside 0 to 1; write a number such as 0.02, or "2 %"'
+        )
+        raise PydanticCustomError("range", "{text}", {"text": text})
+    return value
 
 
 def _fraction(value: object) -> object:
@@ -161,7 +169,9 @@ PartsPerMillion = Annotated[
 Feed = Annotated[float, _quantity("mm/min"), _within(0.0, 1e6, "a feed rate in mm/min"), _written("300 mm/min")]
 Fraction = Annotated[float, BeforeValidator(_fraction), _within(0.0, 1.0, "this fraction")]
 #: Standard uncertainties.
-FractionU = Annotated[float, BeforeValidator(_fraction), Field(ge=0.0, le=1.0)]
+FractionU = Annotated[
+    float, BeforeValidator(_fraction), AfterValidator(_share_u), Field(json_schema_extra={"minimum": 0, "maximum": 1})
+]
 KelvinU = Annotated[float, _quantity("K"), Field(ge=0.0), _written("1 K")]
 MetresU = Annotated[float, _quantity("mm"), AfterValidator(lambda mm: mm / 1e3), Field(ge=0.0), _written("5 cm")]
 
@@ -198,8 +208,19 @@ class CampaignTable(_Table):
     time_zone: TimeZone | None = None
 
 
+def _patch(values: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
+    """Accept a patch that holds a pixel."""
+    if min(values[:2]) < 0 or min(values[2:]) < 1:
+        text = (
+            "this patch holds no pixel of a frame; write first column and first row, from 0 on, and the number of columns and of rows, at "
+            "least 1 each, for example [8, 8, 24, 16]"
+        )
+        raise PydanticCustomError("patch", "{text}", {"text": text})
+    return values
+
+
 #: First column and row, number of columns and rows.
-PixelPatch = tuple[NonNegativeInt, NonNegativeInt, PositiveInt, PositiveInt]
+PixelPatch = Annotated[tuple[int, int, int, int], AfterValidator(_patch)]
 
 
 #: Keys that may be written with their standard uncertainty, ``"0.97 +- 0.01"``; it is kept under the name with ``_u``.
@@ -241,6 +262,16 @@ class StateTable(_Measured):
     temperature_u_K: KelvinU = Field(default=0.1, alias="temperature_u")
 
 
+def _area_mm2(corners: tuple[tuple[float, float], ...]) -> float:
+    """Area of a polygon by Gauss's formula, without its sense."""
+    pairs = zip(corners, (*corners[1:], corners[0]), strict=True)
+    return abs(sum(x * y_next - x_next * y for (x, y), (x_next, y_next) in pairs)) / 2.0
+
+
+def _corners(corners: tuple[tuple[float, float], ...]) -> str:
+    return ", ".join(f"({x:g}, {y:g})" for x, y in corners) + " mm"
+
+
 class SurfaceTable(_Measured):
     """``[[thermography.region]]``: a part of the table with an emissivity of its own, given or from two states."""
 
@@ -263,6 +294,15 @@ class SurfaceTable(_Measured):
             raise PydanticCustomError("region", "{text}", {"text": text})
         if (self.emissivity is None) == (self.states is None):
             text = f'region {self.name} needs either emissivity, for example "0.35 +- 0.05", or states (two cycles of known temperature)'
+            raise PydanticCustomError("region", "{text}", {"text": text})
+        if _area_mm2(self.corners_mm) == 0.0:
+            text = f"region {self.name} with the corners {_corners(self.corners_mm)} has no area; give corners that enclose one"
+            raise PydanticCustomError("region", "{text}", {"text": text})
+        if self.states is not None and self.states[0].cycle == self.states[1].cycle:
+            text = (
+                f"both states of region {self.name} are cycle {self.states[0].cycle}; name two cycles in which its temperature differs, as "
+                "one state cannot tell emissivity and reflection apart"
+            )
             raise PydanticCustomError("region", "{text}", {"text": text})
         return self
 
@@ -548,10 +588,27 @@ def load_campaign(path: str | Path, *, effects: Mapping[str, Effect] | None = No
     except ValidationError as error:
         ordered = sorted(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
         details = [item for item in ordered if not (faults and item["type"] == "missing" and len(item["loc"]) == 1)]
-        faults += [describe(item, Campaign, place) for item in details]
+        faults += [describe(_as_written(item, content), Campaign, place) for item in details]
     if faults:
         raise CampaignError("\n".join(faults))
     return campaign
+
+
+def _as_written(item: ErrorDetails, content: Mapping[str, Any]) -> ErrorDetails:
+    """Return the fault of an uncertainty under the key that states it: ``emissivity = "0.97 +- 2"`` has no line ``emissivity_u``."""
+    *outer, name = item["loc"] or ("",)
+    if not isinstance(name, str) or not name.endswith("_u"):
+        return item
+    table: Any = content
+    try:
+        for part in outer:
+            table = table[part]
+        written = table if name in table else table[name.removesuffix("_u")]
+    except (KeyError, IndexError, TypeError):
+        return item
+    if written is table:
+        return item
+    return {**item, "loc": (*outer, name.removesuffix("_u")), "input": written}
 
 
 def _check_instruments(content: dict[str, Any], place: Place) -> list[str]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
 
 from fusion.alignment.align import AlignmentError, AxisGeometry, camera_on_laser_clock, cycle_bounds
 from fusion.alignment.zone_shift import covered_share, likely_zone_shift
@@ -30,6 +31,7 @@ from interferometry.iso230 import Iso230Budget
 from thermography.io.flir import FrameReference, index_frames
 from thermography.registration.lens import Lens, read_lens
 from thermography.registration.plan import Fiducial, PlanGrid, read_fiducials
+from thermography.registration.polygon import Polygon, PolygonError
 
 #: Maximum number of omitted items listed in a message; the products hold all of them.
 _NAMED = 5
@@ -229,6 +231,7 @@ def _notices(source: Source) -> list[Notice]:
     notices = [*frames_notices(source.frames_rejected), *_remark_notices(source.frames)]
     _raise_if_too_small(source)
     _raise_if_patch_outside(source)
+    _raise_if_regions_unusable(source)
     _raise_if_clocks_disagree(
         source.deviations,
         source.frame_times,
@@ -281,6 +284,28 @@ def _raise_if_patch_outside(source: Source) -> None:
             f"{source.campaign.path}: thermography.reference_patch = {list(patch)}: leaves the frames of {width} x {height} pixels; "
             "write first column, first row, number of columns and of rows"
         )
+
+
+def _raise_if_regions_unusable(source: Source) -> None:
+    """Raise if a region of an emissivity of its own has no cell of the plan to itself, or a state in a cycle that was not measured."""
+    grid, cycles = source.grid, source.deviations["cycle"].values
+    for region in source.thermography.region:
+        where = f"{source.campaign.path}: [[thermography.region]]"
+        try:
+            shares = Polygon(f"region {region.name}", np.array(region.corners_mm)).cell_shares(grid.x_mm, grid.y_mm)
+        except PolygonError as error:
+            raise SourceError(f"{where}: {error}; the plan is {grid.width_mm:g} x {grid.height_mm:g} mm") from error
+        if not binary_erosion(shares == 1.0, np.ones((3, 3)), border_value=1).any():
+            raise SourceError(
+                f"{where}: region {region.name}: no cell lies inside and away from its edge, where the lens blurs both surfaces; give a "
+                f"larger region, at least three cells of {grid.cell_size_mm:g} mm wide, or smaller cells"
+            )
+        for state in region.states or ():
+            if state.cycle not in cycles:
+                raise SourceError(
+                    f"{where}: the states of region {region.name} name cycle {state.cycle}, but {source.interferometry.deviations} holds "
+                    f"the cycles {cycles[0]} to {cycles[-1]}; name a measured one"
+                )
 
 
 class SourceError(FusionError):

@@ -59,7 +59,7 @@ def describe(item: ErrorDetails, model: type[BaseModel], place: Place) -> str:
         part for part in item["loc"] if isinstance(part, str) and not part.startswith(("function-", "tuple["))
     )
     dotted = ".".join(names)
-    where = place(names)
+    where = place(tuple(str(part) for part in item["loc"] if isinstance(part, int) or part in names))
     if item["type"] == "extra_forbidden":
         return f"{where}: unknown key {dotted}; {_nearest(names, model)}"
     if item["type"] == "missing":
@@ -97,7 +97,7 @@ def _table_in(annotation: Any) -> type[BaseModel]:
     return next(item for item in candidates if isinstance(item, type) and issubclass(item, BaseModel))
 
 
-_HEADER = re.compile(r"\s*\[+\s*([^\[\]]+?)\s*\]+\s*(?:#.*)?")
+_HEADER = re.compile(r"\s*(\[+)\s*([^\[\]]+?)\s*\]+\s*(?:#.*)?")
 _KEY = re.compile(r"""\s*((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")
 _PART = re.compile(r"""[\w-]+|"[^"]*"|'[^']*'""")
 
@@ -105,7 +105,8 @@ _PART = re.compile(r"""[\w-]+|"[^"]*"|'[^']*'""")
 def key_lines(text: str) -> dict[tuple[str, ...], int]:
     """Return the line number (from 1) of every key and table header of a TOML text.
 
-    Keys inside inline tables have no line of their own; `find_line` answers with that of the key that holds them.
+    Keys inside inline tables have no line of their own; `find_line` answers with that of the key that holds them. In the path of a table
+    of an array, ``[[region]]``, its number from 0 follows the name.
 
     Parameters
     ----------
@@ -119,10 +120,17 @@ def key_lines(text: str) -> dict[tuple[str, ...], int]:
     """
     lines: dict[tuple[str, ...], int] = {}
     table: tuple[str, ...] = ()
+    last: dict[tuple[str, ...], int] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         if header := _HEADER.fullmatch(line):
-            table = _parts(header.group(1))
+            table = ()
+            for part in _parts(header.group(2)):
+                table += (str(last[table]), part) if table in last else (part,)
             lines.setdefault(table, number)
+            if len(header.group(1)) == 2:
+                last[table] = last.get(table, -1) + 1
+                table += (str(last[table]),)
+                lines[table] = number
         elif key := _KEY.match(line):
             path = table + _parts(key.group(1))
             for depth in range(len(table) + 1, len(path) + 1):

@@ -13,7 +13,7 @@ from thermography.io.frame import FlirFormatError, Frame
 
 #: Largest share of the pixels of a frame outside the range in which the camera is calibrated.
 _OUTSIDE_SHARE = 0.01
-_CHANGING = ("parameters_vary", "several_cameras")
+_CHANGING = ("parameters_vary", "several_cameras", "several_lenses")
 _FIGURES = "temperatures, rises, and every cause that follows the field"
 
 

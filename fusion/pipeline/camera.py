@@ -13,7 +13,7 @@ import xarray as xr
 from fusion._typing import Array
 from fusion.alignment.align import camera_on_laser_clock
 from fusion.campaign.config import relative_name
-from fusion.campaign.inputs import Source, counted, frames_notices, listed
+from fusion.campaign.inputs import Source, SourceError, counted, frames_notices, listed
 from fusion.products.progress import Report
 from fusion.products.results import Notice
 from thermography.errors import ThermographyError
@@ -175,12 +175,18 @@ def examine_camera(source: Source, survey: Survey, registration: Registration) -
     Returns
     -------
     CameraState
+
+    Raises
+    ------
+    SourceError
+        The reference patch shows a part of the plan, whose warming it would take out.
     """
     shifts = np.zeros((0, 2))
     if source.thermography.table == "moving":
         travel = float(np.abs(source.deviations["position"].values).max())
         shifts = np.linspace(-travel, travel, _POSITIONS)[:, None] * np.array(source.plan.axis.direction)
     blocks = locate_blocks(survey, registration, source.grid, shifts)
+    _refuse_patch_on_plan(source, blocks)
     disturbed = disturbed_frames(survey, blocks)
     left_out = [
         *survey.damaged,
@@ -237,6 +243,21 @@ def camera_corrected(part: Mapping[str, Any]) -> bool:
         Part ``camera`` of results.json.
     """
     return bool(part["frames_damaged"] or part["steps"] or part["drift_K"])
+
+
+def _refuse_patch_on_plan(source: Source, blocks: Blocks) -> None:
+    """Refuse a reference patch that shows the plan: what warms there is the table, not the camera."""
+    patch = source.thermography.reference_patch_px
+    if patch is None:
+        return
+    column, row, columns, rows = patch
+    share = float(blocks.plan_px[row : row + rows, column : column + columns].mean())
+    if share > 0.0:
+        raise SourceError(
+            f"{source.campaign.path}: thermography.reference_patch = {list(patch)}: {100.0 * share:.0f} % of its pixels show the plan in "
+            "some frame, so that the warming of the table would be taken for a drift of the camera; choose a surface of constant "
+            "temperature beside the plan, or leave the key out"
+        )
 
 
 def _as_json(item: RejectedFrame, folder: Path) -> dict[str, Any]:

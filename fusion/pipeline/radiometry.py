@@ -123,7 +123,7 @@ def complete_fields(source: Source, fields: xr.Dataset, parameters: Overrides) -
         "surfaces": [_surface_part(table, one, fields, camera, inputs) for one in surfaces],
         "edge_cells": int(edge.sum()),
     }
-    return Outcome(fields, {"radiometry": part}, tuple(_edge_notices(edge, regions)))
+    return Outcome(fields, {"radiometry": part}, (*_edge_notices(edge, regions), *_drift_notices(table, fields)))
 
 
 def _parameters_at(source: Source, parameters: Overrides, times: NDArray[np.datetime64]) -> list[CameraParameters]:
@@ -193,16 +193,40 @@ def _budget(
 
 def _zero_entry(table: ThermographyTable, fields: xr.Dataset, inputs: InputUncertainty) -> dict[str, Any]:
     """The entry of the budget for the camera's zero: what its correction leaves, or the drift that is stated or assumed."""
-    left = fields["camera_correction_u"].values if "camera_correction_u" in fields else np.zeros(1)
-    measured = bool(np.nan_to_num(left).any())
+    left_K = _zero_left_K(fields)
+    measured = left_K > inputs.camera_drift_K
     return {
         "input": "camera_drift_K",
         "value": None,
-        "u": float(np.nanmax(left)) if measured else inputs.camera_drift_K,
+        "u": max(left_K, inputs.camera_drift_K),
         "source": "measured" if measured else "assumed" if table.camera_drift_u_K is None else "stated",
         "temperature_u_K": 0.0,
         "rise_u_percent": None,
     }
+
+
+def _zero_left_K(fields: xr.Dataset) -> float:
+    """Largest standard uncertainty of the camera's zero that its correction leaves, K; 0 where it was not examined."""
+    left = fields["camera_correction_u"].values if "camera_correction_u" in fields else np.zeros(1)
+    return float(np.nan_to_num(left).max())
+
+
+def _drift_notices(table: ThermographyTable, fields: xr.Dataset) -> list[Notice]:
+    """Return a notice where the stated drift of the camera's zero is not the one that the frames leave."""
+    stated_K, left_K = table.camera_drift_u_K, _zero_left_K(fields)
+    if stated_K is None or left_K == 0.0:
+        return []
+    larger = "the stated one" if stated_K >= left_K else "that of the frames"
+    return [
+        Notice(
+            "camera_drift_stated",
+            f"camera_drift_u = {stated_K:.2g} K is stated; the frames leave up to {left_K:.2g} K of the camera's zero uncertain. The "
+            f"larger was taken, {larger}.",
+            ""
+            if stated_K >= left_K
+            else "Leave camera_drift_u out, or keep a surface of constant temperature in view.",
+        )
+    ]
 
 
 def _surface_part(

@@ -52,7 +52,7 @@ def plot_registration(fields: xr.Dataset, *, ax: Axes | None = None) -> Axes:
 
 
 def plot_rise_history(fields: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot the rise of the table over the test: mean over the plan, with its coolest and hottest tenth.
+    """Plot the rise of the table over the test: mean over the plan, with its coolest and hottest tenth; a cycle without a field is a gap.
 
     Parameters
     ----------
@@ -65,10 +65,13 @@ def plot_rise_history(fields: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     rise = fields["temperature_rise"]
     hours = (fields["cycle_time"] - fields["cycle_time"][0]) / np.timedelta64(1, "h")
     flat = rise.values.reshape(rise.sizes["cycle"], -1)
-    low, high = np.nanpercentile(flat, [10, 90], axis=1)
+    low, high, mean, most = np.full((4, len(flat)), np.nan)
+    shown = np.isfinite(flat).any(axis=1)
+    low[shown], high[shown] = np.nanpercentile(flat[shown], [10, 90], axis=1)
+    mean[shown], most[shown] = np.nanmean(flat[shown], axis=1), np.nanmax(flat[shown], axis=1)
     ax.fill_between(hours, low, high, color=ACCENT, alpha=0.15, linewidth=0, label="middle 80 % of the cells")
-    ax.plot(hours, np.nanmean(flat, axis=1), color=ACCENT, label="mean of the table")
-    ax.plot(hours, np.nanmax(flat, axis=1), color=INK, linewidth=0.8, label="warmest cell")
+    ax.plot(hours, mean, color=ACCENT, label="mean of the table")
+    ax.plot(hours, most, color=INK, linewidth=0.8, label="warmest cell")
     ax.axhline(0.0, color=MUTED, linewidth=0.8)
     ax.set(xlabel="time since first cycle / h", ylabel="rise / K")
     ax.legend()

@@ -279,10 +279,13 @@ class Blocks:
         Blocks that the plan covers.
     beside : (rows, columns) ndarray of bool
         Blocks that show nothing of the table in any frame.
+    plan_px : (sensor rows, sensor columns) ndarray of bool
+        Pixels that show a part of the plan in some frame.
     """
 
     table: NDArray[np.bool_]
     beside: NDArray[np.bool_]
+    plan_px: NDArray[np.bool_]
 
 
 def locate_blocks(survey: Survey, registration: Registration, grid: PlanGrid, shifts_mm: Array) -> Blocks:
@@ -317,7 +320,7 @@ def locate_blocks(survey: Survey, registration: Registration, grid: PlanGrid, sh
     margin = np.ones((2 * _MARGIN_PX + 1, 2 * _MARGIN_PX + 1), np.uint8)
     on_table = _block_sums(cv2.erode(rest, margin), survey.edge_px)
     touched = _block_sums(cv2.dilate(anywhere, margin), survey.edge_px)
-    return Blocks(on_table == survey.edge_px**2, touched == 0)
+    return Blocks(on_table == survey.edge_px**2, touched == 0, anywhere.astype(bool))
 
 
 def disturbed_frames(survey: Survey, blocks: Blocks) -> dict[int, str]:

@@ -213,11 +213,12 @@ def _drift(fields: xr.Dataset, parameters: Sequence[CameraParameters], inputs: I
     temperature = fields["temperature"].values
     reference = reference_cycle(temperature)
     drift = np.full(len(temperature), inputs.camera_drift_K)
-    # Where nothing but the table is in view the zero was not examined: its uncertainty is 0, and the stated drift stands.
+    # Where nothing but the table is in view the zero was not examined: its uncertainty is 0, and the stated drift stands. Else the larger
+    # of both: what the frames leave knows nothing of a drift that the room imitates, what is stated knows nothing of these frames.
     if "camera_correction_u" in fields and (left := fields["camera_correction_u"].values.astype(float)).any():
         # The correction is one of the temperature of the table.
         _, at_table = reading_sensitivity(float(np.nanmean(temperature)), parameters[reference])
-        drift = np.hypot(left, left[reference]) / at_table
+        drift = np.maximum(np.hypot(left, left[reference]) / at_table, drift)
     drift[reference] = 0.0
     return drift
 

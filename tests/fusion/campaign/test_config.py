@@ -107,9 +107,18 @@ BAD = [
      "object_distance, object_distance_u, reference_patch, reflected_temperature, reflected_temperature_u, region, relative_humidity, "
      "relative_humidity_u, table, window_temperature, window_temperature_u, window_transmission, window_transmission_u"),
     ("emissivity = 0.97", 'emissivity = "0.97 +- much"',
-     ', line 5: thermography.emissivity_u = "much": this is a number without quotes'),
+     ', line 7: thermography.emissivity = "0.97 +- much": this is a number without quotes'),
+    ("emissivity = 0.97", 'emissivity = "0.97 +- 2"',
+     ', line 7: thermography.emissivity = "0.97 +- 2": the standard uncertainty 2 of a share lies outside 0 to 1; '
+     'write a number such as 0.02, or "2 %"'),
+    ("emissivity = 0.97", 'camera_scale_u = "1.2"',
+     ', line 7: thermography.camera_scale_u = "1.2": the standard uncertainty 1.2 of a share lies outside 0 to 1; '
+     'write a number such as 0.02, or "2 %"'),
+    ("emissivity = 0.97", "reference_patch = [5, 5, 0, 20]",
+     ", line 7: thermography.reference_patch = [5, 5, 0, 20]: this patch holds no pixel of a frame; write first column and first row, "
+     "from 0 on, and the number of columns and of rows, at least 1 each, for example [8, 8, 24, 16]"),
     ('"22 degC"', '"22 degC +- 1 mm"',
-     ', line 5: thermography.reflected_temperature_u = "1 mm": '
+     ', line 8: thermography.reflected_temperature = "22 degC +- 1 mm": '
      '"mm" is not a unit of a temperature difference; use one of mK, K, degC, degF'),
     ('"5 mm"', "5", ', line 15: plan.cell_size = 5: a length needs its unit in the value; write for example "5 mm"'),
     ('"5 mm"', '"5"', ', line 15: plan.cell_size = "5": a length needs its unit in the value; write for example "5 mm"'),
@@ -243,3 +252,38 @@ def test_columns_are_selected_by_name_or_pattern_in_file_order() -> None:
     assert match_columns(["t2 [degC]", "t* [degC]"], headings) == ("t1 [degC]", "t2 [degC]")
     with pytest.raises(CampaignError, match=r'no column is named "z\*"; the file has: time \[s\], t1'):
         match_columns(["z*"], headings)
+
+
+REGIONS = """
+[[thermography.region]]
+name = "vise"
+rectangle = [["100 mm", "50 mm"], ["200 mm", "100 mm"]]
+emissivity = 0.3
+
+[[thermography.region]]
+name = "chuck"
+"""
+STATES = 'states = [{ cycle = 7, temperature = "22 degC" }, { cycle = 7, temperature = "24 degC" }]'
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (
+            'rectangle = [["100 mm", "50 mm"], ["100 mm", "90 mm"]]\nemissivity = 0.3',
+            "[thermography.region]: region chuck with the corners (100, 50), (100, 50), (100, 90), (100, 90) mm has no area; give corners "
+            "that enclose one",
+        ),
+        (
+            'rectangle = [["100 mm", "50 mm"], ["200 mm", "90 mm"]]\n' + STATES,
+            "[thermography.region]: both states of region chuck are cycle 7; name two cycles in which its temperature differs, as one "
+            "state cannot tell emissivity and reflection apart",
+        ),
+    ],
+)
+def test_a_region_that_tells_nothing_is_refused_at_its_line(folder: Path, lines: str, message: str) -> None:
+    text = TEXT + REGIONS + lines + "\n"
+    line = text.splitlines().index('name = "chuck"')
+    with pytest.raises(CampaignError) as error:
+        load(folder, text)
+    assert str(error.value) == f"{folder}/campaign.toml, line {line}: {message}"

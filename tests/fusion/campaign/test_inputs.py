@@ -90,6 +90,31 @@ def test_a_short_test_is_refused_before_the_long_work(copied: Path) -> None:
         read_source(load_campaign(copied / "campaign.toml"))
 
 
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (
+            'rectangle = [["2000 mm", "50 mm"], ["2100 mm", "100 mm"]]\nemissivity = 0.3',
+            r"region chuck: \(x 2000..2100, y 50..100 mm\) holds no part of the plan; give its corners in plan mm; the plan is 700 x",
+        ),
+        (
+            'rectangle = [["100 mm", "50 mm"], ["110 mm", "100 mm"]]\nemissivity = 0.3',
+            "region chuck: no cell lies inside and away from its edge",
+        ),
+        (
+            'rectangle = [["100 mm", "40 mm"], ["200 mm", "140 mm"]]\n'
+            'states = [{ cycle = 1, temperature = "22 degC" }, { cycle = 900, temperature = "24 degC" }]',
+            "region chuck name cycle 900, but .* holds the cycles 1 to ",
+        ),
+    ],
+)
+def test_a_region_that_cannot_be_used_is_refused_before_the_long_work(copied: Path, lines: str, message: str) -> None:
+    path = copied / "campaign.toml"
+    path.write_text(path.read_text() + f'\n[[thermography.region]]\nname = "chuck"\n{lines}\n')
+    with pytest.raises(SourceError, match=message):
+        read_source(load_campaign(path))
+
+
 def test_numbers_and_lists_are_words() -> None:
     assert (counted(1, "frame"), counted(0, "frame")) == ("1 frame", "0 frames")
     assert listed("abc") == "a; b; c"

@@ -25,6 +25,13 @@ def test_every_key_has_its_line() -> None:
     assert find_line(lines, ("camera",)) == 1
 
 
+def test_tables_of_an_array_have_lines_of_their_own() -> None:
+    lines = key_lines('[[region]]\nname = "a"\n[[region]]\nname = "b"\n[region.part]\nlength = 3\n')
+    assert lines[("region",)] == lines[("region", "0")] == 1 and lines[("region", "1")] == 3
+    assert lines[("region", "0", "name")] == 2 and lines[("region", "1", "name")] == 4
+    assert lines[("region", "1", "part", "length")] == 6
+
+
 def test_the_nearest_name_is_suggested() -> None:
     assert suggest("emisivity", ["frames", "emissivity"]) == "did you mean emissivity? "
     assert suggest("colour", ["frames", "emissivity"]) == ""

@@ -48,6 +48,12 @@ def test_a_range_that_changes_is_doubted(frames: list[FrameReference]) -> None:
     assert named["camera_settings"] == "The camera's range changes (2 ranges)."
 
 
+def test_another_lens_is_doubted(frames: list[FrameReference]) -> None:
+    other = replace(frames[3], camera=replace(frames[3].camera, lens_model="FOL76"))
+    named = failed([*frames[:3], other, *frames[4:]], STATED)
+    assert named["camera_settings"] == "The frames were taken through 2 lenses."
+
+
 def test_a_table_outside_the_range_is_doubted(frames: list[FrameReference]) -> None:
     hot = CalibratedRange(573.15, 2273.15, frames[0].limits.raw_minimum, frames[0].limits.raw_maximum)
     named = failed([replace(one, limits=hot) for one in frames], STATED)

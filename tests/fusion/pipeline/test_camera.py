@@ -90,6 +90,9 @@ def test_a_reference_patch_carries_the_correction(tmp_path: Path) -> None:
         SourceError, match=r"reference_patch = \[300, 10, 60, 20\]: leaves the frames of 320 x 240 pixels"
     ):
         _reduce(campaign)
+    campaign.write_text(campaign.read_text().replace("[300, 10, 60, 20]", "[150, 110, 12, 12]"))
+    with pytest.raises(SourceError, match=r"reference_patch = \[150, 110, 12, 12\]: 100 % of its pixels show the plan"):
+        _reduce(campaign)
 
 
 def test_a_sound_camera_is_left_alone(sound: tuple[Truth, Path]) -> None:

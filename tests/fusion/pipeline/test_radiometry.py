@@ -87,6 +87,22 @@ def test_a_stated_emissivity_is_its_share_of_every_rise(campaign: Path, results_
     np.testing.assert_allclose(common.values[warm], np.hypot(0.01 * rise, zero).values[warm], rtol=0.08)
 
 
+@pytest.mark.parametrize(("stated_K", "taken"), [(2.0, "stated"), (0.001, "measured")])
+def test_the_larger_of_stated_and_measured_drift_is_taken_and_said(
+    campaign: Path, results_folder: Path, stated_K: float, taken: str
+) -> None:
+    outcome = completed(
+        campaign, results_folder, ("emissivity = 0.97", f'emissivity = 0.97\ncamera_drift_u = "{stated_K} K"')
+    )
+    entry = next(item for item in outcome.parts["radiometry"]["budget"] if item["input"] == "camera_drift_K")
+    left_K = float(outcome.dataset["camera_correction_u"].max())
+    assert entry["source"] == taken and entry["u"] == pytest.approx(max(stated_K, left_K))
+    u = float(outcome.dataset["temperature_rise_u"].isel(cycle=-1).mean())
+    assert (u > stated_K) if taken == "stated" else (u < 1.0)
+    notice = next(item for item in outcome.notices if item.code == "camera_drift_stated")
+    assert "The larger was taken" in notice.message
+
+
 def test_a_region_is_calibrated_with_its_own_emissivity(campaign: Path, results_folder: Path) -> None:
     outcome = completed(campaign, results_folder, region=REGION + 'emissivity = "0.5 +- 0.02"\n')
     before, after = read_dataset(results_folder / "fields.nc"), outcome.dataset

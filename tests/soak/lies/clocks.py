@@ -64,6 +64,8 @@ LIES = (
     Lie("camera clock 2 h late (stated 0 s)", CLOCK, camera_clock(late(2 * HOUR_S))),
     Lie("camera clock 6 h late (stated 0 s)", CLOCK, camera_clock(late(6 * HOUR_S))),
     Lie("camera clock 20 min late (stated 0 s)", CLOCK, camera_clock(late(1200.0))),
+    Lie("camera clock 40 min late (stated 0 s)", CLOCK, camera_clock(late(2400.0))),
+    Lie("camera clock nearly one cycle late (stated 0 s)", CLOCK, camera_clock(late(240.0))),
     Lie("camera clock one cycle late (stated 0 s)", CLOCK, camera_clock(late(252.0))),
     Lie(
         "camera clock 1 h late (nothing stated)",

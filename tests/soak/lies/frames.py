@@ -22,6 +22,7 @@ LOST = r"frame.*(missing|left out|gap|cover|damaged|rejected)|readings_outside_f
 DAMAGED = r"damaged|CRC|checksum|cut short|left out|corrupt|rejected"
 FROZEN = r"frozen|alike|identical|same pixels|repeat|copies"
 OTHER_TEST = r"clock|another test|material|level|same test|frames.*readings"
+STRAY = OTHER_TEST + "|" + DAMAGED + "|frames?.*(unlike|differ)|jump"
 SETTING = r"emissivity|parameters.*(change|vary)|settings"
 ORDER = r"clock|order|times? of the frames|level|frames?.*(left out|differ)"
 VIEW = r"knock|view|registration|disc|moved|blur|sharp|mirror"
@@ -81,12 +82,18 @@ def frozen(first: int) -> Plant:
     return plant
 
 
-def of_another_test(folder: Path) -> None:
-    """The pictures of another test of the same machine, with the times of this one."""
-    other = folder.parent / "other"
-    write(RECIPES["sound"].vary(campaign={"seed": 77}), other)
-    for path, source in zip(frame_paths(folder), frame_paths(other), strict=True):
-        write_frame(path, replace(read_frame(path), counts=read_frame(source).counts))
+def of_another_test(places: dict[int, int] | None = None) -> Plant:
+    """Pictures of another test of the same machine, with the times of this one: all, or by number those of other numbers."""
+
+    def plant(folder: Path) -> None:
+        other = folder.parent / "other"
+        write(RECIPES["sound"].vary(campaign={"seed": 77}), other)
+        paths, sources = frame_paths(folder), frame_paths(other)
+        for number, source in ({n: n for n in range(1, len(paths) + 1)} if places is None else places).items():
+            path = paths[number - 1]
+            write_frame(path, replace(read_frame(path), counts=read_frame(sources[source - 1]).counts))
+
+    return plant
 
 
 def times_in_reverse(folder: Path) -> None:
@@ -127,6 +134,14 @@ def second_camera(number: int, frame: Frame) -> Frame:
         return frame
     counts = (frame.counts - round(_COUNTS_PER_K)).astype(np.uint16)
     return replace(frame, counts=counts, camera=CameraIdentity(model="FLIR T640", serial="77"))
+
+
+def other_lens(number: int, frame: Frame) -> Frame:
+    return (
+        replace(frame, camera=replace(frame.camera, lens_model="FOL76", field_of_view_deg=15.0))
+        if number == HALF
+        else frame
+    )
 
 
 def smaller(number: int, frame: Frame) -> Frame:
@@ -250,7 +265,11 @@ LIES = (
     sequence("2 kB of zeros in a frame", overwritten(0.5, 2000, 0)),
     sequence("20 kB of zeros in a frame", overwritten(0.4, 20000, 0)),
     sequence("64 bytes of a header zeroed", header_zeroed),
-    Lie("frames of another test, same times", OTHER_TEST, of_another_test),
+    Lie("frames of another test, same times", OTHER_TEST, of_another_test()),
+    Lie("one frame of another test", STRAY, of_another_test({21: 38})),
+    Lie("three frames in a row of another test", STRAY, of_another_test({19: 36, 20: 37, 21: 38})),
+    Lie("last frame of another test", STRAY, of_another_test({40: 4})),
+    Lie("one frame by another lens", r"lens|camera", frames(other_lens)),
     Lie("pictures in reverse order", ORDER, times_in_reverse),
     Lie("two frames with each other's time", ORDER, times_exchanged),
     Lie("files named in another order", ORDER, names_shuffled),

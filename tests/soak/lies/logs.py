@@ -22,6 +22,22 @@ def exchanged(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(**{air: table[material], material: table[air]})
 
 
+def backwards(table: pd.DataFrame) -> pd.DataFrame:
+    """The values in reverse order, with the times in order."""
+    turned = table.iloc[::-1].reset_index(drop=True)
+    return turned.assign(time=table["time"].to_numpy())
+
+
+def of_another_hour(table: pd.DataFrame) -> pd.DataFrame:
+    """The values that were logged three quarters of an hour later, those of the start at the end."""
+    values = pd.DataFrame(np.roll(table.to_numpy(), -45, axis=0), columns=table.columns)
+    return values.assign(time=table["time"].to_numpy())
+
+
+def in_percent_from_the_middle(duty: np.ndarray) -> np.ndarray:
+    return np.where(np.arange(duty.size) < duty.size // 2, 1.0, 100.0) * duty
+
+
 def of_another_test(duty: np.ndarray) -> np.ndarray:
     """A load of the same kind, drawn anew."""
     rng = np.random.default_rng(5)
@@ -33,6 +49,8 @@ LIES = (
     Lie("environment log missing for the second half", ENVIRONMENT, edit_table("environment.csv", first_half)),
     Lie("environment log missing", ENVIRONMENT, key("interferometry", "environment", None)),
     Lie("columns of air and material exchanged", MATERIAL + "|air", edit_table("environment.csv", exchanged)),
+    Lie("environment log backwards in time", ENVIRONMENT, edit_table("environment.csv", backwards)),
+    Lie("environment log with the values of another hour", ENVIRONMENT, edit_table("environment.csv", of_another_hour)),
     Lie(
         "material sensor stands still",
         MATERIAL,
@@ -47,6 +65,11 @@ LIES = (
     Lie("drivers log with the load of another test", DRIVERS, edit_column("drivers.csv", "duty [1]", of_another_test)),
     Lie("drivers log stands still", DRIVERS, edit_column("drivers.csv", "duty [1]", lambda d: np.full(d.size, d[0]))),
     Lie("drivers log inverted (1 - load)", DRIVERS, edit_column("drivers.csv", "duty [1]", lambda d: 1.0 - d)),
+    Lie(
+        "drivers log in percent from the middle on",
+        DRIVERS,
+        edit_column("drivers.csv", "duty [1]", in_percent_from_the_middle),
+    ),
     Lie(
         "drivers log once an hour",
         DRIVERS,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from tests.soak.lies.folder import edit_column, in_turn, key
+from pathlib import Path
+
+from tests.soak.lies.folder import Plant, edit_column, in_turn, key
 from tests.soak.lies.lie import Lie
 
 EMISSIVITY = r"emissivity"
@@ -19,10 +21,45 @@ def laser(name: str, value: str):
     return key("interferometry", name, value)
 
 
+def region(*lines: str) -> Plant:
+    """Add a region of the table to the campaign file."""
+
+    def plant(folder: Path) -> None:
+        path = folder / "campaign.toml"
+        table = "\n".join(["", "[[thermography.region]]", 'name = "chuck"', *lines, ""])
+        path.write_text(path.read_text(encoding="utf-8") + table, encoding="utf-8")
+
+    return plant
+
+
+def patch_on_the_table(folder: Path) -> None:
+    """A reference patch in the middle of the picture, where the table warms."""
+    thermography("reference_patch", "[150, 110, 12, 12]")(folder)
+
+
+_SQUARE = 'rectangle = [["100 mm", "50 mm"], ["200 mm", "100 mm"]]'
+_STATES = 'states = [{{ cycle = {}, temperature = "22 degC" }}, {{ cycle = {}, temperature = "24 degC" }}]'
+
 LIES = (
     Lie("emissivity 0.90 for 0.97", EMISSIVITY, thermography("emissivity", "0.90")),
     Lie("emissivity 0.50 for 0.97", EMISSIVITY, thermography("emissivity", "0.50")),
     Lie("emissivity 0.097 for 0.97", EMISSIVITY, thermography("emissivity", "0.097")),
+    Lie('emissivity "0.97 +- 2"', r"emissivity.*0\.97 \+- 2", thermography("emissivity", '"0.97 +- 2"')),
+    Lie("scale of the camera 1.2 as text", r"camera_scale_u", thermography("camera_scale_u", '"1.2"')),
+    Lie("reference patch on the table", r"reference_patch", patch_on_the_table),
+    Lie("reference patch of no width", r"reference_patch", thermography("reference_patch", "[5, 5, 0, 20]")),
+    Lie(
+        "region outside the plan",
+        r"region.*chuck.*plan",
+        region('rectangle = [["2000 mm", "50 mm"], ["2100 mm", "100 mm"]]', "emissivity = 0.3"),
+    ),
+    Lie(
+        "region of no area",
+        r"region.*chuck.*area",
+        region('rectangle = [["100 mm", "50 mm"], ["100 mm", "100 mm"]]', "emissivity = 0.3"),
+    ),
+    Lie("region by a cycle that does not exist", r"region.*chuck.*cycle", region(_SQUARE, _STATES.format(1, 900))),
+    Lie("region by one cycle twice", r"region.*chuck.*cycle", region(_SQUARE, _STATES.format(7, 7))),
     Lie("reflected temperature in K as °C", REFLECTED, thermography("reflected_temperature", '"295 degC"')),
     Lie("reflected temperature 72 °F as °C", REFLECTED, thermography("reflected_temperature", '"72 degC"')),
     Lie(
