@@ -19,6 +19,7 @@ from dataclasses import dataclass, fields
 import GTC
 import numpy as np
 import xarray as xr
+from scipy.stats import norm
 
 from interferometry.contract import check_dataset
 from interferometry.deviations import DIRECTIONS
@@ -105,8 +106,9 @@ def evaluate_iso230(
         - Per direction and target: ``mean_unidirectional``, ``standard_deviation`` (s_i), ``repeatability`` (4 s_i), ``count`` (1).
         - Per target: ``mean_bidirectional``, ``reversal`` (B_i), ``repeatability_bidirectional`` (R_i).
         - Per direction: ``R_unidirectional``, ``E_unidirectional``, ``A_unidirectional``.
-        - Of the axis: ``B`` reversal error, ``mean_reversal`` (signed), ``R`` bidirectional repeatability, ``E`` bidirectional
-          systematic positioning error, ``M`` mean bidirectional positioning error, ``A`` bidirectional accuracy.
+        - Of the axis: ``B`` reversal error; ``B_of_scatter``, what scatter alone gives in half of such tests of an axis without reversal
+          error (B is the largest of noisy values; no uncertainty); ``mean_reversal`` (signed), ``R`` bidirectional repeatability, ``E``
+          bidirectional systematic positioning error, ``M`` mean bidirectional positioning error, ``A`` bidirectional accuracy.
 
         The uncertainties of mean deviations are relative to the first position. Quantities that need both directions are NaN where
         one was not measured. ``attrs["window"]`` names the cycles, says if they are not the five of the standard, and which targets
@@ -288,6 +290,7 @@ def _quantities(x: np.ndarray, count: np.ndarray) -> dict[str, tuple[tuple[str, 
     }
     axis = {
         "B": _largest(np.abs(reversal)),
+        "B_of_scatter": _reversal_of_scatter(s, count),
         "mean_reversal": float(np.mean(reversal[np.isfinite(reversal)])) if bidirectional else np.nan,
         "R": _largest(repeatability),
         "E": _largest(mean) + _largest(-mean) if bidirectional else np.nan,
@@ -305,6 +308,16 @@ def _quantities(x: np.ndarray, count: np.ndarray) -> dict[str, tuple[tuple[str, 
         **{name: (("direction",), values) for name, values in unidirectional.items()},
         **{name: ((), value) for name, value in axis.items()},
     }
+
+
+def _reversal_of_scatter(s: np.ndarray, count: np.ndarray) -> float:
+    """Return the B that scatter alone gives in half of such tests, um.
+
+    The median q of max |z| over m targets solves (2 Phi(q) - 1)^m = 1/2.
+    """
+    variance = (s**2 / np.fmax(count, 1)).sum(axis=0)
+    both = variance[np.isfinite(variance)]
+    return float(norm.ppf((1.0 + 0.5 ** (1.0 / both.size)) / 2.0) * np.sqrt(both.mean())) if both.size else np.nan
 
 
 def _can_be_evaluated(deviations: xr.Dataset) -> bool:

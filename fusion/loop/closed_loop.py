@@ -119,11 +119,17 @@ def choose(
         if refusal is not None:
             state = state.decide(replace(refusal, evidence={**refusal.evidence, "search_p": score.family_wise_p}))
             continue
-        # Where a stronger effect could not be confirmed, a much weaker one only stands in for it.
+        # Where a stronger effect could not be confirmed, a much weaker one may only stand in for it.
         if unconfirmed is not None and score.excess < unconfirmed.excess - TIE_GAIN:
-            evidence: dict[str, float | str] = {"p_value": score.family_wise_p, "stronger": unconfirmed.name}
-            state = state.decide(Decision(score.name, Reason.STANDS_IN, evidence))
-            continue
+            beside = p_value_beside(problem, state.model, score, unconfirmed)
+            if beside > limit:
+                evidence: dict[str, float | str] = {
+                    "p_value": score.family_wise_p,
+                    "stronger": unconfirmed.name,
+                    "beside_p": beside,
+                }
+                state = state.decide(Decision(score.name, Reason.STANDS_IN, evidence))
+                continue
         score = problem.confirm(score, state)
         state = state.rescored(score)
         if score.confirmation is not None and score.confirmation.passed:
@@ -132,6 +138,24 @@ def choose(
         if unconfirmed is None or score.excess > unconfirmed.excess:
             unconfirmed = score
     return state, None
+
+
+def p_value_beside(problem: Problem[M], model: M, score: Score, stronger: Score) -> float:
+    """The family-wise p-value of an effect with a stronger one in the model; that of the search where it gains as much as by itself.
+
+    The tail of the p-values of the search falls by at most a factor of :math:`e` per nat (docs/method/closed-loop.md, null hypothesis), so
+    they grow at most by that for every nat that the stronger effect takes away.
+
+    Parameters
+    ----------
+    problem : the data
+    model : to which neither was added
+    score, stronger : of both effects
+    """
+    weaker = Term(score.name, score.best)
+    joint = problem.refit(model, [*model.terms, Term(stronger.name, stronger.best), weaker])
+    lost = max(score.gain - problem.loss_without(joint, weaker), 0.0)
+    return min(1.0, score.family_wise_p * float(np.exp(lost)))
 
 
 def not_confirmed(score: Score, scored: Round) -> Decision:

@@ -103,8 +103,9 @@ def _reading_notices(deviations: xr.Dataset, drift: xr.Dataset) -> list[Notice]:
 def _iso_part(windows: xr.Dataset) -> dict[str, Any]:
     """Return the axis values of the first window, as the standard's test would have found them."""
     first = windows.isel(window=0)
-    values = {f"{name}_um": {"value": float(first[name]), "u": float(first[f"{name}_u"])} for name in iso230.QUANTITIES}
-    return {"window": str(first["window"].values), **values}
+    names = (*iso230.QUANTITIES, "mean_reversal")
+    values = {f"{name}_um": {"value": float(first[name]), "u": float(first[f"{name}_u"])} for name in names}
+    return {"window": str(first["window"].values), **values, "B_of_scatter_um": float(first["B_of_scatter"])}
 
 
 def by_direction(values: xr.DataArray) -> dict[str, list[float]]:

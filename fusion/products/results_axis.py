@@ -98,6 +98,10 @@ class Iso230Part(ResultPart):
     """Mean bidirectional positioning error M, um."""
     A_um: Quantity
     """Bidirectional positioning accuracy A, um."""
+    mean_reversal_um: Quantity
+    """Mean reversal error of the axis with its sign, um."""
+    B_of_scatter_um: Number
+    """B that scatter alone gives in half of such tests of an axis without reversal error, um."""
 
 
 class NeighboursPart(ResultPart):

@@ -32,6 +32,23 @@ def iso230_values(iso: Iso230Part) -> dict[str, str]:
     return {symbol: quantity(getattr(iso, f"{symbol}_um"), "µm") for symbol in ISO230_TERMS}
 
 
+def reversal_note(iso: Iso230Part) -> str:
+    """Return one sentence on what B means beside the scatter of the readings; empty where the approaches were not compared.
+
+    Parameters
+    ----------
+    iso : Iso230Part
+        The part ``iso230`` of the results.
+    """
+    if iso.B_of_scatter_um is None:
+        return ""
+    return (
+        f"B is the largest of noisy values: scatter alone gives {number(iso.B_of_scatter_um, 2)} µm in half of such tests of an axis "
+        f"without reversal error, which its uncertainty does not hold. The mean reversal error, "
+        f"{quantity(iso.mean_reversal_um, 'µm')}, is free of that."
+    )
+
+
 def scatter_range(drift: DriftPart) -> str:
     """Return smallest, largest and median scatter over targets and directions, µm.
 

@@ -25,6 +25,7 @@ from fusion.report.findings import (
     anomaly_figures,
     anomaly_place,
     iso230_values,
+    reversal_note,
     standing_out,
 )
 from fusion.report.model_section import (
@@ -160,6 +161,7 @@ def describe_campaign(
         "neighbours": "" if results.neighbours is None else _neighbours_text(results.neighbours),
         "comparison": None if deviations is None else _comparison_table(deviations),
         "iso230": None if results.iso230 is None else _iso230_table(results),
+        "reversal": "" if results.iso230 is None else reversal_note(results.iso230),
         "anomalies": _anomalies(results),
         "correlation": correlation,
         "joint": None if joint is None else {**joint, "table": _joint_table(joint)},

@@ -94,7 +94,11 @@ PARTS: dict[str, Any] = {
         "largest_u_K": 0.02,
     },
     "alignment": {"clock_offset_s": {"value": 0.0, "u": None}},
-    "iso230": {"window": "cycles 1 to 5", **{f"{name}_um": MEASURED for name in "BREMA"}},
+    "iso230": {
+        "window": "cycles 1 to 5",
+        **{f"{name}_um": MEASURED for name in (*"BREMA", "mean_reversal")},
+        "B_of_scatter_um": 0.3,
+    },
     "neighbours": {"conventional_s_um": BOTH, "pair_s_um": BOTH, "ratio": BOTH},
     "drift": {"profile_um": BOTH, "profile_u_um": BOTH, "scatter_um": BOTH},
     "anomalies": [

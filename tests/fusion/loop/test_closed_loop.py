@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -16,6 +17,7 @@ from fusion.loop.closed_loop import (
     no_progress,
     not_confirmed,
     open_hold_out,
+    p_value_beside,
     search,
     withdraw,
 )
@@ -133,10 +135,20 @@ def test_a_refusal_is_recorded_and_does_not_stand_in_the_way_of_a_weaker_effect(
     assert state.decisions == (Decision("a", Reason.AT_SWITCHING, {"hours": 1.0, "search_p": 0.001}),)
 
 
-@pytest.mark.parametrize(("excess", "name"), [(17.0, "b"), (16.9, None)])
-def test_a_much_weaker_effect_only_stands_in_for_one_that_was_not_confirmed(excess, name):
-    problem = Script(not_confirmed=frozenset({"a"}))
-    state, chosen = choose(problem, start(score("a", 20.0, 0.003), score("b", excess)))
+@pytest.mark.parametrize(
+    ("excess", "loss", "name"),
+    [
+        (17.0, 0.0, "b"),
+        # 0.001 grows by a factor of e with every nat that is lost beside the stronger effect; the level is 0.02.
+        (16.9, 30.0 - math.log(19.9), "b"),
+        (16.9, 30.0 - math.log(20.1), None),
+        (16.9, 40.0, "b"),
+    ],
+)
+def test_a_much_weaker_effect_is_held_against_a_stronger_one_that_was_not_confirmed(excess, loss, name):
+    problem = Script(not_confirmed=frozenset({"a"}), losses={"b": loss})
+    weaker = replace(score("b", excess), gain=30.0)
+    state, chosen = choose(problem, start(score("a", 20.0, 0.003), weaker))
     assert (chosen.name if chosen else None) == name
     decision, *others = state.decisions
     assert decision == Decision("a", Reason.NOT_CONFIRMED, {"p_value": 0.003})
@@ -144,9 +156,20 @@ def test_a_much_weaker_effect_only_stands_in_for_one_that_was_not_confirmed(exce
     assert [other.reason for other in others] == ([] if name else [Reason.STANDS_IN])
 
 
+def test_what_a_weaker_effect_gains_is_measured_with_both_in_the_model():
+    asked = []
+    problem = Script()
+    problem.loss_without = lambda model, term: asked.append((model.names, term.effect)) or 28.0
+    model = Model((Term("declared", CANDIDATE),))
+    p_value = p_value_beside(problem, model, replace(score("b"), gain=30.0), score("a"))
+    assert p_value == pytest.approx(0.001 * math.exp(2.0))
+    assert asked == [(("declared", "a", "b"), "b")]
+
+
 def test_the_strongest_of_those_not_confirmed_sets_the_limit():
-    problem = Script(not_confirmed=frozenset({"a", "b"}))
-    _, chosen = choose(problem, start(score("a", 20.0), score("b", 18.0), score("c", 16.0)))
+    problem = Script(not_confirmed=frozenset({"a", "b"}), losses={"c": 0.0})
+    scores = (score("a", 20.0), score("b", 18.0), replace(score("c", 16.0), gain=30.0))
+    _, chosen = choose(problem, start(*scores))
     assert chosen is None
 
 

@@ -23,7 +23,7 @@ FIELDS = {
     Reason.FOLLOWS_RATE: {"series"},
     Reason.SMOOTHING: {"series", "advantage"},
     Reason.NOT_PREDICTED: {"p_value", "before_um", "after_um"},
-    Reason.STANDS_IN: {"p_value", "stronger"},
+    Reason.STANDS_IN: {"p_value", "stronger", "beside_p"},
     Reason.NOT_CONFIRMED: {"p_value"},
     Reason.SUPERFLUOUS: {"loss"},
     Reason.TOO_MANY_EVENTS: {"most"},

@@ -18,7 +18,11 @@ from fusion.products.results import (
 from fusion.products.results_loop import Baselines, ErrorInterval, ModelErrors, StepPart
 from fusion.report import findings
 
-ISO = Iso230Part(window="cycles 1..5", **{f"{symbol}_um": Quantity(value=9.9017, u=1.378) for symbol in "BREMA"})
+ISO = Iso230Part(
+    window="cycles 1..5",
+    B_of_scatter_um=0.4379,
+    **{f"{name}_um": Quantity(value=9.9017, u=1.378) for name in (*"BREMA", "mean_reversal")},
+)
 
 
 def correlation(verdict: str, *loads: DutyPart) -> CorrelationPart:
@@ -30,6 +34,8 @@ def correlation(verdict: str, *loads: DutyPart) -> CorrelationPart:
 
 def test_axis_values_bear_the_terms_of_the_standard() -> None:
     assert findings.iso230_values(ISO)["A"] == "9.9 \u00b1 2.8 \u00b5m"
+    assert "scatter alone gives 0.44 \u00b5m" in findings.reversal_note(ISO)
+    assert findings.reversal_note(ISO.model_copy(update={"B_of_scatter_um": None})) == ""
     assert findings.ISO230_TERMS["E"] == "Bidirectional systematic positioning error E"
     assert findings.ISO230_TERMS["M"] == "Mean bidirectional positioning error M"
     assert findings.ISO230_TERMS["B"] == "Reversal error B"
