@@ -172,6 +172,9 @@ Fraction = Annotated[float, BeforeValidator(_fraction), _within(0.0, 1.0, "this 
 FractionU = Annotated[
     float, BeforeValidator(_fraction), AfterValidator(_share_u), Field(json_schema_extra={"minimum": 0, "maximum": 1})
 ]
+PartsPerMillionU = Annotated[
+    float, _quantity("ppm/K"), _within(1e-3, 200.0, "a standard uncertainty in ppm/K"), _written("0.5 ppm/K")
+]
 KelvinU = Annotated[float, _quantity("K"), Field(ge=0.0), _written("1 K")]
 MetresU = Annotated[float, _quantity("mm"), AfterValidator(lambda mm: mm / 1e3), Field(ge=0.0), _written("5 cm")]
 
@@ -233,6 +236,7 @@ _WITH_UNCERTAINTY = (
     "window_transmission",
     "window_temperature",
     "temperature",
+    "expansion_coefficient",
 )
 
 
@@ -385,7 +389,7 @@ class PlanTable(_Table):
         return self
 
 
-class InterferometryTable(_Table):
+class InterferometryTable(_Measured):
     """``[interferometry]``: the readings, and the parameters of the laser's compensation."""
 
     deviations: ExistingFile
@@ -393,6 +397,7 @@ class InterferometryTable(_Table):
     time_zone: TimeZone | None = None
     dead_path_mm: Millimetres = Field(default=0.0, alias="dead_path")
     expansion_coefficient_ppm_per_K: PartsPerMillion = Field(default=11.7, alias="expansion_coefficient")
+    expansion_coefficient_u_ppm_per_K: PartsPerMillionU | None = Field(default=None, alias="expansion_coefficient_u")
     feed_mm_per_min: Feed | None = Field(default=None, alias="feed")
     dwell_s: PositiveSeconds | None = Field(default=None, alias="dwell")
     compensation: Literal["as recorded", "redo"] = "as recorded"

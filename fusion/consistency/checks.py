@@ -23,6 +23,7 @@ CODES = (
     "datum",
     "zeroed_cycles",
     "travel_order",
+    "target_order",
     "mirrored_readings",
     "environment_coverage",
     "drivers_coverage",

@@ -83,7 +83,7 @@ def _expansion(entry: Mapping[str, Any]) -> Check:
         if passed
         else (
             "Check expansion_coefficient, the emissivity, origin and direction under [plan.axis], the sign and the unit of the deviations, "
-            "and the clocks of camera and laser; or the model lacks an effect that goes with the expansion."
+            "the unit of the positions, and the clocks of camera and laser; or the model lacks an effect that goes with the expansion."
         ),
         "the declared coefficients, and every cause that is added beside them",
     )
@@ -125,7 +125,7 @@ def _sensitivities(coefficients: list[Mapping[str, Any]], travel_mm: float) -> l
             else f"No coefficient per kelvin is beyond what the expansion of a frame of {frame_mm * 1e-3:.2g} m can do.",
             ""
             if passed
-            else "Check the scale of the temperatures (emissivity, range, unit) and the unit of the deviations.",
+            else "Check the scale of the temperatures (emissivity, range, unit), and the units of positions (mm) and deviations (µm).",
             "the coefficients, and every cause that follows the temperature",
         )
     ]

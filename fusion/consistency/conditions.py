@@ -39,6 +39,7 @@ _CONDITIONS = {
     "copied_cycles": Condition("every cycle was measured", _LASER),
     "approach_labels": Condition("the labels of the approaches are right", _LASER),
     "travel_order": Condition("the labels of the approaches are right", _LASER),
+    "target_order": Condition("the targets are numbered alike in both approaches", _LASER),
     "mirrored_readings": Condition("the signs of the deviations are right", _LASER),
     "datum": Condition("the datum of the laser stayed the same", _LASER),
     "zeroed_cycles": Condition("the laser was not set to zero in every cycle", _LASER),

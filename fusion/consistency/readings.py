@@ -188,7 +188,10 @@ def _copied_cycles(deviations: xr.Dataset) -> Check:
 
 def _exchanged_approaches(deviations: xr.Dataset, noise_um: float) -> Check:
     """A reversal error that changes its sign and keeps its size at one cycle shows exchanged labels of approach."""
-    code, endangered = "approach_labels", "reversal error, and every effect that depends on the direction of approach"
+    code, endangered = (
+        "approach_labels",
+        "ISO 230-2 values, reversal error, and every effect that depends on the direction of approach",
+    )
     sound = Check(code, 0.0, _EXCHANGE_SIGMAS, True, "The reversal error keeps its sign over the test.", "", endangered)
     if deviations.sizes["direction"] < 2 or not noise_um > 0.0:
         return sound
@@ -230,7 +233,7 @@ def _exchanged_approaches(deviations: xr.Dataset, noise_um: float) -> Check:
 
 def _datum(deviations: xr.Dataset, noise_um: float) -> Check:
     """A sudden shift of all targets and approaches alike, far larger than the drift beside it, is a new datum or a slip."""
-    endangered = "drift, accuracy and repeatability over the whole test, and every cause that acts from that cycle on"
+    endangered = "drift, ISO 230-2 values over the whole test, and every cause that acts from that cycle on"
     values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
     level, cycles = _levels(values), deviations["cycle"].values
     sound = Check("datum", 0.0, _DATUM_RANGES, True, "The readings do not jump together at any cycle.", "", endangered)

@@ -1,4 +1,4 @@
-"""Checks of order and sign: passes travelled against their label, and readings that are the mirror image of the others."""
+"""Checks of order and sign: passes against their label, targets numbered from the other end, readings mirrored against the others."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from fusion.consistency.checks import Check
 
 #: Fewest targets in which a shape can be told.
 _LEAST_TARGETS = 5
+#: Fewest complete cycles from which the scatter between the approaches is taken.
+_LEAST_CYCLES = 5
 #: What a mirrored part leaves at most when its sign is inverted, in units of what is usual: the median step of a pass from cycle to cycle,
-#: or the median distance of a target from the line through the others. Normal noise exceeds five times its median once in a thousand.
+#: the median distance of a target from the line through the others, or the scatter of the difference between both approaches. Normal noise
+#: exceeds five times its median once in a thousand.
 _INVERTED_AT_MOST = 3.0
 #: What it leaves at least as it was read: a drift that passes quickly through zero makes larger steps than noise does.
 _PASS_AT_LEAST, _TARGET_AT_LEAST = 8.0, 5.0
@@ -30,14 +33,14 @@ def check_signs(deviations: xr.Dataset) -> list[Check]:
     Returns
     -------
     list of Check
-        ``travel_order`` and ``mirrored_readings``.
+        ``travel_order``, ``target_order`` and ``mirrored_readings``.
 
     Notes
     -----
     Approach in positive direction means that the position grows (ISO 230-2:2014, clause 3). In a step cycle both approaches go through the
     targets in one order, so that only a cycle in which both passes run against their label contradicts it.
     """
-    return [_travel_order(deviations), _mirrored_readings(deviations)]
+    return [_travel_order(deviations), _target_order(deviations), _mirrored_readings(deviations)]
 
 
 def _travel_order(deviations: xr.Dataset) -> Check:
@@ -56,7 +59,7 @@ def _travel_order(deviations: xr.Dataset) -> Check:
         else f"In {contrary.sum()} of {contrary.size} cycles, first in cycle {first}, the readings labelled positive were taken at falling "
         "positions and those labelled negative at growing positions.",
         "" if passed else "Exchange the labels of the direction of approach, or correct the times of the readings.",
-        "reversal error, profile by direction, and every effect that depends on the direction of approach",
+        "ISO 230-2 values, reversal error, profile by direction, and every effect that depends on the direction of approach",
     )
 
 
@@ -70,6 +73,45 @@ def _steps_against_label(deviations: xr.Dataset) -> Array:
     return np.asarray(-label * np.nansum(np.sign(np.diff(seconds, axis=-1)), axis=-1))
 
 
+def _target_order(deviations: xr.Dataset) -> Check:
+    """Approaches that show one profile only when the targets of one of them are read from the other end are numbered differently."""
+    as_read, turned = _distances_of_approaches(deviations)
+    passed = not (as_read >= _TARGET_AT_LEAST and turned <= _INVERTED_AT_MOST)
+    return Check(
+        "target_order",
+        as_read,
+        _TARGET_AT_LEAST,
+        passed,
+        "Both approaches number the targets alike, as far as their profiles tell."
+        if passed
+        else f"The profiles of the two approaches differ by {as_read:.1f} times their scatter from cycle to cycle, and by {turned:.1f} "
+        "times with the targets of one approach read from the other end.",
+        ""
+        if passed
+        else "Number the targets by their position in both approaches: in one of them the readings stand in the order of travel.",
+        "ISO 230-2 values, profile, reversal error, anomalies and every effect",
+    )
+
+
+def _distances_of_approaches(deviations: xr.Dataset) -> tuple[float, float]:
+    """Distance of the passes in both approaches, apart from their level, as read and with the targets of one turned round.
+
+    In units of the root mean square by which that distance changes at random from cycle to cycle; zeros where it cannot be told, and where
+    the drifts of both approaches run against each other: a wrong order leaves them as they are, a wrong sign does not.
+    """
+    values = deviations["deviation"].values
+    values = values[np.isfinite(values).all(axis=(1, 2))]
+    if len(values) < _LEAST_CYCLES or values.shape[1] < 2 or values.shape[2] < _LEAST_TARGETS:
+        return 0.0, 0.0
+    levels = values.mean(axis=2)
+    if np.cov(levels.T)[0, 1] <= _OPPOSITE * np.prod(levels.std(axis=0, ddof=1)):
+        return 0.0, 0.0
+    shapes = values - levels[..., None]
+    apart, turned = shapes[:, 0] - shapes[:, 1], shapes[:, 0] - shapes[:, 1, ::-1]
+    usual = max(float(np.sqrt(np.mean(np.diff(apart, axis=0) ** 2) / 2.0)), float(np.finfo(float).tiny))
+    return float(np.sqrt(np.mean(apart**2))) / usual, float(np.sqrt(np.mean(turned**2))) / usual
+
+
 def _mirrored_readings(deviations: xr.Dataset) -> Check:
     """Readings that are those of the others with the opposite sign."""
     mirrored = [*_mirrored_passes(deviations), *_mirrored_targets(deviations)]
@@ -81,7 +123,7 @@ def _mirrored_readings(deviations: xr.Dataset) -> Check:
         not mirrored,
         f"Deviations have the sign opposite to that of the others: {named}." if mirrored else "The signs agree.",
         "Check the sign of the deviations there." if mirrored else "",
-        "profile, reversal error, anomalies and every effect",
+        "ISO 230-2 values, profile, reversal error, anomalies and every effect",
     )
 
 

@@ -93,7 +93,7 @@ STEP_EVENT = Effect(
     source="level shift at one instant",
     candidates=_step_event,
     repeats=True,
-    label="sudden step",
+    label="sudden step or new zero",
     remedy="Ask whether the laser was zeroed or its beam broken at that time; if not, look at the clamping of optics and laser head.",
 )
 PERIODIC_DISTURBANCE = Effect(

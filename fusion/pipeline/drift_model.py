@@ -180,7 +180,7 @@ def gap_notices(readings: Readings) -> list[Notice]:
 
 
 def library_for(source: Source) -> dict[str, Effect]:
-    """The library with what the campaign file says of the machine: the expansion coefficient that is expected.
+    """The library with what the campaign file says of the machine: the expansion coefficient that is expected, and how well it is known.
 
     Parameters
     ----------
@@ -189,7 +189,8 @@ def library_for(source: Source) -> dict[str, Effect]:
     effects, table = library(), source.campaign.interferometry
     if table is None:
         return effects
-    expected = Prior(table.expansion_coefficient_ppm_per_K, EXPANSION_U_PPM_PER_K)
+    stated_u = table.expansion_coefficient_u_ppm_per_K
+    expected = Prior(table.expansion_coefficient_ppm_per_K, EXPANSION_U_PPM_PER_K if stated_u is None else stated_u)
     return {**effects, "axis_expansion": replace(effects["axis_expansion"], prior=expected)}
 
 

@@ -83,6 +83,10 @@ def test_numbers_arrive_in_the_unit_of_their_name(folder: Path) -> None:
     assert campaign.thermography.reflected_temperature_degC == 22.0
     assert campaign.thermography.atmospheric_temperature_degC is None
     assert campaign.interferometry.expansion_coefficient_ppm_per_K == 11.7
+    assert campaign.interferometry.expansion_coefficient_u_ppm_per_K is None
+    measured = load(folder, TEXT.replace('"11.7 ppm/K"', '"11.2 +- 0.4 ppm/K"')).interferometry
+    assert measured is not None
+    assert (measured.expansion_coefficient_ppm_per_K, measured.expansion_coefficient_u_ppm_per_K) == (11.2, 0.4)
 
 
 def test_paths_start_from_the_campaign_file_and_frames_are_sorted(folder: Path) -> None:

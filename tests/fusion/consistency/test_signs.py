@@ -50,6 +50,16 @@ def test_inverted_signs_are_named_with_their_place(place: tuple, words: str) -> 
     assert words in found["mirrored_readings"].evidence
 
 
+def test_targets_of_one_approach_numbered_from_the_other_end_are_named() -> None:
+    test = sloped()
+    values = test["deviation"].values.copy()
+    values[:, 1] = values[:, 1, ::-1]
+    found = failed(with_deviation(test, values))
+    assert list(found) == ["target_order"]
+    assert "with the targets of one approach read from the other end" in found["target_order"].evidence
+    assert "ISO 230-2 values" in found["target_order"].endangers
+
+
 def test_exchanged_labels_contradict_the_travel() -> None:
     labelled = sloped().assign_coords(direction=["negative", "positive"]).sel(direction=["positive", "negative"])
     check = failed(labelled)["travel_order"]

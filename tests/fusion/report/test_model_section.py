@@ -26,7 +26,7 @@ def test_steps_start_with_the_declared_model() -> None:
         "",
     ]
     assert added.marked
-    assert added.cells[1:3] == ["sudden step", "time / s 1800 (at least 1700), shape flat (or linear)"]
+    assert added.cells[1:3] == ["sudden step or new zero", "time / s 1800 (at least 1700), shape flat (or linear)"]
     assert added.cells[4:9] == ["0.600", "0.400", "0.700", "0.500", "yes"]
     assert added.cells[-1] == "dead path of the laser, 4.0 less in log-likelihood"
 
@@ -58,7 +58,7 @@ def test_a_refused_effect_that_is_significant_has_its_p_value() -> None:
 def test_the_model_is_told_in_numbers() -> None:
     rows = dict(model_section.describe_model(LOOP))
     assert rows["expansion of the axis"] == "11.60 \u00b1 0.40 ppm/K (expected beforehand 11.7 \u00b1 4.0 ppm/K)"
-    assert rows["sudden step"] == "1.00 \u00b1 0.20 \u00b5m"
+    assert rows["sudden step or new zero"] == "1.00 \u00b1 0.20 \u00b5m"
     assert rows["unexplained drift"].startswith(
         "random walk; rms 0.10 \u00b5m common to all positions, below 0.001 \u00b5m"
     )
@@ -79,7 +79,7 @@ def test_an_effect_that_cannot_be_detected_has_no_limit() -> None:
 
 def test_candidates_are_listed_by_round() -> None:
     (row,) = model_section.describe_candidates(LOOP).rows
-    assert row.cells == ["1", "sudden step", "", "9.0", "8.0", "0.01", "4.0", "0.01"]
+    assert row.cells == ["1", "sudden step or new zero", "", "9.0", "8.0", "0.01", "4.0", "0.01"]
 
 
 def test_evidence_is_told_with_all_its_numbers() -> None:

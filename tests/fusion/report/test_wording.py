@@ -54,14 +54,14 @@ def loop(verdict: Verdict, *effects: str, shape: str = "") -> Loop:
     ("found", "sentence"),
     [
         (loop("complete"), "The declared model explains the drift; nothing in these data shows that an effect is missing."),
-        (loop("explained", "step_event"), "The declared model lacked an effect: sudden step. With it, nothing is left that these data can show."),
+        (loop("explained", "step_event"), "The declared model lacked an effect: sudden step or new zero. With it, nothing is left that these data can show."),
         (
             loop("explained", "step_event", "dead_path"),
-            "The declared model lacked 2 effects: sudden step and dead path of the laser. With them, nothing is left that these data can show.",
+            "The declared model lacked 2 effects: sudden step or new zero and dead path of the laser. With them, nothing is left that these data can show.",
         ),
         (
             loop("partial", "step_event", shape="a wave of 37 min"),
-            "The declared model lacked an effect: sudden step. With it, something without a name is left (a wave of 37 min).",
+            "The declared model lacked an effect: sudden step or new zero. With it, something without a name is left (a wave of 37 min).",
         ),
         (loop("unexplained"), "Something is left that no effect of the library explains."),
         (
@@ -70,7 +70,7 @@ def loop(verdict: Verdict, *effects: str, shape: str = "") -> Loop:
         ),
         (
             loop("unexplained").model_copy(update={"steps": (StepPart.model_construct(effect="step_event", confirmed=False),)}),
-            "Something is left that no effect of the library explains (sudden step is not confirmed).",
+            "Something is left that no effect of the library explains (sudden step or new zero is not confirmed).",
         ),
         (
             loop("no_skill", shape="a slow drift"),

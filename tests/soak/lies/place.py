@@ -113,6 +113,7 @@ LIES = (
     Lie("axis direction flipped, same origin", AXIS, axis((500.0, 90.0), (1, 0))),
     Lie("axis direction flipped, origin on the plan", AXIS, axis((500.0 - TRAVEL_MM, 90.0), (1, 0))),
     Lie("plan origin 150 mm wrong along the axis", AXIS, axis((650.0, 90.0), (-1, 0))),
+    Lie("plan origin 200 mm wrong along the axis", AXIS, axis((700.0, 90.0), (-1, 0))),
     Lie("plan origin 60 mm wrong across the axis", AXIS, axis((500.0, 150.0), (-1, 0))),
     Lie("plan origin off the plan", AXIS, axis((500.0, 900.0), (-1, 0))),
     Lie("axis along y for along x", AXIS, axis((500.0, 90.0), (0, -1))),

@@ -92,6 +92,16 @@ def positions_reversed(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(position_mm=(table["position_mm"].max() - table["position_mm"]).round(4))
 
 
+def targets_reversed_in_one_approach(table: pd.DataFrame) -> pd.DataFrame:
+    """Number the targets of one approach from the other end: their readings change places, with their times."""
+    other = table.assign(target=TARGETS + 1 - table["target"])[["cycle", "direction", "target", "deviation_um"]]
+    joined = table.drop(columns="deviation_um").merge(other, on=["cycle", "direction", "target"])
+    values = joined.set_index(["cycle", "direction", "target"])["deviation_um"]
+    keys = pd.MultiIndex.from_frame(table[["cycle", "direction", "target"]])
+    reversed_um = pd.Series(values.reindex(keys).to_numpy(), index=table.index)
+    return table.assign(deviation_um=table["deviation_um"].where(table["direction"] == "positive", reversed_um))
+
+
 def positions_shifted(table: pd.DataFrame) -> pd.DataFrame:
     spacing = table["position_mm"].max() / (TARGETS - 1)
     return table.assign(position_mm=(table["position_mm"] + spacing).round(4))
@@ -116,6 +126,7 @@ LIES = (
     Lie("approach labels swapped everywhere", APPROACH, swapped_approaches(0)),
     Lie("approach labels swapped in the second half", APPROACH, swapped_approaches(HALF)),
     Lie("targets numbered from the other end", TARGETS_NAMED, laser(positions_reversed)),
+    Lie("targets of one approach numbered from the other end", TARGETS_NAMED, laser(targets_reversed_in_one_approach)),
     Lie("target list shifted by one", TARGETS_NAMED, laser(positions_shifted)),
     Lie("places of targets 2 and 7 exchanged", TARGETS_NAMED, laser(exchanged_targets)),
     Lie("cycles numbered from 0", NUMBERS, laser(lambda t: t.assign(cycle=t["cycle"] - 1)), renumbered=1),
@@ -143,6 +154,12 @@ LIES = (
         "last 7 cycles of another set-up: +20 µm",
         DATUM,
         added(lambda t: t["cycle"].isin(_LAST), 20.0),
+        describes=frozenset({"step_event"}),
+    ),
+    Lie(
+        "+5 µm at all targets from cycle 15 on",
+        DATUM,
+        added(lambda t: t["cycle"] >= _COPIED, 5.0),
         describes=frozenset({"step_event"}),
     ),
     Lie("laser set to zero at the start of every cycle", DATUM, laser(zeroed_in_every_cycle)),

@@ -40,6 +40,7 @@ LIES = (
     Lie("deviations in mm as µm (/1000)", DEVIATION, deviation(1e-3)),
     Lie("deviations in nm as µm (x 1000)", DEVIATION, deviation(1e3)),
     Lie("deviations in µinch as µm (x 39.4)", DEVIATION, deviation(1e3 / _INCH_MM)),
+    Lie("deviations scaled by 1.4", DEVIATION + "|scale|coefficient", deviation(1.4)),
     Lie(
         "decimal comma lost in every deviation",
         DEVIATION,
