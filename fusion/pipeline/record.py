@@ -18,16 +18,18 @@ from fusion.record.blocks import Record, reduce_record
 from fusion.record.hold_out import declare
 from fusion.record.loop import close_record
 from fusion.record.result import RecordResult
-from fusion.report.wording import duration
+from fusion.record.sensor_health import SensorHealth, examine_record
+from fusion.report.wording import describe_fault, duration, number
 
 
 @dataclass(frozen=True)
 class RecordSource:
-    """A record as it was read, before anything is modelled: on its blocks, with what is declared and what was left out."""
+    """A record as it was read, before anything is modelled: what is declared, what was left out, and the health of its sensors."""
 
     record: Record
     declared: list[str]
     notices: list[Notice]
+    health: SensorHealth
 
 
 def read_source(campaign: Campaign) -> RecordSource:
@@ -40,14 +42,16 @@ def read_source(campaign: Campaign) -> RecordSource:
     Raises
     ------
     TableError, RecordError
-        If the table cannot be read or is too short, or a declared effect has no meaning for a record.
+        If the table cannot be read or is too short, no sensor is sound, or a declared effect has no meaning for a record.
     """
     table = read_record(campaign)
-    record = reduce_record(table)
     declared, notices = declared_effects(campaign)
+    health = examine_record(table, declared)
+    record = reduce_record(health.table)
     declare(declared, record)
+    left_out = left_out_notices(table, "record_rows_left_out")
     return RecordSource(
-        record, declared, [*notices, *left_out_notices(table, "record_rows_left_out"), *record_notices(record)]
+        record, declared, [*sensor_notices(health), *notices, *left_out, *record_notices(record)], health
     )
 
 
@@ -62,7 +66,8 @@ def model_record(source: RecordSource, *, report: Report) -> Outcome:
     result = close_record(
         source.record, source.declared, progress=lambda done, total, what: report("closed loop", done, total)
     )
-    return Outcome(record_variables(source.record, result), {"loop": result.as_json()}, tuple(source.notices))
+    loop = {**result.as_json(), "sensor_faults": source.health.as_json()}
+    return Outcome(record_variables(source.record, result), {"loop": loop}, tuple(source.notices))
 
 
 def declared_effects(campaign: Campaign) -> tuple[list[str], list[Notice]]:
@@ -87,6 +92,39 @@ def declared_effects(campaign: Campaign) -> tuple[list[str], list[Notice]]:
     return [QUASI_STATIC, *(name for name in kept if name != QUASI_STATIC)], [
         Notice("declared_without_axis", message, remedy)
     ]
+
+
+def sensor_notices(health: SensorHealth) -> list[Notice]:
+    """Notices of sensors that were left out because they are faulty, and of those that are suspected.
+
+    Parameters
+    ----------
+    health : of the sensors of a record
+    """
+    notices = []
+    for fault in health.faults:
+        name = health.names[fault.sensor]
+        told = f"{name} {describe_fault(fault)}"
+        if fault.is_clear:
+            error = health.errors_um[name]
+            with_it = f"{number(error, 3)} µm with it" if np.isfinite(error) else "no model with it"
+            notices.append(
+                Notice(
+                    "record_sensor_faulty",
+                    f"{told}; it is left out of the whole record. Held-out error of the declared model: {with_it}, "
+                    f"{number(health.sound_um, 3)} µm without.",
+                    f"Look at contact, cable and input of {name}.",
+                )
+            )
+        else:
+            notices.append(
+                Notice(
+                    "record_sensor_suspected",
+                    f"{told}. It is suspected only ({fault.reason}), and stays in the model.",
+                    f"Look at contact, cable and input of {name}; take it out of record.temperatures if it is faulty.",
+                )
+            )
+    return notices
 
 
 def record_notices(record: Record) -> list[Notice]:

@@ -431,6 +431,33 @@ class ChainedPart(ResultPart):
     """Root mean square error of the final model, um."""
 
 
+class SensorFaultPart(ResultPart):
+    """A temperature sensor that is faulty or suspected."""
+
+    sensor: str
+    """Name of the sensor."""
+    kind: Literal["no signal", "stuck", "jump", "ramp", "drift", "noise"]
+    """What it does."""
+    state: Literal["left_out", "suspected"]
+    """Whether it was left out of the whole record, or stays because a machine may do the same."""
+    onset_s: Number
+    """When it began, s from the start."""
+    onset_u_s: Number
+    """Standard uncertainty of that, s."""
+    size: Number
+    """Change beyond what the other sensors predict, K; of noise the ratio after to before; null where there is no signal."""
+    ratio: Number
+    """Its largest excursion over the next largest; null where none is compared."""
+    limit: Number
+    """Ratio from which it is named; null as above."""
+    reason: str
+    """Why it is suspected only; empty for one that was left out."""
+    rmse_with_um: Number
+    """Error of the declared model on the hold-out set with it, um; null for a suspected one, and where it has too few readings."""
+    rmse_without_um: Number
+    """The same without all sensors that were left out, um; null for a suspected one."""
+
+
 class RecordLoop(Loop):
     """What the closed loop found on a record; errors are means over the channels."""
 
@@ -444,3 +471,5 @@ class RecordLoop(Loop):
     """Forward-chained parts."""
     search: tuple[tuple[RecordScorePart, ...], ...]
     """Scores of every round of the search."""
+    sensor_faults: tuple[SensorFaultPart, ...] = ()
+    """Sensors that are faulty or suspected, examined before any model."""

@@ -15,6 +15,7 @@ from fusion.report import plots_record
 from fusion.report.model_section import DECIDED_BEFORE, errors_table, parameters, refused_effects, steps_table
 from fusion.report.tables import Row, Table, Words, table
 from fusion.report.wording import (
+    describe_fault,
     duration,
     effect_words,
     join,
@@ -128,6 +129,7 @@ def describe_record(results: Results, provenance: Mapping[str, Any], record: xr.
         ],
         "shown": list(enumerate(_shown_channels(record))),
         "omitted": max(0, len(channels) - _MOST_CHANNELS),
+        "sensor_faults": _sensor_faults_table(loop),
         "steps": steps_table(loop),
         "errors": errors_table(loop),
         "unexplained": loop.unexplained,
@@ -185,6 +187,32 @@ def _numbers(loop: RecordLoop) -> list[dict[str, str]]:
             }
         )
     return numbers
+
+
+def _sensor_faults_table(loop: RecordLoop) -> Table:
+    """Return the sensors that are faulty or suspected, with the error of the declared model with and without each."""
+    rows = [
+        [
+            fault.sensor,
+            f"{describe_fault(fault)}{f'; {fault.reason}' if fault.reason else ''}",
+            number(fault.ratio, 3),
+            number(fault.limit, 3),
+            fault.state.replace("_", " "),
+            number(fault.rmse_with_um, 3),
+            number(fault.rmse_without_um, 3),
+        ]
+        for fault in loop.sensor_faults
+    ]
+    columns = [
+        Words("Sensor"),
+        Words("What it does"),
+        "Largest excursion / next",
+        "Limit",
+        Words("State"),
+        "Held-out error with it / µm",
+        "without / µm",
+    ]
+    return table(columns, rows)
 
 
 def _channels_table(loop: RecordLoop) -> Table:

@@ -8,10 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from fusion.alignment.sensor_health import Kind, SensorFault
 from fusion.effects.effect import Candidate
 from fusion.model.fit import Term
-from fusion.pipeline.record import declared_effects, record_notices, record_variables
+from fusion.pipeline.record import declared_effects, record_notices, record_variables, sensor_notices
 from fusion.record.blocks import Record
+from fusion.record.sensor_health import SensorHealth
 from tests.fusion.record_tables import record_of
 
 
@@ -72,6 +74,25 @@ def test_dependent_sensors_and_missing_drivers_are_noted():
     told = notices_of(plain(duplicates=("t2", "t3"), drivers={}))
     assert told["record_sensors_dependent"] == "Left out because the other sensors tell the same: t2; t3."
     assert told["no_drivers"].startswith("No driver was logged, so a heat source that no sensor sees")
+
+
+def test_a_faulty_sensor_is_noted_with_both_errors_and_a_suspected_one_with_its_reason():
+    faults = (
+        SensorFault(0, Kind.RAMP, True, 7200.0, 360.0, 28.0, 90.0, 10.0),
+        SensorFault(1, Kind.NO_SIGNAL, True, 7200.0, 60.0, np.nan),
+        SensorFault(2, Kind.JUMP, False, 3600.0, 60.0, -2.0, 12.0, 10.0, "other sensors respond"),
+    )
+    errors = {"t1": 12.34, "t2": np.nan}
+    ramp, silent, suspected = sensor_notices(SensorHealth(None, ("t1", "t2", "t3"), faults, errors, 2.345))
+    assert ramp.code == silent.code == "record_sensor_faulty"
+    assert ramp.message == (
+        "t1 ramps by 28 K from 2.00 h on (standard uncertainty 0.1 h); it is left out of the whole record. Held-out error of the "
+        "declared model: 12.3 µm with it, 2.35 µm without."
+    )
+    assert "no model with it" in silent.message
+    assert suspected.code == "record_sensor_suspected"
+    assert "t3 jumps by 2 K from 1.00 h on" in suspected.message
+    assert "suspected only (other sensors respond), and stays in the model" in suspected.message
 
 
 def result_of(record: Record, *, names: tuple[str, ...], chained: list[tuple[float, float]]) -> SimpleNamespace:

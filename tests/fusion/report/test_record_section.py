@@ -56,3 +56,26 @@ def test_a_candidate_that_was_tried_and_not_chosen_is_rejected_whatever_the_sent
     told = describe_record(results, {"inputs": {}}, record())
     assert [row.cells[-1] for row in told["candidates"].rows] == ["predicts no better", ""]
     assert len(told["rejected"].rows) == 1
+
+
+def test_a_faulty_sensor_stands_with_the_error_with_and_without_it() -> None:
+    fault = {
+        "sensor": "t5",
+        "kind": "ramp",
+        "state": "left_out",
+        "onset_s": 9000.0,
+        "onset_u_s": 180.0,
+        "size": 27.9,
+        "ratio": 214.0,
+        "limit": 10.6,
+        "reason": "",
+        "rmse_with_um": 15.7,
+        "rmse_without_um": 4.3,
+    }
+    suspected = {**fault, "state": "suspected", "reason": "other sensors respond", "rmse_with_um": None}
+    results = assemble("R", {"loop": {**RECORD_LOOP, "sensor_faults": [fault, suspected]}}, [])
+    first, second = describe_record(results, {"inputs": {}}, record())["sensor_faults"].rows
+    told = "ramps by 28 K from 2.50 h on (standard uncertainty 0.05 h)"
+    assert first.cells == ["t5", told, "214", "10.6", "left out", "15.7", "4.30"]
+    assert second.cells[1] == f"{told}; other sensors respond"
+    assert describe_record(RESULTS, {"inputs": {}}, record())["sensor_faults"].rows == ()
