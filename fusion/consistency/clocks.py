@@ -1,4 +1,4 @@
-"""Checks of the clocks against one another: loads and material temperature against the field, the field against the drift.
+"""Checks of the clocks against one another, loads and material temperature against the field, the field against the drift; scale of loads.
 
 Each compares two courses at many shifts of one clock. A shift is doubted only where it lies outside the delays that physics makes and
 explains far more than every delay within them; where the data cannot tell, the check is passed and says so.
@@ -6,6 +6,7 @@ explains far more than every delay within them; where the data cannot tell, the 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,6 +44,12 @@ _MODES = 2
 #: Share of the variance of the field's rate that the load must explain, and the factor by which a shift must lessen what is left: half
 #: the standard deviation.
 _LEAST_EXPLAINED, _LEFT_RATIO = 0.6, 4.0
+#: A load whose largest value grows or falls by this factor from one sample to the next may have changed its unit; ...
+_SCALE_JUMP = 20.0
+#: ... by one of these: minutes or seconds, per cent, thousands, hours or seconds.
+_SCALES = (60.0, 100.0, 1000.0, 3600.0)
+#: Largest load in per cent: drives may be overloaded.
+_PER_CENT = 200.0
 #: Resampled courses, none of which may gain as much, from blocks of this length, s.
 _DRAWS, _BLOCK_S = 400, 1800.0
 
@@ -156,6 +163,82 @@ def check_load_clock(field: FieldSeries | None, log: xr.Dataset | None, *, file:
     return [_log_check("drivers_clock", file, "load", best, endangered)]
 
 
+def check_load_scale(field: FieldSeries | None, log: xr.Dataset | None, *, file: str) -> list[Check]:
+    """Check that a load keeps its unit: a share does not become per cent, and where a size jumps, the field's rate must follow.
+
+    Parameters
+    ----------
+    field : FieldSeries or None
+        Temperature of the table; None where too few frames show it.
+    log : Dataset or None
+        Drivers along ``time`` (UTC).
+    file : str
+        The file, for the message.
+
+    Returns
+    -------
+    list of Check
+        ``drivers_scale``; empty where no load was logged or no field is there.
+    """
+    loads = {} if log is None else {str(name): column for name, column in log.data_vars.items() if _is_load(column)}
+    if field is None or log is None or not loads:
+        return []
+    at, rate = field.since_start(log["time"].values), _Rate.of(field)
+    value, evidence = 1.0, f"The loads in {file} keep their scale (or it cannot be told)."
+    for name, column in loads.items():
+        load = column.values.astype(float)
+        for start, factor in _scale_jumps(load):
+            share = str(column.attrs.get("units", "")) == "1" and _share_and_per_cent(load, start)
+            reason = "a share and per cent" if share else _rate_against_jump(rate, at, load, start, factor)
+            if reason:
+                value = 100.0 if share else max(factor, 1.0 / factor)
+                since = np.datetime_as_string(log["time"].values[start], unit="s")
+                size = "larger" if factor > 1.0 else "smaller"
+                evidence = f"{name} in {file} is some {value:.0f} times {size} from {since}Z on: {reason}."
+    passed = value == 1.0
+    remedy = "" if passed else f"Write all rows of {file} in one unit; a share is 0 to 1 or, throughout, per cent."
+    endangered = "every effect that follows a load, and the verdict that none is missing"
+    return [Check("drivers_scale", value, _SCALE_JUMP, passed, evidence, remedy, endangered)]
+
+
+def _scale_jumps(load: Array) -> Iterator[tuple[int, float]]:
+    """First sample on another scale, and the factor of `_SCALES` next to that of the largest values, or its inverse."""
+    size = np.where(np.isfinite(load), np.abs(load), 0.0)
+    for sizes, falls in ((size, False), (size[::-1], True)):
+        largest = np.maximum.accumulate(sizes)
+        jumps = np.flatnonzero((largest[:-1] > 0.0) & (sizes[1:] > _SCALE_JUMP * largest[:-1]))
+        if jumps.size:
+            ratio = largest[-1] / largest[jumps[-1]]
+            scale = min(_SCALES, key=lambda known: abs(np.log(known / ratio)))
+            yield (size.size - jumps[-1] - 1, 1.0 / scale) if falls else (int(jumps[-1]) + 1, scale)
+
+
+def _share_and_per_cent(load: Array, start: int) -> bool:
+    """Whether a load is 0 to 1 on one side of a jump and up to some hundred on the other; flags and numbers of programs are whole."""
+    sides = sorted((load[:start], load[start:]), key=lambda side: float(np.nanmax(np.abs(side))))
+    share, other = (side[np.isfinite(side)] for side in sides)
+    fractional = bool(np.any(share != np.rint(share)))
+    shares = fractional and share.min() >= 0.0 and share.max() <= 1.0
+    return bool(shares and other.min() >= 0.0 and 0.01 * _PER_CENT < other.max() <= _PER_CENT)
+
+
+def _rate_against_jump(rate: _Rate, at: Array, load: Array, start: int, factor: float) -> str:
+    """Why the field contradicts a jump of a load; empty where it does not."""
+    corrected = np.where(np.arange(load.size) < start, load, load / factor)
+    left, left_corrected = _load_left(rate, at, load), _load_left(rate, at, corrected)
+    if left_corrected > 1.0 - _LEAST_EXPLAINED or left < _LEFT_RATIO * left_corrected:
+        return ""
+    as_logged, without = (100.0 * np.sqrt(share) for share in (left, left_corrected))
+    return f"the load leaves {as_logged:.0f} % of the field's rate unexplained as it is logged, {without:.0f} % without that factor"
+
+
+def _load_left(rate: _Rate, at: Array, load: Array) -> float:
+    """Share of the variance of the field's rate that a load leaves, at the best delay of physics."""
+    columns = rate.columns(at, load, _LOG_SHIFTS_S[_delays(_LOG_DELAY_S)])
+    explained = ((columns.reshape(-1, columns.shape[-1]) @ rate.modes) ** 2).sum(axis=1)
+    return 1.0 - float(explained.max()) / max(float((rate.modes**2).sum()), 1e-30)
+
+
 def _is_load(column: xr.DataArray) -> bool:
     """Whether a column may drive the field: numbers that change and are no temperature."""
     if column.dtype.kind not in "fiu" or str(column.attrs.get("units", "")) in ("degC", "K"):
@@ -196,7 +279,7 @@ class _Rate:
         modes = (increments @ patterns[:_MODES].T) * weight[:, None]
         return cls(field.seconds, weight, trend, modes - trend @ (trend.T @ modes))
 
-    def columns(self, at: Array, load: Array) -> Array:
+    def columns(self, at: Array, load: Array, shifts_s: NDArray[np.floating] = _LOG_SHIFTS_S) -> Array:
         """Unit responses to a load, (shifts, shapes, n), whitened and freed of the trend; zero where a load does not change."""
         grid = np.arange(at[0], at[-1] + 1.0, 60.0)
         finite = np.isfinite(load)
@@ -209,7 +292,7 @@ class _Rate:
         columns = np.array(
             [
                 [np.diff(np.interp(self.seconds + shift, grid, shape)) * self.weight for shape in shapes]
-                for shift in _LOG_SHIFTS_S
+                for shift in shifts_s
             ]
         )
         columns -= (columns @ self.trend) @ self.trend.T

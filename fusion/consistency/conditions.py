@@ -63,8 +63,11 @@ _CONDITIONS = {
     "camera_phase": Condition("the table was in place when the frames were taken", _CAMERA),
     "camera_clock": Condition("the clocks of camera and laser agree as stated", _CLOCK),
     "environment_clock": Condition("the clock of the environment log is right", (_CAUSES,)),
+    "drivers_scale": Condition("the loads are logged in one unit throughout", (_CAUSES,)),
     "drivers_clock": Condition("the clock of the drivers' log is right", (_CAUSES,)),
     "material_course": Condition("frames and environment log are of one test and in order", _CAMERA),
+    "material_still": Condition("the material sensor measured the table", (_CAUSES,)),
+    "environment_columns": Condition("the columns of the environment log are named right", (_CAUSES,)),
     "material_rise": Condition("the emissivity is right", _CAMERA),
     "material_level": Condition("the level of the camera's temperature is right", _CAMERA),
     "expansion_coefficient": Condition(

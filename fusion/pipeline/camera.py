@@ -17,7 +17,7 @@ from fusion.campaign.inputs import Source, SourceError, counted, frames_notices,
 from fusion.products.progress import Report
 from fusion.products.results import Notice
 from thermography.errors import ThermographyError
-from thermography.fields.survey import Blocks, Survey, disturbed_frames, locate_blocks, survey_frames
+from thermography.fields.survey import LEAST_BESIDE, Blocks, Survey, disturbed_frames, locate_blocks, survey_frames
 from thermography.io.flir import FrameReference, RejectedFrame
 from thermography.radiometry.camera_artefacts import find_repeats
 from thermography.radiometry.camera_correction import (
@@ -31,8 +31,6 @@ from thermography.radiometry.overrides import Overrides
 from thermography.radiometry.planck import ZERO_CELSIUS_K, signal_slope
 from thermography.registration.register import Registration
 
-#: Fewest blocks beside the table that tell the camera from the table.
-_LEAST_BLOCKS = 4
 #: Uncertainty of the camera's zero from which it is named, K: as large as the steps that many cameras make.
 _NAMED_U_K = 0.1
 #: Largest number of positions at which a moving table is laid out.
@@ -187,7 +185,7 @@ def examine_camera(source: Source, survey: Survey, registration: Registration) -
         shifts = np.linspace(-travel, travel, _POSITIONS)[:, None] * np.array(source.plan.axis.direction)
     blocks = locate_blocks(survey, registration, source.grid, shifts)
     _refuse_patch_on_plan(source, blocks)
-    disturbed = disturbed_frames(survey, blocks)
+    disturbed = disturbed_frames(survey, blocks, still=source.thermography.table == "still")
     left_out = [
         *survey.damaged,
         *(RejectedFrame(survey.frames[i].path, survey.frames[i].index, reason) for i, reason in disturbed.items()),
@@ -270,7 +268,7 @@ def _levels(survey: Survey, blocks: Blocks, kept: Array) -> tuple[Array, Array, 
     """Level of what lies beside the table, mean and spread of the table, (frames,) degC and K; None where nothing lies beside it."""
     beside = survey.levels[kept][:, blocks.beside].astype(float)
     beside = beside[:, np.isfinite(beside).all(axis=0)]
-    if beside.shape[1] < _LEAST_BLOCKS:
+    if beside.shape[1] < LEAST_BESIDE:
         return None
     middle = np.median(beside, axis=0)
     # People and warm parts move in some of the blocks; the quieter half shows the room and the camera.

@@ -14,7 +14,7 @@ from fusion.campaign.config import CampaignError
 from fusion.campaign.inputs import Source
 from fusion.consistency.camera_stamps import check_order, check_phase
 from fusion.consistency.checks import CODES, Check
-from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_material_clock
+from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_load_scale, check_material_clock
 from fusion.consistency.coefficients import check_coefficients
 from fusion.consistency.field_series import field_at, thin_fields
 from fusion.consistency.frames import check_frames
@@ -107,11 +107,13 @@ def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[
     near = field if place_mm is None else field_at(fields, place_mm)
     interferometry, drivers = source.campaign.interferometry, source.campaign.drivers
     environment_file = (interferometry.environment if interferometry is not None else None) or "the environment log"
+    drivers_file = drivers.file if drivers is not None else "the drivers' log"
     return [
         *check_camera_clock(read_fused(fused)),
         *check_material_clock(near, source.environment, file=environment_file),
-        *check_load_clock(field, source.drivers, file=drivers.file if drivers is not None else "the drivers' log"),
-        *check_material(near, source.environment, stated=place_mm is not None),
+        *check_load_clock(field, source.drivers, file=drivers_file),
+        *check_load_scale(field, source.drivers, file=drivers_file),
+        *check_material(near, source.environment, stated=place_mm is not None, file=environment_file),
         *check_place(fields),
     ]
 

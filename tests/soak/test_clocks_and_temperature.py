@@ -13,7 +13,7 @@ from fusion.alignment.align import AxisGeometry, align
 from fusion.alignment.readings import read_fused
 from fusion.consistency.camera_stamps import check_phase
 from fusion.consistency.checks import Check
-from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_material_clock
+from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_load_scale, check_material_clock
 from fusion.consistency.field_series import field_at, thin_fields
 from fusion.consistency.temperature import check_material
 from fusion.twin import simulate
@@ -67,7 +67,8 @@ def of_logs(test: Recorded, *, stated: bool) -> list[Check]:
     return [
         *check_material_clock(near, test.environment, file="environment.csv"),
         *check_load_clock(field, test.drivers, file="drivers.csv"),
-        *check_material(near, test.environment, stated=stated),
+        *check_load_scale(field, test.drivers, file="drivers.csv"),
+        *check_material(near, test.environment, stated=stated, file="environment.csv"),
     ]
 
 

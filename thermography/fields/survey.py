@@ -34,8 +34,21 @@ _EDGE_PX = 4
 _LEAST_PIXELS = 16
 #: ... where frames differ so in most of the series, from this multiple of the upper quartile on.
 _ORDINARY_MULTIPLE = 5.0
+#: A frame is of another series from this excess of its table over both neighbours on, K: no table warms and cools by as much from one frame
+#: to the next, ...
+_STRAY_K = 0.2
+#: ... and this share of the difference between its neighbours, so that the bend of a steep course is none.
+_STRAY_SHARE = 0.5
+#: Frames that follow one another are told in turn, the outermost last.
+_STRAY_PASSES = 5
+#: Fewest frames that show what is ordinary.
+_LEAST_FRAMES = 8
+#: Beyond the ends of a series a course goes on by this multiple of its last change.
+_END_STRETCH = 2
 #: About this number of pixels gives noise (to 3 %) and common shift of two frames.
 _SAMPLE_PX = 1200
+#: Fewest blocks beside the table that tell the camera from the table.
+LEAST_BESIDE = 4
 #: Width of the lens's blur at the table's edge, px.
 _MARGIN_PX = 4
 
@@ -194,7 +207,7 @@ class _Neighbours:
         before, after = (self._window[other][1] for other in others)
         limit, shift = _limit_and_shift(counts, before, after)
         # The change between the two others goes on beyond the ends of the series.
-        stretch = 2 if end else 0
+        stretch = _END_STRETCH if end else 0
         flat = (counts.reshape(-1), before.reshape(-1), after.reshape(-1))
         if _count_off(*flat, limit, shift, stretch) < _LEAST_PIXELS:
             return
@@ -323,14 +336,71 @@ def locate_blocks(survey: Survey, registration: Registration, grid: PlanGrid, sh
     return Blocks(on_table == survey.edge_px**2, touched == 0, anywhere.astype(bool))
 
 
-def disturbed_frames(survey: Survey, blocks: Blocks) -> dict[int, str]:
-    """Frames that a part of the table alone tells from the frames before and after, or whose pixels leave the camera's range.
+def stray_frames(levels: Array, *, ends: bool) -> dict[int, float]:
+    """Frames whose table is warmer or colder than in the frames before and after: of another series, or taken with another setting.
+
+    Parameters
+    ----------
+    levels : (n, blocks) ndarray, K
+        Levels of the blocks that show the table, free of what all pixels have in common.
+    ends : bool
+        Whether the first and the last frame are judged as well, by the two next to them; a step of the camera's zero that `levels` contain
+        would make them stand out.
+
+    Returns
+    -------
+    dict of int to float
+        Root mean square over the blocks, K, by which a frame lies beyond the frames before and after, by its index.
+
+    Notes
+    -----
+    A table warms and cools steadily, so that a frame lies between its neighbours; a step of the camera's zero leaves it at one of them.
+    Frames that are found are taken out and the others judged again, as a stray frame makes its neighbours stand out.
+    """
+    kept, found = np.arange(len(levels)), dict[int, float]()
+    for _ in range(_STRAY_PASSES):
+        if kept.size < _LEAST_FRAMES:
+            break
+        beyond, change = _beyond(levels[kept], ends=ends)
+        limit = np.maximum(max(_STRAY_K, _ORDINARY_MULTIPLE * float(np.quantile(beyond, 0.75))), _STRAY_SHARE * change)
+        around = np.pad(beyond, 1)
+        stray = (beyond > limit) & (beyond >= np.maximum(around[:-2], around[2:]))
+        if not stray.any():
+            break
+        found.update({int(i): float(b) for i, b in zip(kept[stray], beyond[stray], strict=True)})
+        kept = kept[~stray]
+    return dict(sorted(found.items()))
+
+
+def _beyond(levels: Array, *, ends: bool) -> tuple[Array, Array]:
+    """By how much every frame lies beyond its two neighbours, and by how much these differ, (n,) K root mean square over the blocks."""
+    n = len(levels)
+    before, after = np.maximum(np.arange(n) - 1, 0), np.minimum(np.arange(n) + 1, n - 1)
+    before[-1], after[0] = n - 3, 2
+    before[0] = 1
+    after[-1] = n - 2
+    lower, upper = np.minimum(levels[before], levels[after]), np.maximum(levels[before], levels[after])
+    # The change between the two others goes on beyond the ends of the series.
+    stretch = np.zeros((n, 1))
+    stretch[[0, -1]] = _END_STRETCH
+    reach = stretch * (upper - lower)
+    excess = np.maximum(levels - upper - reach, 0.0) + np.maximum(lower - levels - reach, 0.0)
+    beyond, change = (np.sqrt(np.mean(values**2, axis=1)) for values in (excess, upper - lower))
+    if not ends:
+        beyond[[0, -1]] = 0.0
+    return beyond, change
+
+
+def disturbed_frames(survey: Survey, blocks: Blocks, *, still: bool) -> dict[int, str]:
+    """Frames that the table tells from the frames before and after, or whose pixels leave the camera's range.
 
     Parameters
     ----------
     survey : Survey
     blocks : Blocks
         Of `locate_blocks`.
+    still : bool
+        Whether the table stands still, so that its levels can be compared with those of the frames before and after.
 
     Returns
     -------
@@ -348,6 +418,28 @@ def disturbed_frames(survey: Survey, blocks: Blocks) -> dict[int, str]:
     ):
         limit = max(_LEAST_PIXELS, _ORDINARY_MULTIPLE * float(np.quantile(numbers, 0.75)))
         found.update(
-            {int(i): f"{text.format(numbers[i])}: damaged or covered" for i in np.flatnonzero(numbers >= limit)}
+            {
+                int(i): f"{text.format(numbers[i])}: damaged, covered, or of another series"
+                for i in np.flatnonzero(numbers >= limit)
+            }
         )
+    if still:
+        found.update(_strays(survey, blocks, np.array([i for i in range(n) if i not in found], int)))
     return dict(sorted(found.items()))
+
+
+def _strays(survey: Survey, blocks: Blocks, kept: NDArray[np.int64]) -> dict[int, str]:
+    """Reason by index for those of the kept frames whose table is warmer or colder than in the frames before and after."""
+    table, beside = (survey.levels[kept][:, chosen].astype(float) for chosen in (blocks.table, blocks.beside))
+    table, beside = (levels[:, np.isfinite(levels).all(axis=0)] for levels in (table, beside))
+    if table.shape[1] == 0:
+        return {}
+    examined = beside.shape[1] >= LEAST_BESIDE
+    if examined:
+        table = table - np.median(beside - np.median(beside, axis=0), axis=1, keepdims=True)
+    return {
+        int(
+            kept[i]
+        ): f"the table lies {beyond:.2g} K off the frames before and after it: of another series, or of another setting"
+        for i, beyond in stray_frames(table, ends=examined).items()
+    }

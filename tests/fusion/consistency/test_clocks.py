@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from fusion.consistency.checks import Check
-from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_material_clock
+from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_load_scale, check_material_clock
 from fusion.consistency.field_series import field_at, thin_fields
 from tests.fusion.consistency.twin_fields import SENSOR_MM, Recorded, late, recorded
 
@@ -83,3 +84,50 @@ def test_inputs_stay_as_they_were() -> None:
     logs(test)
     assert test.environment.identical(kept[0]) and test.drivers.identical(kept[1])
     assert np.array_equal(test.fields["frame_temperature"], kept[2]["frame_temperature"])
+
+
+def loads(values: np.ndarray, units: str = "1") -> xr.Dataset:
+    drivers = recorded().drivers
+    changed = drivers["duty"].copy(data=values)
+    changed.attrs["units"] = units
+    return xr.Dataset({"duty": changed})
+
+
+@pytest.mark.parametrize("from_middle", [100.0, 0.01])
+def test_a_share_that_becomes_per_cent_is_doubted(from_middle: float) -> None:
+    test = recorded()
+    duty = test.drivers["duty"].values.astype(float)
+    half = np.arange(duty.size) >= duty.size // 2
+    log = loads(np.where(half, from_middle, 1.0) * duty * (1.0 if from_middle > 1.0 else 100.0))
+    (check,) = check_load_scale(thin_fields(test.fields), log, file="drivers.csv")
+    assert not check.passed and check.value == 100.0
+    assert check.evidence.startswith(
+        f"duty in drivers.csv is some 100 times {'larger' if from_middle > 1.0 else 'smaller'}"
+    )
+    assert check.evidence.endswith("a share and per cent.")
+
+
+def test_a_jump_of_another_unit_is_held_against_the_rate_of_the_field() -> None:
+    test = recorded(duty="switched")
+    duty = test.drivers["duty"].values.astype(float)
+    half = np.arange(duty.size) >= duty.size // 2
+    field = thin_fields(test.fields)
+    (check,) = check_load_scale(field, loads(1500.0 * np.where(half, 60.0, 1.0) * duty, "1/min"), file="drivers.csv")
+    assert not check.passed and "% of the field's rate unexplained" in check.evidence
+    (sound,) = check_load_scale(field, loads(1500.0 * duty, "1/min"), file="drivers.csv")
+    assert sound.passed and sound.value == 1.0
+
+
+def test_a_small_share_before_a_large_one_is_no_per_cent() -> None:
+    test = recorded()
+    load = np.where(np.arange(test.drivers.sizes["time"]) < 60, 0.01, 0.9)
+    (check,) = check_load_scale(thin_fields(test.fields), loads(load), file="drivers.csv")
+    assert check.passed
+
+
+def test_a_number_of_a_program_is_no_per_cent() -> None:
+    test = recorded()
+    number = np.where(np.arange(test.drivers.sizes["time"]) < 60, 1.0, 57.0)
+    (check,) = check_load_scale(thin_fields(test.fields), loads(number), file="drivers.csv")
+    assert check.passed
+    assert check_load_scale(None, loads(number), file="drivers.csv") == []

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tests.thermography.flir_mutations import without_checksums
-from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene
-from thermography.fields.survey import disturbed_frames, locate_blocks, survey_frames
+from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene, smooth_field
+from thermography.fields.survey import disturbed_frames, locate_blocks, stray_frames, survey_frames
 from thermography.io.flir import index_frames
 from thermography.io.flir_writer import write_sequence
 from thermography.io.frame import CalibratedRange, Frame
@@ -43,7 +43,7 @@ def _film(path: Path, image: np.ndarray, rng: np.random.Generator, change=lambda
 
 
 def _disturbed(survey, registration) -> dict[int, str]:
-    return disturbed_frames(survey, locate_blocks(survey, registration, GRID, np.zeros((0, 2))))
+    return disturbed_frames(survey, locate_blocks(survey, registration, GRID, np.zeros((0, 2))), still=True)
 
 
 def test_levels_and_blocks(tmp_path: Path, image: np.ndarray, registration, rng: np.random.Generator) -> None:
@@ -91,7 +91,7 @@ def test_damage_is_found_with_and_without_a_checksum(
     else:
         assert survey.damaged == []
         (index,) = (found := _disturbed(survey, registration))
-        assert index == damaged and found[index].endswith("damaged or covered")
+        assert index == damaged and found[index].endswith("damaged, covered, or of another series")
 
 
 def test_a_hand_over_the_table_in_one_frame_is_found(
@@ -130,3 +130,49 @@ def test_repeats_and_a_moving_scene(tmp_path: Path, image: np.ndarray, rng: np.r
     survey = survey_frames(twice, still=False, progress=done.append)
     assert survey.repeated.tolist() == [False] * 3 + [True] + [False] * 5
     assert survey.off == {} and sum(done) == 9
+
+
+def _course(frames: int = 30, blocks: int = 40) -> np.ndarray:
+    """Levels of a table that warms and cools again as a load comes and goes, with 10 mK of noise."""
+    minutes = 4.0 * np.arange(frames)
+    load = np.where(minutes < 60.0, 1.0 - np.exp(-minutes / 20.0), np.exp(-(minutes - 60.0) / 20.0))
+    rng = np.random.default_rng(2)
+    return 24.0 + 3.0 * load[:, None] * np.linspace(0.3, 1.0, blocks) + rng.normal(0.0, 0.01, (frames, blocks))
+
+
+def test_a_frame_of_another_level_is_told_and_a_course_is_not() -> None:
+    levels = _course()
+    assert stray_frames(levels, ends=True) == {}
+    for index in (1, 12, 15, 29):
+        changed = levels.copy()
+        changed[index] += 0.9
+        (found,) = stray_frames(changed, ends=True).items()
+        # What was added, less where the course rises and more where it turns.
+        assert found[0] == index and 0.2 < found[1] < 1.05
+
+
+def test_a_step_of_the_camera_is_no_stray_frame() -> None:
+    levels = _course() + np.repeat([0.0, 0.5, -0.3], 10)[:, None]
+    assert stray_frames(levels, ends=False) == {}
+
+
+def test_several_stray_frames_are_told_one_by_one() -> None:
+    levels = _course()
+    levels[[5, 11, 17]] = levels[[29, 2, 0]]
+    assert set(stray_frames(levels, ends=True)) == {5, 11, 17}
+
+
+def test_a_restless_table_and_a_short_series_tell_nothing() -> None:
+    restless = _course() + np.random.default_rng(5).normal(0.0, 0.6, 30)[:, None]
+    assert stray_frames(restless, ends=True) == {}
+    assert stray_frames(_course()[:6] + np.array([0, 0, 0, 2, 0, 0])[:, None], ends=True) == {}
+
+
+def test_a_frame_of_a_uniform_other_level_is_left_out(
+    tmp_path: Path, image: np.ndarray, registration, rng: np.random.Generator
+) -> None:
+    # Less than ten times the noise of a pixel.
+    warmer = Scene(disc_K=-4.0, field=lambda x, y: smooth_field(x, y) + 0.35).render()
+    frames = _film(tmp_path / "a.seq", image, rng, lambda index, image: warmer if index == 4 else image)
+    (index,) = (found := _disturbed(survey_frames(frames), registration))
+    assert index == 4 and found[4].startswith("the table lies 0.3")
