@@ -1,0 +1,107 @@
+"""Sound campaigns run as a user runs them, from files to results: false doubts, and false statements where nothing is missing.
+
+The price of all checks together (docs/method/consistency.md), and the chance that a report on a sound campaign states anything that is
+not there: an effect, a position that stands out, or something left. THERMOFUSE_RUNS campaigns (200 by default),
+THERMOFUSE_FIRST_SEED; every second one has neither an undeclared effect nor an anomaly.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import NamedTuple
+from unittest import mock
+
+import numpy as np
+import pytest
+
+from fusion.errors import FusionError
+from fusion.pipeline.run import run_campaign
+from fusion.products.results import Results
+from fusion.twin.machine.recipe import Recipe
+from interferometry.errors import InterferometryError
+from tests.soak.lies.campaigns import write
+from tests.soak.rates import campaigns, first_seed, rate, wilson
+from tests.soak.test_sound_inputs import sound_recipe
+from thermography.errors import ThermographyError
+
+pytestmark = pytest.mark.slow
+
+
+class Run(NamedTuple):
+    """What was said of a sound campaign.
+
+    Attributes
+    ----------
+    seed : int
+    bare : bool
+        Whether nothing was there to be found.
+    doubts : tuple of str
+        Codes of the doubts, or the refusal.
+    statements : tuple of str
+        What was stated of a campaign with nothing to be found.
+    """
+
+    seed: int
+    bare: bool
+    doubts: tuple[str, ...]
+    statements: tuple[str, ...]
+
+
+def recipe_of(seed: int) -> Recipe:
+    """A sound campaign with small pictures, drawn from the twin's options; every second one has nothing undeclared."""
+    drawn = sound_recipe(seed).vary(camera={"columns": 320, "rows": 240, "focal_px": 765.0})
+    return drawn.vary(effect=(), anomaly=()) if seed % 2 == 0 else drawn
+
+
+def run(seed: int) -> Run:
+    recipe = recipe_of(seed)
+    bare = not recipe.effect and not recipe.anomaly
+    with tempfile.TemporaryDirectory() as base, contextlib.ExitStack() as stack:
+        folder = Path(base)
+        write(recipe, folder / "campaign")
+        stack.enter_context(mock.patch("fusion.pipeline.run.render_report", return_value=""))
+        try:
+            results = run_campaign(folder / "campaign" / "campaign.toml", folder / "out")
+        except (FusionError, InterferometryError, ThermographyError) as error:
+            return Run(seed, bare, (f"refused: {error}".replace(base, ""),), ())
+    assert results.inputs is not None
+    doubts = tuple(f"{check.code} {check.value:.3g}" for check in results.inputs.doubts)
+    return Run(seed, bare, doubts, statements_of(results) if bare else ())
+
+
+def statements_of(results: Results) -> tuple[str, ...]:
+    """What the results state beyond the declared model."""
+    loop = results.loop
+    assert loop is not None
+    said = [f"effect {step.effect}" for step in loop.steps]
+    said += [f"significant {name}" for name in loop.unnamed]
+    said += [f"remainder: {loop.unexplained.shape}"] if loop.unexplained.shape else []
+    said += [f"anomaly at target {anomaly.target}" for anomaly in results.anomalies or ()]
+    return tuple(said)
+
+
+def test_reports_on_sound_campaigns(capsys: pytest.CaptureFixture[str]) -> None:
+    first, runs = first_seed(61000), campaigns(200)
+    done = []
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        for one in pool.map(run, range(first, first + runs)):
+            done.append(one)
+            if one.doubts or one.statements:
+                with capsys.disabled():
+                    print(f"\n{one.seed}: {'; '.join((*one.doubts, *one.statements))}", flush=True)
+    doubted = sum(bool(one.doubts) for one in done)
+    bare = [one for one in done if one.bare]
+    false = sum(bool(one.statements) for one in bare)
+    with capsys.disabled():
+        print(f"\ndoubted or refused: {rate(doubted, runs)}; something false stated: {rate(false, len(bare))}")
+    assert wilson(doubted, runs)[0] <= 0.02
+    assert wilson(false, len(bare))[0] <= 0.05
+
+
+def test_every_second_campaign_has_nothing_to_be_found() -> None:
+    bare = [not recipe.effect and not recipe.anomaly for recipe in map(recipe_of, range(40))]
+    assert all(bare[::2]) and np.mean(bare[1::2]) < 0.5
