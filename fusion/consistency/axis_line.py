@@ -6,7 +6,7 @@ patterns that effects of the library can imitate. Where one of these mistakes ex
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, combinations
 
@@ -30,6 +30,12 @@ _LEAST_SHIFT = 0.1
 _CLOSER_LOOKS = 3
 #: Standard deviations from the expected expansion within which an alternative is an explanation.
 _PLAUSIBLE = 2.5
+#: Share of the tests with the right line in which an alternative may be taken for it, and number of simulated tests that show it.
+_FALSE_ALARMS, _DRAWS = 2e-3, 20_000
+#: Log-likelihood within which a line explains the readings as well as the declared one.
+_AS_WELL = 2.0
+#: Share of its whitened length that the other terms must leave of a line for its expansion to be determined.
+_DETERMINED = 1e-9
 
 
 @dataclass(frozen=True)
@@ -42,17 +48,23 @@ class LineComparison:
         The alternative in words.
     gain : float
         What it gains in log-likelihood, every column of an added effect counted as half the logarithm of the number of readings.
+    gain_limit : float
+        What an alternative gains by chance in two of a thousand tests with the declared line.
     expansion_ppm_per_K, expansion_u_ppm_per_K : float, ppm/K
         Coefficient that the readings alone ask for beside it.
     superfluous : tuple of str
         Added effects that are not needed beside it.
+    as_well_ppm_per_K : (float, float), ppm/K
+        Smallest and largest expansion that the readings ask for along lines that explain them as well as the declared one, itself included.
     """
 
     alternative: str
     gain: float
+    gain_limit: float
     expansion_ppm_per_K: float
     expansion_u_ppm_per_K: float
     superfluous: tuple[str, ...]
+    as_well_ppm_per_K: tuple[float, float]
 
     def as_json(self) -> dict[str, object]:
         """The entry ``loop.axis_line`` of results.json."""
@@ -83,11 +95,17 @@ def compare_lines(model: ModelFit, declared: int, fields: xr.Dataset, axis: Axis
     A line and a choice among the added effects score their log-likelihood under the drift of the model, less (k/2) ln n for the k columns
     of the effects beside n readings (Schwarz 1978, Ann. Stat. 6, 461), less half the squared distance of the expansion from the expected
     one in standard deviations. The choice is free for the declared line as well.
+
+    The limit is that of a parametric bootstrap (Cox's test of separate families by simulation; D. A. Williams, Biometrics 26 (1970) 23):
+    tests with the declared line, the fitted noise, and the fitted expansion or the plausible one nearest to it, of which two in a thousand
+    exceed it with the largest gain over all alternatives. It is never below ln(500), which a likelihood ratio exceeds at most as often
+    under any law of the noise (Markov).
     """
     comparison = _Comparison.of(model, declared)
     if comparison is None:
         return None
-    scored = [(comparison.glance(column), words, column) for words, column in _alternatives(model, fields, axis)]
+    alternatives = list(_alternatives(model, fields, axis))
+    scored = [(comparison.glance(column), words, column) for words, column in alternatives]
     closer = sorted(scored, key=lambda tried: -tried[0])[:_CLOSER_LOOKS]
     looked = [(comparison.best(column), words) for value, words, column in closer if np.isfinite(value)]
     if not looked:
@@ -95,7 +113,8 @@ def compare_lines(model: ModelFit, declared: int, fields: xr.Dataset, axis: Axis
     stated = comparison.best(comparison.expansion.candidate.columns[:, 0], plausible=np.inf)
     best, words = max(looked, key=lambda pair: pair[0].value)
     superfluous = tuple(term.effect for term in stated.kept if all(term is not other for other in best.kept))
-    return LineComparison(words, best.value - stated.value, best.coefficient, best.u, superfluous)
+    limit, as_well = comparison.by_chance([column for _, column in alternatives])
+    return LineComparison(words, best.value - stated.value, limit, best.coefficient, best.u, superfluous, as_well)
 
 
 @dataclass(frozen=True)
@@ -151,6 +170,47 @@ class _Comparison:
         count, columns = fit.response.size, sum(term.width for term in kept)
         score = -0.5 * (count * np.log(fit.rss) + columns * np.log(count) + off**2)
         return _Scored(float(score), value, u, kept)
+
+    def by_chance(self, columns: Sequence[Array]) -> tuple[float, tuple[float, float]]:
+        """Gain that chance exceeds rarely, and the range of the expansion along lines that explain the readings as well."""
+        gram, sigma2 = self._whitened([self.expansion.candidate.columns[:, 0], *columns])
+        lines, seen = gram[:-1, :-1], gram[:-1, -1]
+        gains, expansion = self._gains(np.diag(lines), seen[:, None], sigma2)
+        reach = _PLAUSIBLE * self.prior.u
+        plausible = np.clip(expansion[0], self.prior.mean - reach, self.prior.mean + reach)
+        values, axes = np.linalg.eigh(lines)
+        noise = np.random.default_rng(1).standard_normal((len(values), _DRAWS))
+        spread = axes * np.sqrt(sigma2 * np.maximum(values, 0.0))
+        simulated, _ = self._gains(np.diag(lines), plausible * lines[:, :1] + spread @ noise, sigma2)
+        limit = float(np.quantile(simulated.max(axis=0, initial=-np.inf), 1.0 - _FALSE_ALARMS, method="higher"))
+        as_well = np.append(expansion[0], expansion[1:][gains >= -_AS_WELL])
+        return max(limit, -float(np.log(_FALSE_ALARMS))), (float(as_well.min()), float(as_well.max()))
+
+    def _whitened(self, columns: Sequence[Array]) -> tuple[Array, float]:
+        """Products of whitened lines (declared first) and readings beside all other terms, and the variance about the declared line."""
+        model, terms = self.model, (*self.beside, *self.added)
+        design = [model.profile, *(term.candidate.columns for term in terms)]
+        if model.fit.system.order == 2:
+            design.append(model.readings.loadings * (model.readings.seconds / 3600.0)[:, None])
+        others = np.column_stack(design)[model.used]
+        lines = np.column_stack(columns)[model.used]
+        whole, _ = model.fit.system.normal_equations(np.column_stack([others, lines, model.fit.response]))
+        count = others.shape[1]
+        inner, across = whole[:count, :count], whole[:count, count:]
+        left = whole[count:, count:] - across.T @ np.linalg.lstsq(inner, across, rcond=1e-12)[0]
+        determined = np.diag(left) > _DETERMINED * np.diag(whole)[count:]
+        determined[[0, -1]] = True
+        left = left[np.ix_(determined, determined)]
+        residual = left[-1, -1] - left[0, -1] ** 2 / left[0, 0]
+        return left, float(residual) / (model.fit.response.size - count - 1)
+
+    def _gains(self, squares: Array, products: Array, sigma2: float) -> tuple[Array, Array]:
+        """Gain of every line over the declared one, (lines - 1, tests), and the expansions, (lines, tests)."""
+        length = squares[:, None]
+        expansion = products / length
+        off = (expansion - self.prior.mean) / np.sqrt(sigma2 / length + self.prior.u**2)
+        score = 0.5 * (products**2 / (length * sigma2) - off**2)
+        return np.where(np.abs(off[1:]) <= _PLAUSIBLE, score[1:] - score[0], -np.inf), expansion
 
 
 def _alternatives(model: ModelFit, fields: xr.Dataset, axis: AxisGeometry) -> Iterator[tuple[str, Array]]:

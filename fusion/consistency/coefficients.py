@@ -14,9 +14,9 @@ _LIMIT = 2.5
 _LARGEST_PPM_PER_K = 26.0
 #: Largest length of a frame that can move the laser against the table, as a multiple of the travel, and its smallest value, mm.
 _FRAME_TRAVELS, _LEAST_FRAME_MM = 5.0, 3000.0
-#: Log-likelihood by which another line must explain the readings better: odds of 20,000 to 1, for some sixty alternatives. Where it does
-#: away with a named cause, that cause was chosen among as many candidates, so that the sixty (ln 60 = 4) count on both sides.
-_LINE_GAIN, _LINE_GAIN_OVER_CAUSE = 10.0, 6.0
+#: Log-likelihood by which another line must explain the readings better where it does away with a named cause: odds of 400 to 1. That
+#: cause was chosen among as many candidates as there are lines, so that the number of alternatives counts on both sides.
+_LINE_GAIN_OVER_CAUSE = 6.0
 #: Standard deviations by which a coefficient must lie beyond what is possible.
 _BEYOND_SIGMAS = 3.0
 
@@ -132,7 +132,7 @@ def _sensitivities(coefficients: list[Mapping[str, Any]], travel_mm: float) -> l
 
 
 def _axis_line(line: Mapping[str, Any]) -> Check:
-    limit = _LINE_GAIN_OVER_CAUSE if line["superfluous"] else _LINE_GAIN
+    limit = _LINE_GAIN_OVER_CAUSE if line["superfluous"] else line["gain_limit"]
     passed = line["gain"] <= limit
     named = [name.replace("_", " ") for name in line["superfluous"]]
     without = f", and without {', '.join(named)}" if named else ""
@@ -141,7 +141,7 @@ def _axis_line(line: Mapping[str, Any]) -> Check:
         line["gain"],
         limit,
         passed,
-        "No other line on the plan, order of the targets or sign of the deviations explains the readings better."
+        _no_better_line(line, limit)
         if passed
         else f"The field explains the readings better {line['alternative']} than as declared (log-likelihood {line['gain']:+.1f}, limit "
         f"{limit:g}), with an expansion of {line['expansion_ppm_per_K']:.3g} ± {line['expansion_u_ppm_per_K']:.2g} ppm/K{without}.",
@@ -151,3 +151,18 @@ def _axis_line(line: Mapping[str, Any]) -> Check:
         "of the deviations.",
         "the declared coefficients, the place of every heat source along the axis, and every cause that is added beside them",
     )
+
+
+def _no_better_line(line: Mapping[str, Any], limit: float) -> str:
+    """How well the readings determine the line, where none is clearly better than the declared one."""
+    low, high = line["as_well_ppm_per_K"]
+    if line["gain"] <= 0.0:
+        compared = (
+            "No other line on the plan, order of the targets or sign of the deviations explains the readings better"
+        )
+    else:
+        compared = (
+            f"Of other lines on the plan, orders of the targets and signs of the deviations none explains the readings better than chance "
+            f"would (log-likelihood {line['gain']:+.1f} {line['alternative']}, limit {limit:.1f})"
+        )
+    return f"{compared}; lines that do so as well as the declared one ask for {low:.3g} to {high:.3g} ppm/K."

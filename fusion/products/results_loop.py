@@ -302,12 +302,16 @@ class AxisLine(ResultPart):
     """The alternative in words."""
     gain: Number
     """What it gains in log-likelihood, less a penalty for added effects, nats; negative where the declared line is better."""
+    gain_limit: Number
+    """What an alternative gains by chance in two of a thousand tests with the declared line, nats."""
     expansion_ppm_per_K: Number
     """Expansion that the readings alone ask for beside it, ppm/K."""
     expansion_u_ppm_per_K: Number
     """Its standard uncertainty, ppm/K."""
     superfluous: tuple[str, ...]
     """Added effects that are not needed beside it."""
+    as_well_ppm_per_K: tuple[Number, Number]
+    """Smallest and largest expansion that the readings ask for along lines that explain them as well as the declared one, ppm/K."""
 
 
 class ResidualPart(ResultPart):

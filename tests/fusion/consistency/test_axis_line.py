@@ -69,7 +69,21 @@ def doubted(comparison: LineComparison) -> bool:
 
 def test_the_true_line_has_no_better_alternative() -> None:
     fields = heated_table()
-    assert not doubted(compared(readings_of(fields, TRUE), fields, TRUE))
+    comparison = compared(readings_of(fields, TRUE), fields, TRUE)
+    assert not doubted(comparison)
+    # A likelihood ratio exceeds 500 in two of a thousand tests at most.
+    assert comparison.gain_limit >= np.log(500.0)
+    low, high = comparison.as_well_ppm_per_K
+    assert low <= PPM_PER_K + 0.3 and high >= PPM_PER_K - 0.3
+
+
+def test_on_a_table_that_warms_evenly_the_lines_that_explain_as_well_are_not_doubted() -> None:
+    fields = heated_table()
+    even = fields.assign(
+        frame_temperature=0.0 * fields["frame_temperature"] + fields["frame_temperature"].mean(["y", "x"])
+    )
+    comparison = compared(readings_of(even, AxisGeometry((200.0, 20.0), (1.0, 0.0))), even, TRUE)
+    assert not doubted(comparison)
 
 
 @pytest.mark.parametrize(

@@ -83,7 +83,13 @@ def test_the_coefficients_of_added_effects_are_held_against_physics_as_well() ->
 
 @pytest.mark.parametrize(
     ("gain", "superfluous", "passed"),
-    [(9.0, (), True), (11.0, (), False), (5.0, ("angular_growth",), True), (7.0, ("angular_growth",), False)],
+    [
+        (-3.0, (), True),
+        (7.5, (), True),
+        (8.5, (), False),
+        (5.0, ("angular_growth",), True),
+        (7.0, ("angular_growth",), False),
+    ],
 )
 def test_a_line_that_does_away_with_a_named_cause_needs_less(
     gain: float, superfluous: tuple[str, ...], passed: bool
@@ -91,10 +97,14 @@ def test_a_line_that_does_away_with_a_named_cause_needs_less(
     line = {
         "alternative": "along a line that runs the other way round from x 200 mm, y 90 mm",
         "gain": gain,
+        "gain_limit": 8.0,
+        "as_well_ppm_per_K": (11.2, 12.6),
         "expansion_ppm_per_K": 11.5,
         "expansion_u_ppm_per_K": 0.2,
         "superfluous": superfluous,
     }
     check = by_code({"axis_line": line})["axis_line"]
     assert check.passed is passed
+    assert ("ask for 11.2 to 12.6 ppm/K" in check.evidence) is passed
+    assert (f"(log-likelihood {gain:+.1f}" in check.evidence) is (gain > 0.0)
     assert ("without angular growth" in check.evidence) is (bool(superfluous) and not passed)
