@@ -41,11 +41,22 @@ class Series:
         One value for all sites, or one per target position.
     units : str
         Unit of the values.
+    first : tuple of int
+        Number of the sample with which every run begins; runs have nothing to do with each other.
     """
 
     seconds: Array
     values: Array
     units: str
+    first: tuple[int, ...] = (0,)
+
+    def runs(self) -> list[Series]:
+        """Return every run by itself."""
+        ends = [*self.first[1:], self.seconds.size]
+        return [
+            Series(self.seconds[first:end], self.values[first:end], self.units)
+            for first, end in zip(self.first, ends, strict=True)
+        ]
 
     def lagged(self, time_constant_s: float, *, at_rest: float | None = None) -> Series:
         """Return the response of a first-order system to the series; see `fusion.alignment.first_order_lag.respond`.
@@ -55,10 +66,13 @@ class Series:
         time_constant_s : float, s
             Up to 0 the series itself is returned.
         at_rest : float, optional
-            State of the system at the first sample, in `units`; by default the first sample itself (steady state).
+            State of the system at the first sample of every run, in `units`; by default that sample itself (steady state).
         """
         if time_constant_s <= 0.0:
             return self
+        if len(self.first) > 1:
+            responses = [run.lagged(time_constant_s, at_rest=at_rest).values for run in self.runs()]
+            return Series(self.seconds, np.concatenate(responses), self.units, self.first)
         values = self.values if self.values.ndim == 2 else self.values[:, None]
         start = None if at_rest is None else np.full(values.shape[1], at_rest)
         response = respond(values, self.seconds, time_constant_s=time_constant_s, start=start)

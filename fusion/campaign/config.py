@@ -196,6 +196,11 @@ FramePatterns = Annotated[
     AfterValidator(_filled),
     Field(json_schema_extra={"minItems": 1}),
 ]
+#: Names or patterns of the runs of a record, a single one without brackets too.
+RunPatterns = Annotated[
+    tuple[Annotated[str, AfterValidator(_matching)], ...],
+    BeforeValidator(lambda value: (value,) if isinstance(value, str) else value),
+]
 DeclaredEffects = Annotated[tuple[Annotated[str, AfterValidator(_declarable)], ...], AfterValidator(_each_once)]
 
 
@@ -427,12 +432,15 @@ class DriversTable(_Table):
 
 
 class RecordTable(_Table):
-    """``[record]``: temperature sensors and displacement channels over time, in one table (CSV or XLSX).
+    """``[record]``: temperature sensors and displacement channels over time, in one table per run (CSV or XLSX).
 
-    Columns are named as in the file's heading, ``"name [unit]"`` or ``"name (unit)"``; ``*`` stands for any text.
+    Columns are named as in the file's heading, ``"name [unit]"`` or ``"name (unit)"``; ``*`` stands for any text. ``test`` names the runs
+    that are held out; left out: the last one.
     """
 
-    file: ExistingFile
+    file: ExistingFile | None = None
+    files: RunPatterns = ()
+    test: RunPatterns = ()
     sheet: str | None = None
     time: str
     start: str | None = None
@@ -440,6 +448,25 @@ class RecordTable(_Table):
     temperatures: tuple[str, ...] = Field(min_length=1)
     displacements: tuple[str, ...] = Field(min_length=1)
     drivers: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _runs_are_whole(self, info: ValidationInfo) -> RecordTable:
+        if (self.file is None) == (not self.files):
+            text = 'write either file = "run.csv", or files = ["run_*.csv"] (names or patterns) for several runs of one test'
+            raise PydanticCustomError("runs", "{text}", {"text": text})
+        if self.test and not self.files:
+            text = "test names runs among files; write files = [...] instead of file, or leave test out: the last fifth is held out"
+            raise PydanticCustomError("runs", "{text}", {"text": text})
+        if isinstance(info.context, _Surroundings) and self.test:
+            runs, test = (_each_match(info.context.folder, patterns) for patterns in (self.files, self.test))
+            strange = [path.name for path in test if path not in runs]
+            if strange:
+                text = f"test names {', '.join(strange)}, which files does not; the runs are {', '.join(path.name for path in runs)}"
+                raise PydanticCustomError("runs", "{text}", {"text": text})
+            if len(test) == len(runs):
+                text = f"test names all {len(runs)} runs, which leaves none to learn from; name fewer"
+                raise PydanticCustomError("runs", "{text}", {"text": text})
+        return self
 
 
 class ModelTable(_Table):
@@ -487,6 +514,20 @@ class Campaign(_Table):
             return ()
         return tuple(sorted({path for pattern in self.thermography.frames for path in _matches(self.folder, pattern)}))
 
+    def record_paths(self) -> tuple[Path, ...]:
+        """Return the tables of the record's runs, each once, in the order in which the campaign file names them."""
+        if self.record is None:
+            return ()
+        return (
+            _each_match(self.folder, self.record.files)
+            if self.record.file is None
+            else (self.resolve(self.record.file),)
+        )
+
+    def test_paths(self) -> tuple[Path, ...]:
+        """Return the tables of the runs that the campaign file holds out; empty where it names none."""
+        return () if self.record is None else _each_match(self.folder, self.record.test)
+
     def input_files(self) -> dict[str, Path]:
         """Return every file that the campaign reads, keyed by its path relative to the campaign file."""
         files = {relative_name(self.path, self.folder): self.path}
@@ -503,11 +544,9 @@ class Campaign(_Table):
             names = [self.interferometry.deviations, self.interferometry.environment]
         elif table == "drivers" and self.drivers is not None:
             names = [self.drivers.file]
-        elif table == "record" and self.record is not None:
-            names = [self.record.file]
         elif table == "thermography" and self.thermography is not None:
             names = [self.thermography.lens]
-        paths = list(self.frame_paths()) if table == "thermography" else []
+        paths = list({"thermography": self.frame_paths, "record": self.record_paths}.get(table, tuple)())
         paths += [self.resolve(name) for name in names if name is not None]
         return {relative_name(path, self.folder): path for path in paths}
 
@@ -643,6 +682,11 @@ def _matches(folder: Path, pattern: str) -> list[Path]:
     if given.is_absolute():
         return [path for path in Path(given.anchor).glob(str(given.relative_to(given.anchor))) if path.is_file()]
     return [path.resolve() for path in folder.glob(pattern) if path.is_file()]
+
+
+def _each_match(folder: Path, patterns: tuple[str, ...]) -> tuple[Path, ...]:
+    """Return the files that patterns match, each once, in the order of the patterns and of the names that one pattern matches."""
+    return tuple(dict.fromkeys(path for pattern in patterns for path in sorted(_matches(folder, pattern))))
 
 
 def _near_file(path: Path) -> str:

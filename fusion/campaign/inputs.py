@@ -350,7 +350,7 @@ def _reason(item: Mapping[str, Any]) -> str:
 
 
 def left_out_notices(dataset: xr.Dataset, code: str) -> list[Notice]:
-    """Return one notice that counts the rejected lines of a file and lists the first of them.
+    """Return one notice for each file that counts its rejected lines and lists the first of them.
 
     Parameters
     ----------
@@ -360,16 +360,17 @@ def left_out_notices(dataset: xr.Dataset, code: str) -> list[Notice]:
         Code of the notice.
     """
     lines = json.loads(dataset.attrs.get("left_out", "[]"))
-    if not lines:
-        return []
-    named = [f"line {item['line']} ({item['value']!r} {item['reason']})" for item in lines]
-    return [
-        Notice(
-            code,
-            f"{counted(len(lines), 'line')} of {lines[0]['path']} left out: {listed(named)}.",
-            f"Correct these lines in {lines[0]['path']} and run again; the estimates allow for the gaps.",
+    notices = []
+    for path in dict.fromkeys(item["path"] for item in lines):
+        named = [f"line {item['line']} ({item['value']!r} {item['reason']})" for item in lines if item["path"] == path]
+        notices.append(
+            Notice(
+                code,
+                f"{counted(len(named), 'line')} of {path} left out: {listed(named)}.",
+                f"Correct these lines in {path} and run again; the estimates allow for the gaps.",
+            )
         )
-    ]
+    return notices
 
 
 def counted(number: int, noun: str) -> str:

@@ -35,6 +35,10 @@ _SKIPPED = re.compile(r"Skipping line (\d+): expected (\d+) fields, saw (\d+)")
 _HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
 
 
+#: Where seconds count from in a table whose start is not stated.
+NO_START = np.datetime64("1970-01-01", "ns")
+
+
 class TableError(CampaignError):
     """A logged table that cannot be used; the message names file, column and remedy."""
 
@@ -118,13 +122,15 @@ def read_drivers(path: Path) -> xr.Dataset:
     return read_timed_rows(table, variables, lambda fields: [table.number(fields[column]) for column in headings])
 
 
-def read_record(campaign: Campaign) -> xr.Dataset:
-    """Read a ``[record]``: temperatures, displacements and drivers over time.
+def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
+    """Read one table of a ``[record]``: temperatures, displacements and drivers over time.
 
     Parameters
     ----------
     campaign : Campaign
         A checked campaign with a ``[record]``.
+    path : Path
+        The table, CSV or XLSX.
 
     Returns
     -------
@@ -140,7 +146,6 @@ def read_record(campaign: Campaign) -> xr.Dataset:
     record = campaign.record
     if record is None:
         raise TableError(f"{campaign.path}: there is no [record] in this campaign")
-    path = campaign.resolve(record.file)
     frame, misfits = _read_frame(path, record)
     columns = list(frame.columns)
     if record.time not in columns:
@@ -235,9 +240,7 @@ def _times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarr
     if seconds.notna().mean() > 0.5:
         _, unit = split_heading(path, record.time)
         factor = _converted(path, record.time, unit, "s")(np.array([0.0, 1.0]))
-        start, zone = (
-            (np.datetime64("1970-01-01", "ns"), "+0000") if record.start is None else _parse(path, record.start)
-        )
+        start, zone = (NO_START, "+0000") if record.start is None else _parse(path, record.start)
         zones[zone] = 0
         elapsed = seconds.to_numpy(dtype="f8") * (factor[1] - factor[0])
         time = start + np.where(np.isfinite(elapsed), np.round(elapsed * 1e9), 0).astype("m8[ns]")

@@ -82,7 +82,8 @@ def profile_gains(
             y, x = priors.append(y, x)
         q, _ = np.linalg.qr(x)
         y = y - q @ (q.T @ y)
-        rss = (y**2).sum(axis=0)
+        # A response that the design explains exactly leaves nothing; it has no gain, and no logarithm of zero.
+        rss = np.maximum((y**2).sum(axis=0), np.finfo(float).tiny)
         reduced, given, separate = reductions(c, y[:n], q[:n], groups)
         likelihood = _likelihood(rss, reduced, n, log_determinant)
         without = np.maximum(without, -0.5 * (n * np.log(rss) + log_determinant))

@@ -10,13 +10,14 @@ import xarray as xr
 
 from fusion.campaign.config import Campaign
 from fusion.campaign.inputs import counted, left_out_notices, listed
-from fusion.campaign.logged_tables import read_record
+from fusion.campaign.record_runs import read_record
 from fusion.effects.thermal import QUASI_STATIC
 from fusion.products.progress import Report
 from fusion.products.results import Notice, Outcome
 from fusion.record.blocks import Record, reduce_record
 from fusion.record.hold_out import declare
 from fusion.record.loop import close_record
+from fusion.record.prediction import known_mean
 from fusion.record.result import RecordResult
 from fusion.record.sensor_health import SensorHealth, examine_record
 from fusion.report.wording import describe_fault, duration, number
@@ -135,6 +136,15 @@ def record_notices(record: Record) -> list[Notice]:
     record : on its blocks
     """
     notices = []
+    if record.runs:
+        notices.append(
+            Notice(
+                "record_runs",
+                f"{counted(len(record.runs), 'run')} in the order {listed(one.name for one in record.runs)}: displacements and rises count "
+                "from the first block of each run, and nothing is carried from one run to the next.",
+                "",
+            )
+        )
     if record.gaps:
         named = [f"{name} ({number} blocks)" for name, number in record.gaps.items()]
         notices.append(
@@ -144,7 +154,16 @@ def record_notices(record: Record) -> list[Notice]:
                 "Look at the logger; effects that act within the gaps cannot be seen.",
             )
         )
-    pauses = np.diff(record.seconds)
+    if record.impossible:
+        named = [f"{name} ({counted(number, 'sample')})" for name, number in record.impossible.items()]
+        notices.append(
+            Notice(
+                "record_impossible_values",
+                f"Samples beyond what can be measured count as missing: {listed(named)}.",
+                "Look at the logger and at the units in the heading: it writes such a number where it has no value.",
+            )
+        )
+    pauses = np.concatenate([np.diff(run.seconds) for run in record.series(record.seconds, "s").runs()])
     pauses = pauses[pauses > 1.5 * record.block_s]
     if pauses.size:
         notices.append(
@@ -205,8 +224,8 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
     final = result.predictions[-1]
     # What forward chaining has shown the model to miss by, where it can be known: not smaller than on the hold-out set.
     chained = np.array([one.rmse_final_um for one in result.chained]).reshape(-1, len(record.channels))
-    spread = np.fmax(result.errors[-1], np.sqrt(np.nanmean(chained**2, axis=0)) if len(chained) else 0.0)
-    return xr.Dataset(
+    spread = np.fmax(result.errors[-1], np.sqrt(known_mean(chained**2, axis=0)) if len(chained) else 0.0)
+    dataset = xr.Dataset(
         {
             "displacement": (dims, record.displacement, {**um, "long_name": "mean displacement over the block"}),
             "temperature": (
@@ -232,11 +251,25 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
             "part": ("time", record.chained + 1, {"long_name": "part of the record for forward chaining"}),
         },
         coords={
-            "time": record.start + np.round(record.seconds * 1e9).astype("m8[ns]"),
+            "time": record.time,
             "channel": list(record.channels),
             "sensor": list(record.sensors),
             "driver_name": list(record.drivers),
             "effect": unique,
         },
         attrs={"block_s": record.block_s},
+    )
+    if not record.runs:
+        return dataset
+    return dataset.assign(
+        run=(
+            "time",
+            record.run + 1,
+            {"long_name": "number of the run", "runs": ", ".join(one.name for one in record.runs)},
+        ),
+        elapsed=(
+            "time",
+            record.seconds,
+            {"units": "s", "long_name": "time since the start, time between runs left out"},
+        ),
     )

@@ -426,7 +426,9 @@ class ChainedPart(ResultPart):
     in_training: bool
     """Whether it lies before the hold-out, so that it had a say in what entered."""
     effects: tuple[str, ...]
-    """Effects found before it."""
+    """Effects found before it, or in the other runs."""
+    runs: tuple[str, ...] = ()
+    """Names of the runs that it consists of; absent in a record of one run."""
     rmse_persistence_um: Number
     """Root mean square error of repeating the last value, um."""
     rmse_declared_um: Number
@@ -462,6 +464,27 @@ class SensorFaultPart(ResultPart):
     """The same without all sensors that were left out, um; null for a suspected one."""
 
 
+class RunPart(ResultPart):
+    """One run of a record of several; errors are means over the channels, null where the run is not held out."""
+
+    file: str
+    """Name of its table."""
+    held_out: bool
+    """Whether it is held out."""
+    duration_h: Number
+    """Its length, h."""
+    blocks: int
+    """Number of its blocks."""
+    rmse_persistence_um: Number
+    """Root mean square error of repeating the run's zero, um."""
+    rmse_declared_um: Number
+    """Root mean square error of the declared model, um."""
+    rmse_final_um: Number
+    """Root mean square error of the final model, um."""
+    verdict: Verdict | Literal[""]
+    """Verdict by the errors in this run; empty where it is not held out."""
+
+
 class RecordLoop(Loop):
     """What the closed loop found on a record; errors are means over the channels."""
 
@@ -477,3 +500,5 @@ class RecordLoop(Loop):
     """Scores of every round of the search."""
     sensor_faults: tuple[SensorFaultPart, ...] = ()
     """Sensors that are faulty or suspected, examined before any model."""
+    runs: tuple[RunPart, ...] = ()
+    """Runs of a record of several; absent where there is one."""

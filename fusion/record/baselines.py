@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.alignment.readings import Series
 from fusion.loop.baselines import LAGS_MIN
 from fusion.record.blocks import Record
-from fusion.record.prediction import last_values, predict
+from fusion.record.prediction import known_mean, last_values, predict
 
 
 def plain_predictions(record: Record, train: NDArray[np.bool_]) -> dict[str, Array]:
@@ -23,14 +22,15 @@ def plain_predictions(record: Record, train: NDArray[np.bool_]) -> dict[str, Arr
     Returns
     -------
     dict of (blocks, channels) ndarray
-        um: ``last_value`` and ``mean`` of every channel; ``least_squares`` and ``ridge`` on temperatures and drivers (and their squares);
+        um: ``last_value`` of every channel (of a run that is held out as a whole, its zero) and ``mean``; ``least_squares`` and ``ridge`` on
+        temperatures and drivers (and their squares);
         ``ridge_with_lags`` on lagged copies of them too.
     """
     now = np.column_stack([record.rise, *(values for powers in record.drivers.values() for values in powers.values())])
-    late = [Series(record.seconds, now, "1").lagged(60.0 * minutes).values for minutes in LAGS_MIN]
+    late = [record.series(now, "1").lagged(60.0 * minutes).values for minutes in LAGS_MIN]
     return {
-        "last_value": np.broadcast_to(last_values(record, train), record.displacement.shape),
-        "mean": np.broadcast_to(np.nanmean(record.displacement[train], axis=0), record.displacement.shape),
+        "last_value": last_values(record, train),
+        "mean": np.broadcast_to(known_mean(record.displacement[train], axis=0), record.displacement.shape),
         "least_squares": _least_squares(record, now, train),
         "ridge": predict(record, now, train).predicted,
         "ridge_with_lags": predict(record, np.column_stack([now, *late]), train).predicted,

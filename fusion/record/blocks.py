@@ -6,8 +6,9 @@ time constant; drivers are averaged after they are raised to a power, because he
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -23,12 +24,25 @@ from fusion.errors import FusionError
 MOST_BLOCKS = 600
 #: Blocks below which nothing can be held out.
 LEAST_BLOCKS = 40
+#: Blocks below which a run of several shows nothing.
+LEAST_RUN_BLOCKS = 10
 #: Powers of a driver in the heat it makes: friction of a torque that is constant and of one that grows with the speed.
 EXPONENTS = (1, 2)
 #: A load cycle starts where a driver leaves its rest; rest is this share of its range above its minimum.
 _REST_SHARE = 0.02
 #: A driver is switched where it changes by this share of its range from one block to the next.
 _SWITCHED = 0.2
+#: Coordinate that names the columns, smallest and largest value of every variable: absolute zero and 3000 degC, a displacement of 1 m, and
+#: for a driver, whose unit is free, a tenth of the largest single-precision number, which loggers write for no value.
+_POSSIBLE = {
+    "temperature": ("sensor", -273.15, 3000.0),
+    "displacement": ("channel", -1e6, 1e6),
+    "driver": ("driver_name", -3e37, 3e37),
+}
+#: Share of its largest size by which a constant may differ from its mean.
+_ROUNDING = 1e-12
+#: Blocks on either side of a switching that are near it.
+_NEAR_SWITCHING = 2
 #: Most and fewest parts that a record is cut into for forward chaining.
 _MOST_CHAINED = 8
 _LEAST_CHAINED = 4
@@ -39,15 +53,33 @@ class RecordError(FusionError):
 
 
 @dataclass(frozen=True)
+class RecordedRun:
+    """One run of a record.
+
+    Attributes
+    ----------
+    name : of its table
+    start : time of its first sample, UTC
+    first_s : that time on the record's own axis, s
+    held_out : whether it is held out
+    """
+
+    name: str
+    start: np.datetime64
+    first_s: float
+    held_out: bool
+
+
+@dataclass(frozen=True)
 class Record:
-    """A record on its blocks.
+    """A record on its blocks. Runs follow each other on one axis of time, with a border of one block between them.
 
     Attributes
     ----------
     start : time of the first sample, UTC
-    seconds : (blocks,) middle of each block, s since the first sample
+    seconds : (blocks,) middle of each block, s since the first sample, time between runs left out
     block_s : length of a block, s
-    displacement : (blocks, channels) mean, um; NaN where a block holds no sample
+    displacement : (blocks, channels) mean, um, of several runs minus that of each run's first block; NaN where a block holds no sample
     temperature : (blocks, sensors) mean, degC, gaps interpolated
     temperature_noise : (sensors,) standard uncertainty of a block mean from the scatter of the samples, K
     drivers : driver to its powers, exponent to (blocks,) values as a share of the driver's largest size
@@ -55,6 +87,9 @@ class Record:
     duplicates : sensors left out because they are a linear combination of the others
     chained : (blocks,) number of the chronological block of each row for forward chaining, from 0
     gaps : values that were interpolated, by column
+    impossible : samples beyond what can be measured, which count as missing, by column
+    runs : of a record of several runs; empty where there is one
+    first : number of the first block of every run
     """
 
     start: np.datetime64
@@ -69,31 +104,64 @@ class Record:
     duplicates: tuple[str, ...]
     chained: NDArray[np.int64]
     gaps: Mapping[str, int]
+    impossible: Mapping[str, int] = field(default_factory=dict)
+    runs: tuple[RecordedRun, ...] = ()
+    first: tuple[int, ...] = (0,)
 
     @property
     def rise(self) -> Array:
-        """Temperatures minus their first block, K (blocks, sensors)."""
-        return self.temperature - self.temperature[0]
+        """Temperatures minus those of the run's first block, K (blocks, sensors)."""
+        zero = self.temperature[np.asarray(self.first)[self.run]] if self.runs else self.temperature[0]
+        return self.temperature - zero
+
+    @property
+    def run(self) -> NDArray[np.int64]:
+        """Number of each block's run, from 0 (blocks,)."""
+        return np.searchsorted(self.first, np.arange(self.seconds.size), side="right") - 1
+
+    @property
+    def time(self) -> NDArray[np.datetime64]:
+        """Time of the middle of each block, UTC (blocks,)."""
+        elapsed = np.round(self.seconds * 1e9).astype("m8[ns]")
+        if not self.runs:
+            return np.asarray(self.start + elapsed)
+        zero = np.array([one.start - np.round(one.first_s * 1e9).astype("m8[ns]") for one in self.runs])
+        return np.asarray(zero[self.run] + elapsed)
+
+    def series(self, values: Array, units: str) -> Series:
+        """Values on the blocks as a series that begins anew with every run.
+
+        Parameters
+        ----------
+        values : (blocks,) or (blocks, k), in `units`
+        units : of the values
+        """
+        return Series(self.seconds, values, units, self.first)
 
     def switched(self) -> NDArray[np.bool_]:
         """Blocks within two blocks of a switching of any driver (blocks,): what happens there may be its consequence."""
         near = np.zeros(self.seconds.size, bool)
         for powers in self.drivers.values():
             change = np.abs(np.diff(powers[1], prepend=powers[1][0])) > _SWITCHED * np.ptp(powers[1])
-            near |= np.convolve(change, np.ones(5), "same") > 0
+            change[list(self.first)] = False
+            switched = np.flatnonzero(change)
+            for beside in range(-_NEAR_SWITCHING, _NEAR_SWITCHING + 1):
+                here = np.clip(switched + beside, 0, near.size - 1)
+                near[here[self.run[here] == self.run[switched]]] = True
         return near
 
     def view(self) -> Readings:
         """The record as readings of one place, so that effects that only need time, series and drivers work on it."""
         one = np.ones(self.seconds.size)
-        series = {"mean_rise": Series(self.seconds, self.rise.mean(axis=1), "K")}
-        series |= {
-            f"{SENSOR_PREFIX}{name}": Series(self.seconds, self.rise[:, k], "K") for k, name in enumerate(self.sensors)
-        }
-        series |= {name: Series(self.seconds, powers[1], "1") for name, powers in self.drivers.items()}
+        known = np.isfinite(self.displacement)
+        total = np.where(known, self.displacement, 0.0).sum(axis=1)
+        rise = self.rise
+        series = {"mean_rise": self.series(rise.mean(axis=1), "K")}
+        series |= {f"{SENSOR_PREFIX}{name}": self.series(rise[:, k], "K") for k, name in enumerate(self.sensors)}
+        series |= {name: self.series(powers[1], "1") for name, powers in self.drivers.items()}
         return Readings(
             seconds=self.seconds,
-            response=np.nanmean(self.displacement, axis=1),
+            response=np.where(known.any(axis=1), total / np.maximum(known.sum(axis=1), 1), np.nan),
             cycle=np.arange(1, self.seconds.size + 1),
             target=one.astype(np.int64),
             position_mm=one,
@@ -108,12 +176,17 @@ class Record:
 
 @dataclass(frozen=True)
 class _Blocks:
-    """How samples fall into blocks: place of each sample among the blocks that hold any, middle of each of those, s."""
+    """How samples fall into blocks: place of each sample among the blocks that hold any, middle of each of those, s; first one, and time
+    of the first sample, of each run.
+    """
 
     source: str
     place: NDArray[np.intp]
     seconds: Array
     length_s: float
+    zero_s: tuple[float, ...]
+    first: tuple[int, ...]
+    names: tuple[str, ...]
     gaps: dict[str, int]
 
     def mean(self, values: Array) -> Array:
@@ -134,7 +207,34 @@ class _Blocks:
             )
         if not known.all():
             self.gaps[name] = int((~known).sum())
-        return np.asarray(np.interp(self.seconds, self.seconds[known], column[known]))
+        return np.concatenate([self._filled_run(name, column, rows, k) for k, rows in enumerate(self.rows())])
+
+    def rows(self) -> list[slice]:
+        """Blocks of every run."""
+        return [slice(first, last) for first, last in pairwise([*self.first, self.seconds.size])]
+
+    def _filled_run(self, name: str, column: Array, rows: slice, run: int) -> Array:
+        """The blocks of one run with its gaps interpolated: nothing is taken from another run."""
+        seconds, values = self.seconds[rows], column[rows]
+        known = np.isfinite(values)
+        if not known.any():
+            raise RecordError(
+                f'{self.names[run]}: column "{name}" has no value in this run; leave the column or the run out of [record]'
+            )
+        return np.asarray(np.interp(seconds, seconds[known], values[known]))
+
+    def zeroed(self, channel: str, values: Array) -> Array:
+        """Block means of a channel; of several runs each minus its own first one, its zero."""
+        mean = self.mean(values)
+        if len(self.first) > 1:
+            for run, rows in enumerate(self.rows()):
+                known = mean[rows][np.isfinite(mean[rows])]
+                if not known.size:
+                    raise RecordError(
+                        f'{self.names[run]}: channel "{channel}" has no value in this run; leave the channel or the run out of [record]'
+                    )
+                mean[rows] -= known[0]
+        return mean
 
 
 def reduce_record(table: xr.Dataset) -> Record:
@@ -143,7 +243,7 @@ def reduce_record(table: xr.Dataset) -> Record:
     Parameters
     ----------
     table : Dataset
-        As :func:`fusion.campaign.logged_tables.read_record` returns it.
+        As :func:`fusion.campaign.record_runs.read_record` returns it.
 
     Raises
     ------
@@ -152,9 +252,12 @@ def reduce_record(table: xr.Dataset) -> Record:
     """
     time = table["time"].values.astype("datetime64[ns]")
     elapsed = np.asarray((time - time[0]) / np.timedelta64(1, "s"), np.float64)
-    blocks = _lay_blocks(str(table.attrs.get("source", "record")), elapsed)
+    table, impossible = _without_impossible(table)
+    blocks = _lay_blocks(table, elapsed)
     channels = tuple(str(name) for name in table["channel"].values)
-    displacement = np.column_stack([blocks.mean(table["displacement"].values[:, k]) for k in range(len(channels))])
+    displacement = np.column_stack(
+        [blocks.zeroed(name, table["displacement"].values[:, k]) for k, name in enumerate(channels)]
+    )
     for k, name in enumerate(channels):
         known = displacement[np.isfinite(displacement[:, k]), k]
         if known.size < LEAST_BLOCKS or np.ptp(known) == 0.0:
@@ -180,24 +283,79 @@ def reduce_record(table: xr.Dataset) -> Record:
         channels=channels,
         sensors=tuple(sensors[k] for k in kept),
         duplicates=tuple(name for k, name in enumerate(sensors) if k not in kept),
-        chained=chained_blocks(blocks.seconds, [powers[1] for powers in drivers.values()]),
+        chained=_chained_runs(blocks, [powers[1] for powers in drivers.values()]),
         gaps=blocks.gaps,
+        impossible=impossible,
+        runs=_runs(table, blocks),
+        first=blocks.first,
     )
 
 
-def _lay_blocks(source: str, elapsed: Array) -> _Blocks:
-    """Cut the time of the samples (s since the first) into blocks of equal length."""
-    times = np.unique(elapsed)
-    if times.size < LEAST_BLOCKS:
+def _runs(table: xr.Dataset, blocks: _Blocks) -> tuple[RecordedRun, ...]:
+    """The runs of a table of several; none of one."""
+    if "runs" not in table.attrs:
+        return ()
+    test = json.loads(table.attrs["test"])
+    time, run = table["time"].values.astype("datetime64[ns]"), table["run"].values
+    return tuple(
+        RecordedRun(name, time[run == k][0], zero_s, k in test)
+        for k, (name, zero_s) in enumerate(zip(blocks.names, blocks.zero_s, strict=True))
+    )
+
+
+def _chained_runs(blocks: _Blocks, drivers: list[Array]) -> NDArray[np.int64]:
+    """Parts for forward chaining, numbered through all runs; none holds blocks of two."""
+    parts: list[NDArray[np.int64]] = []
+    for rows in blocks.rows():
+        start = int(parts[-1][-1]) + 1 if parts else 0
+        parts.append(start + chained_blocks(blocks.seconds[rows], [values[rows] for values in drivers]))
+    return np.concatenate(parts)
+
+
+def _without_impossible(table: xr.Dataset) -> tuple[xr.Dataset, dict[str, int]]:
+    """The record without samples beyond what can be measured, which loggers write for no value, and their number by column."""
+    counts: dict[str, int] = {}
+    kept = {}
+    for variable, (names, low, high) in _POSSIBLE.items():
+        values = table[variable]
+        wrong = np.asarray((values < low) | (values > high))
+        counts |= {str(name): int(n) for name, n in zip(values[names].values, wrong.sum(axis=0), strict=True) if n}
+        kept[variable] = values.where(~wrong) if wrong.any() else values
+    return table.assign(kept), counts
+
+
+def _lay_blocks(table: xr.Dataset, elapsed: Array) -> _Blocks:
+    """Cut the time of the samples (s since the first) into blocks of equal length, every run from its own first sample on."""
+    source = str(table.attrs.get("source", "record"))
+    names = tuple(json.loads(table.attrs["runs"])) if "runs" in table.attrs else (source,)
+    run = table["run"].values if "runs" in table.attrs else np.zeros(elapsed.size, int)
+    times = [np.unique(elapsed[run == k]) for k in range(len(names))]
+    samples = sum(one.size for one in times)
+    if samples < LEAST_BLOCKS:
         raise RecordError(
-            f"{source}: {times.size} samples are too few to hold a part out; a record needs at least {LEAST_BLOCKS}"
+            f"{source}: {samples} samples are too few to hold a part out; a record needs at least {LEAST_BLOCKS}"
         )
-    step = float(np.median(np.diff(times)))
-    length = step * max(1, int(np.ceil(times.size / MOST_BLOCKS)))
-    # A sample that comes a little early still belongs to its own block.
-    number = np.floor((elapsed + 0.5 * step) / length).astype(int)
-    numbers, place = np.unique(number, return_inverse=True)
-    return _Blocks(source, place, np.asarray((numbers + 0.5) * length - 0.5 * step, np.float64), length, {})
+    step = float(np.median(np.concatenate([np.diff(one) for one in times])))
+    length = step * max(1, int(np.ceil(samples / MOST_BLOCKS)))
+    places, seconds, first, zeros, start = [], [], [0], [], 0.0
+    for k, one in enumerate(times):
+        # A sample that comes a little early still belongs to its own block.
+        number = np.floor((elapsed[run == k] - one[0] + 0.5 * step) / length).astype(int)
+        numbers, place = np.unique(number, return_inverse=True)
+        if len(times) > 1 and numbers.size < LEAST_RUN_BLOCKS:
+            raise RecordError(
+                f"{names[k]}: the run fills {numbers.size} blocks of {length:g} s, fewer than {LEAST_RUN_BLOCKS}; leave it out of "
+                "record.files"
+            )
+        places.append(place + first[-1])
+        seconds.append(start + (numbers + 0.5) * length - 0.5 * step)
+        first.append(first[-1] + numbers.size)
+        zeros.append(start)
+        # A border of one block lies between two runs.
+        start += (float(numbers[-1]) + 2.0) * length
+    return _Blocks(
+        source, np.concatenate(places), np.concatenate(seconds), length, tuple(zeros), tuple(first[:-1]), names, {}
+    )
 
 
 def _drivers(table: xr.Dataset, blocks: _Blocks) -> dict[str, dict[int, Array]]:
@@ -229,7 +387,9 @@ def independent(columns: Array, *, tolerance: float = 1e-8) -> list[int]:
     centred = columns - columns.mean(axis=0)
     basis = np.empty((columns.shape[0], 0))
     for k in range(columns.shape[1]):
-        own = float(centred[:, k] @ centred[:, k])
+        # What a constant differs from its mean by is rounding.
+        moves = np.abs(centred[:, k]).max(initial=0.0) > _ROUNDING * np.abs(columns[:, k]).max(initial=0.0)
+        own = float(centred[:, k] @ centred[:, k]) if moves else 0.0
         left = centred[:, k] - basis @ (basis.T @ centred[:, k])
         left -= basis @ (basis.T @ left)
         rest = float(left @ left)

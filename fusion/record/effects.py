@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fusion.alignment.readings import Series
 from fusion.effects.effect import Candidate, Effect
 from fusion.effects.events import periods_min
 from fusion.effects.jumps import jumps
@@ -66,7 +65,7 @@ def _thermal_lag(record: Record, near: Candidate | None) -> Iterator[Candidate]:
             continue
         for minutes in _around(near, LAGS_MIN):
             if minutes >= 2.0 * block_min:
-                lagged = Series(record.seconds, rise, "K").lagged(60.0 * minutes).values
+                lagged = record.series(rise, "K").lagged(60.0 * minutes).values
                 yield Candidate(lagged[:, None], {"sensor": name, "time_constant_min": minutes}, ("um/K",))
 
 
@@ -77,7 +76,7 @@ def _unseen_heat_source(record: Record, near: Candidate | None) -> Iterator[Cand
             continue
         for minutes in _around(near, _SOURCE_MIN):
             states = [
-                Series(record.seconds, powers[exponent], "1").lagged(60.0 * minutes * share).values
+                record.series(powers[exponent], "1").lagged(60.0 * minutes * share).values
                 for share in _CHAIN
                 for exponent in EXPONENTS
             ]
@@ -138,7 +137,9 @@ def sensor_faults(record: Record) -> list[tuple[int, float, float]]:
         others = np.delete(record.rise, k, axis=1)
         common = others.mean(axis=1) if others.shape[1] else np.zeros(record.seconds.size)
         own = []
-        for before, after, size in jumps(Series(record.seconds, record.rise[:, k], "K")):
+        for before, after, size in (
+            jump for run in record.series(record.rise[:, k], "K").runs() for jump in jumps(run)
+        ):
             at = np.searchsorted(record.seconds, (before, after))
             alone = abs(size) > _OWN_JUMP * abs(common[at[1]] - common[at[0]])
             if alone and not switched[at[0] : at[1] + 1].any():

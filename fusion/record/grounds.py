@@ -98,7 +98,7 @@ class RecordGrounds:
         model = self._model
         rise = _sensor_rise(self._record, str(candidate.parameters["sensor"]))
         weight = {True: 0.0, False: 0.0}
-        for fit, rows in zip(model.channels, model.rows, strict=True):
+        for fit, rows, levels in zip(model.channels, model.rows, model.levels, strict=True):
             course = rise[rows] - rise[rows].mean()
             size = fit.design.shape[1]
             together = fit_fixed_effects(
@@ -106,7 +106,8 @@ class RecordGrounds:
             )
             delayed = float(together.coefficients[-1])
             alone, beside = (
-                float((fit.design[:, 1:] @ coefficients[1:size]) @ course) / max(float(course @ course), 1e-300)
+                float((fit.design[:, levels:] @ coefficients[levels:size]) @ course)
+                / max(float(course @ course), 1e-300)
                 for coefficients in (fit.coefficients, together.coefficients)
             )
             cancels = beside * delayed < 0.0 and abs(beside + delayed) < 0.5 * max(abs(beside), abs(delayed))
@@ -137,7 +138,9 @@ def _smoothed(record: Record, values: Array, minutes: float) -> Array:
     """Mean over a centred window as wide as the lag's memory, without delay, (blocks,)."""
     half = max(1, round(60.0 * minutes / record.block_s))
     place = np.arange(values.size)
-    first, last = np.maximum(place - half, 0), np.minimum(place + half + 1, values.size)
+    begin = np.asarray(record.first)[record.run]
+    end = np.array([*record.first[1:], values.size])[record.run]
+    first, last = np.maximum(place - half, begin), np.minimum(place + half + 1, end)
     total = np.concatenate([[0.0], np.cumsum(values)])
     return np.asarray((total[last] - total[first]) / (last - first))
 

@@ -1,8 +1,8 @@
 """The closed loop on a record: what the quasi-static model of the temperatures lacks, and the error before and after.
 
 Search and hold-out set are those of :mod:`fusion.loop.closed_loop`. In addition every part of the record from the third on is predicted by
-the whole procedure from the time before it; an effect that did not help on the parts of the training time is withdrawn before the hold-out
-set is opened.
+the whole procedure from the time before it, every run of several from the other runs; an effect that did not help on the parts of the
+training time is withdrawn before the hold-out set is opened.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from fusion.record.baselines import plain_predictions
 from fusion.record.blocks import Record
 from fusion.record.hold_out import declare, hold_out
 from fusion.record.model import columns_of, fit_record
-from fusion.record.prediction import channel_rmse, left_out_rmse
+from fusion.record.prediction import channel_rmse, known_mean, left_out_rmse
 from fusion.record.problem import EARNED, ChainedPart, RecordProblem, RecordState, chain_forward, search_record
 from fusion.record.remainder import examine
 from fusion.record.result import RecordResult
@@ -73,6 +73,7 @@ def close_record(
         hold_out=~train,
         held_out=description,
         predictions=predictions,
+        without=[problem.predict(state.kept([place])) for place in range(len(state.steps))] if record.runs else [],
         errors=errors,
         plain=plain_predictions(record, train),
         cross_um=[cross_rmse(problem, [*state.declared, *state.added])]
@@ -109,8 +110,8 @@ def without_unrepeated(problem: RecordProblem, state: RecordState, chained: Sequ
         tried = [part for part in chained if part.in_training and step.effect in part.effects]
         if not tried or step.score.is_event:
             continue
-        before = float(np.nanmean([np.nanmean(part.rmse_declared_um) for part in tried]))
-        after = float(np.nanmean([np.nanmean(part.rmse_final_um) for part in tried]))
+        before = float(known_mean(np.array([known_mean(part.rmse_declared_um) for part in tried])))
+        after = float(known_mean(np.array([known_mean(part.rmse_final_um) for part in tried])))
         if after >= EARNED * before:
             evidence = {
                 "p_value": step.score.family_wise_p,

@@ -41,6 +41,7 @@ class RecordFit:
     terms : the effects, declared ones first; each with columns for all blocks, shared by the channels
     channels : the generalised least-squares fit of every channel under its own drift
     rows : the blocks of each channel's fit, as indices
+    levels : number of each channel's constants, the first columns of its design: one for every run
     """
 
     record: Record
@@ -48,6 +49,7 @@ class RecordFit:
     terms: tuple[Term, ...]
     channels: tuple[DriftFit, ...]
     rows: tuple[NDArray[np.intp], ...]
+    levels: tuple[int, ...]
 
     @property
     def sigma(self) -> Array:
@@ -71,7 +73,7 @@ def columns_of(record: Record, terms: Sequence[Term]) -> Array:
 
 
 def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -> RecordFit:
-    """Fit every channel by itself: constant, terms, and a drift whose order and size come from restricted likelihood.
+    """Fit every channel by itself: a constant for every run, terms, and a drift whose order and size come from restricted likelihood.
 
     Parameters
     ----------
@@ -87,12 +89,13 @@ def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -
     most = int(used.sum()) // _PER_COLUMN
     parts = [_leading(term.candidate.columns, used, most) for term in terms]
     columns = np.concatenate([columns_of(record, []), *parts], axis=1)
-    design = np.column_stack([np.ones(record.seconds.size), columns[:, independent(columns[used])]])
+    columns = columns[:, independent(columns[used])]
     rng = np.random.default_rng(0)
-    fits, rows = [], []
+    fits, rows, levels = [], [], []
     for k, name in enumerate(record.channels):
         response = record.displacement[:, k]
         here = np.flatnonzero(used & np.isfinite(response))
+        design, constants = _with_levels(record, columns, here)
         if here.size < _LEAST_PER_COEFFICIENT * design.shape[1]:
             raise RecordError(
                 f'channel "{name}" has {here.size} blocks for a model of {design.shape[1]} coefficients; record for longer, or leave it '
@@ -100,9 +103,24 @@ def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -
             )
         # A displacement that follows the columns exactly leaves no noise to weigh with: it is given a millionth of its range.
         shaken = response[here] + 1e-6 * np.ptp(response[here]) * rng.standard_normal(here.size)
-        fits.append(estimate(record.seconds[here], np.ones((here.size, 1)), shaken, design[here], robust=True))
+        fits.append(estimate(record.seconds[here], np.ones((here.size, 1)), shaken, design, robust=True))
         rows.append(here)
-    return RecordFit(record, used, tuple(terms), tuple(fits), tuple(rows))
+        levels.append(constants)
+    return RecordFit(record, used, tuple(terms), tuple(fits), tuple(rows), tuple(levels))
+
+
+def _with_levels(record: Record, columns: Array, here: NDArray[np.intp]) -> tuple[Array, int]:
+    """Design of one channel at its blocks: a constant for every run, then the columns; and the number of constants.
+
+    A column that only differs from run to run cannot be told from the runs' constants and is left out.
+    """
+    run = record.run[here]
+    later = np.unique(run)[1:]
+    if not later.size:
+        return np.column_stack([np.ones(here.size), columns[here]]), 1
+    levels = (run[:, None] == later).astype(float)
+    both = np.column_stack([levels, columns[here]])
+    return np.column_stack([np.ones(here.size), both[:, independent(both)]]), 1 + later.size
 
 
 def _leading(columns: Array, used: NDArray[np.bool_], most: int) -> Array:
@@ -144,9 +162,7 @@ def simulate_channels(model: RecordFit, rng: np.random.Generator, *, draws: int)
     laid = np.full((blocks, len(noises)), np.nan)
     for k, rows in enumerate(model.rows):
         laid[rows, k] = shocks[k]
-    known = laid[np.isfinite(laid).all(axis=1)]
-    ranks = np.clip(known / known.std(axis=0), -3.0, 3.0)
-    root = np.linalg.cholesky(np.corrcoef(ranks.T).reshape(len(noises), -1) + 1e-6 * np.eye(len(noises)))
+    root = np.linalg.cholesky(_correlation(laid) + 1e-6 * np.eye(len(noises)))
     correlated = rng.standard_normal((2, blocks, draws, len(noises))) @ root.T
     picked = rng.integers(0, blocks, (blocks, draws))
     simulated = []
@@ -158,6 +174,15 @@ def simulate_channels(model: RecordFit, rng: np.random.Generator, *, draws: int)
         drawn += fit.sigma * np.sqrt(ratios) * random_walk(fit.system, *correlated[..., k][:, rows])
         simulated.append(drawn)
     return simulated
+
+
+def _correlation(shocks: Array) -> Array:
+    """Correlation of the channels' shocks (blocks, channels), NaN where one is missing; none where too few blocks hold all of them."""
+    channels = shocks.shape[1]
+    known = shocks[np.isfinite(shocks).all(axis=1)]
+    if known.shape[0] <= channels or not known.std(axis=0).all():
+        return np.eye(channels)
+    return np.corrcoef(np.clip(known / known.std(axis=0), -3.0, 3.0).T).reshape(channels, -1)
 
 
 def channel_gains(model: RecordFit, candidates: Sequence[Candidate], draws: Sequence[Array] = ()) -> Gains:

@@ -17,6 +17,8 @@ from fusion.record.blocks import Record
 
 #: Shares of a column's variance that are added to it: from ordinary least squares to hardly any coefficient at all.
 PENALTIES = 10.0 ** np.arange(-5.0, 1.6, 0.5)
+#: Times that runs are left out at most; of more runs several are left out together.
+MOST_LEFT_OUT = 8
 #: Share of the training blocks that must lie before a part for its prediction to be counted.
 _LATER = 0.5
 
@@ -50,19 +52,20 @@ def predict(record: Record, columns: Array, train: NDArray[np.bool_]) -> Predict
     columns : (blocks, p) of the model, known for all blocks
     train : (blocks,) those whose displacements may be used
     """
-    asked = chained_parts(record, train)
+    asked = folds(record, train)
     errors = np.full((len(asked), PENALTIES.size), np.nan)
-    for place, number in enumerate(asked):
-        before, part = train & (record.chained < number), train & (record.chained == number)
+    for place, (before, part) in enumerate(asked):
         for k, (predicted, _, _) in enumerate(_paths(record, columns, before)):
             errors[place, k] = rmse(record, predicted, part)
-    mean = errors.mean(axis=0) if asked else np.full(PENALTIES.size, np.nan)
-    best = int(np.argmin(mean)) if asked else PENALTIES.size // 2
+    mean = known_mean(errors, axis=0)
+    best = int(np.argmin(mean)) if np.isfinite(mean).all() else PENALTIES.size // 2
     return Prediction(*_paths(record, columns, train)[best], float(PENALTIES[best]), float(mean[best]))
 
 
-def last_values(record: Record, train: NDArray[np.bool_]) -> Array:
-    """Last training value of every channel.
+def folds(record: Record, train: NDArray[np.bool_]) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
+    """Blocks that are predicted for the choice of the penalty, and those that they are predicted from.
+
+    Runs are predicted from the other runs, at most `MOST_LEFT_OUT` times; parts of a single run from those before them.
 
     Parameters
     ----------
@@ -71,9 +74,35 @@ def last_values(record: Record, train: NDArray[np.bool_]) -> Array:
 
     Returns
     -------
-    (channels,) ndarray, um
+    list of (used, predicted)
+        (blocks,) each, True for blocks of the training part.
     """
-    return np.array([column[train & np.isfinite(column)][-1] for column in record.displacement.T])
+    runs = np.unique(record.run[train])
+    if runs.size > 1:
+        left_out = [np.isin(record.run, some) for some in np.array_split(runs, min(runs.size, MOST_LEFT_OUT))]
+        return [(train & ~some, train & some) for some in left_out]
+    return [(train & (record.chained < one), train & (record.chained == one)) for one in chained_parts(record, train)]
+
+
+def last_values(record: Record, train: NDArray[np.bool_]) -> Array:
+    """Last training value of every channel in every run; in a run without any, its zero.
+
+    Parameters
+    ----------
+    record : on its blocks
+    train : (blocks,) True for the training part
+
+    Returns
+    -------
+    (blocks, channels) ndarray, um
+    """
+    last = np.zeros(record.displacement.shape)
+    for run in range(len(record.first)):
+        here = record.run == run
+        for channel, column in enumerate(record.displacement.T):
+            values = column[train & here & np.isfinite(column)]
+            last[here, channel] = values[-1] if values.size else 0.0
+    return last
 
 
 def persistence_rmse(record: Record, train: NDArray[np.bool_], where: NDArray[np.bool_]) -> Array:
@@ -89,11 +118,11 @@ def persistence_rmse(record: Record, train: NDArray[np.bool_], where: NDArray[np
     -------
     (channels,) ndarray, um
     """
-    return channel_rmse(record, np.broadcast_to(last_values(record, train), record.displacement.shape), where)
+    return channel_rmse(record, last_values(record, train), where)
 
 
 def left_out_rmse(record: Record, columns: Array, penalty: float) -> float:
-    """Error of predicting every part of a record from all others, earlier and later ones.
+    """Error of predicting every part of a record, or every run of several, from all others, earlier and later ones.
 
     Parameters
     ----------
@@ -108,8 +137,9 @@ def left_out_rmse(record: Record, columns: Array, penalty: float) -> float:
     """
     predicted = np.full(record.displacement.shape, np.nan)
     place = int(np.flatnonzero(penalty == PENALTIES)[0])
-    for number in np.unique(record.chained):
-        part = record.chained == number
+    numbers = record.run if record.runs else record.chained
+    for number in np.unique(numbers):
+        part = numbers == number
         predicted[part] = _paths(record, columns, ~part)[place][0][part]
     return rmse(record, predicted, np.ones(part.size, bool))
 
@@ -148,7 +178,21 @@ def rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> float:
     float
         um
     """
-    return float(np.nanmean(channel_rmse(record, predicted, where)))
+    return float(known_mean(channel_rmse(record, predicted, where)))
+
+
+def known_mean(values: Array, axis: int | None = None) -> Array:
+    """Mean over the values that are known, NaN where there is none.
+
+    Parameters
+    ----------
+    values : in any unit, NaN where one is missing
+    axis : over which the mean is taken; all of them by default
+    """
+    known = np.isfinite(values)
+    number = known.sum(axis=axis)
+    total = np.where(known, values, 0.0).sum(axis=axis)
+    return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
 
 
 def channel_rmse(record: Record, predicted: Array, where: NDArray[np.bool_]) -> Array:

@@ -29,7 +29,7 @@ from fusion.record.effects import record_library
 from fusion.record.grounds import RecordGrounds
 from fusion.record.hold_out import hold_out
 from fusion.record.model import RecordFit, channel_gains, columns_of, fit_record, simulate_channels
-from fusion.record.prediction import Prediction, channel_rmse, persistence_rmse, predict
+from fusion.record.prediction import Prediction, channel_rmse, folds, known_mean, persistence_rmse, predict
 
 #: Probability of adding an effect where only drift and noise act. A drift that wanders at random is a stand-in for what a real machine
 #: does, and its sensors are late, so the probability is smaller than along an axis: that of an error of three standard deviations.
@@ -109,7 +109,7 @@ class RecordProblem:
 
     def hold_out_error(self, terms: Sequence[Term]) -> float:
         """Error of predicting the blocks that may not be used, mean over the channels, um."""
-        return float(np.nanmean(channel_rmse(self.record, self.predict(terms).predicted, ~self.train)))
+        return float(known_mean(channel_rmse(self.record, self.predict(terms).predicted, ~self.train)))
 
     def predict(self, terms: Sequence[Term]) -> Prediction:
         """Predict all blocks from the training part."""
@@ -148,6 +148,7 @@ class ChainedPart:
     effects : what the search on the time before added
     rmse_persistence_um, rmse_declared_um, rmse_final_um : (channels,) errors of repeating the last value, of the declared model, and
         of the model with what was added
+    runs : names of the runs that it consists of; empty in a record of one run
     """
 
     first_h: float
@@ -157,6 +158,7 @@ class ChainedPart:
     rmse_persistence_um: Array
     rmse_declared_um: Array
     rmse_final_um: Array
+    runs: tuple[str, ...] = ()
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
@@ -192,7 +194,7 @@ def chain_forward(
     effects: Mapping[str, Effect] | None = None,
     progress: Progress = no_progress,
 ) -> list[ChainedPart]:
-    """Predict every part of the record from the third on by the whole procedure applied to the time before it.
+    """Predict every part of the record from the third on by the whole procedure applied to the time before it; runs from the other runs.
 
     Nothing of the predicted part is used: no level, no parameter, no choice of an effect.
 
@@ -202,12 +204,11 @@ def chain_forward(
     declared : terms of the declared model
     seed, effects, progress : as for :func:`search_record`
     """
-    parts = []
     train, _ = hold_out(record)
-    numbers = np.unique(record.chained)[2:]
-    for done, number in enumerate(numbers):
-        progress(done, numbers.size, "predicting part after part")
-        before, part = record.chained < number, record.chained == number
+    parts = []
+    asked = chained_folds(record, train)
+    for done, (before, part) in enumerate(asked):
+        progress(done, len(asked), "predicting part after part")
         problem, state = search_record(record, before, declared, seed=seed, effects=effects)
         hours = record.seconds[part] / 3600.0
         parts.append(
@@ -219,6 +220,30 @@ def chain_forward(
                 persistence_rmse(record, before, part),
                 channel_rmse(record, problem.predict(state.declared).predicted, part),
                 channel_rmse(record, problem.predict(state.model.terms).predicted, part),
+                tuple(record.runs[run].name for run in np.unique(record.run[part])) if record.runs else (),
             )
         )
     return parts
+
+
+def chained_folds(record: Record, train: NDArray[np.bool_]) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
+    """Parts that the whole procedure predicts, and what it predicts them from.
+
+    Parameters
+    ----------
+    record : on its blocks
+    train : (blocks,) True for the training part
+
+    Returns
+    -------
+    list of (used, predicted)
+        (blocks,) each. Of two or more training runs, every one from the others; else every part from the third on from all before it, in
+        the training part alone where other runs are held out.
+    """
+    if np.unique(record.run[train]).size > 1:
+        return folds(record, train)
+    within = train if record.runs else np.ones_like(train)
+    return [
+        (within & (record.chained < one), within & (record.chained == one))
+        for one in np.unique(record.chained[within])[2:]
+    ]

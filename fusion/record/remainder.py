@@ -17,6 +17,7 @@ from fusion.diagnosis.remainder import LEVEL, PermutationTest, permutation_test
 from fusion.loop.verdict import exceeds_noise
 from fusion.record.blocks import Record
 from fusion.record.model import RecordFit
+from fusion.record.prediction import known_mean
 
 #: What may be left beside the noise of a block mean, as a multiple of it: three standard deviations, beyond which a block is off by more
 #: than noise.
@@ -77,14 +78,14 @@ def examine(model: RecordFit, hold_out_rmse: Array, rng: np.random.Generator) ->
     test = _test(innovations, switched, rng)
     share = hold_out_rmse**2 / np.nanvar(record.displacement, axis=0)
     words = _shapes(test, innovations, record, rng) if test.p_value < LEVEL else []
-    error_um, noise_um = float(np.sqrt(np.nanmean(hold_out_rmse**2))), float(np.sqrt(np.mean(model.sigma**2)))
+    error_um, noise_um = float(np.sqrt(known_mean(hold_out_rmse**2))), float(np.sqrt(np.mean(model.sigma**2)))
     if exceeds_noise(error_um, noise_um, NOISE_SHARE):
         words.append(
             f"a slow drift that neither temperatures nor drivers follow, largest in {_largest(record, hold_out_rmse)}"
         )
     shape = " and ".join(words)
     return RecordRemainder(
-        test.p_value, test.p_values, shape, float(np.nanmean(hold_out_rmse)) if words else 0.0, share
+        test.p_value, test.p_values, shape, float(known_mean(hold_out_rmse)) if words else 0.0, share
     )
 
 

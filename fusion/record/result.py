@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,35 @@ from fusion.loop.baselines import ErrorInterval, error_interval
 from fusion.loop.closed_loop import not_confirmed
 from fusion.loop.result import errors_json
 from fusion.loop.state import Round, Step, rivals
-from fusion.loop.verdict import doubt_of, has_skill, verdict
+from fusion.loop.verdict import doubt_of, exceeds_noise, has_skill, verdict
 from fusion.model.fit import Term, place_of
 from fusion.products.results_loop import Verdict
 from fusion.record.blocks import Record
 from fusion.record.model import RecordFit
-from fusion.record.prediction import Prediction, channel_rmse, rmse
+from fusion.record.prediction import Prediction, channel_rmse, known_mean, rmse
 from fusion.record.problem import ENTRY_LEVEL, ChainedPart, RecordState
 from fusion.record.remainder import NOISE_SHARE, RecordRemainder
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """One run of a record of several.
+
+    Attributes
+    ----------
+    number : of the run, from 0
+    blocks : (blocks,) True for its blocks
+    last_value_um, declared_um, final_um : errors of repeating its zero, of the declared and of the final model, mean over the channels, um;
+        NaN where it is not held out
+    verdict : word for the outcome in this run; empty where it is not held out
+    """
+
+    number: int
+    blocks: NDArray[np.bool_]
+    last_value_um: float = np.nan
+    declared_um: float = np.nan
+    final_um: float = np.nan
+    verdict: Verdict | Literal[""] = ""
 
 
 @dataclass(frozen=True)
@@ -35,6 +56,7 @@ class RecordResult:
     hold_out : (blocks,) True for the hold-out set
     held_out : which part that is, in words
     predictions : of the declared model and after every added effect, from the training part
+    without : of the final model without each of its effects in turn
     errors : (1 + effects, channels) their errors on the hold-out set, um
     plain : (blocks, channels) each, plain predictions from the training part, by name
     cross_um : error of predicting every part from all others, um: of the final model, then without each of its effects
@@ -48,6 +70,7 @@ class RecordResult:
     hold_out: NDArray[np.bool_]
     held_out: str
     predictions: list[Prediction]
+    without: list[Prediction]
     errors: Array
     plain: Mapping[str, Array]
     cross_um: list[float]
@@ -81,12 +104,12 @@ class RecordResult:
     def skill(self) -> bool:
         """Whether the final model predicts the hold-out set better than last value and mean of the training part."""
         last, mean = (rmse(self.record, self.plain[name], self.hold_out) for name in ("last_value", "mean"))
-        return has_skill(float(np.nanmean(self.errors[-1])), last, mean, self.noise_um, NOISE_SHARE)
+        return has_skill(float(known_mean(self.errors[-1])), last, mean, self.noise_um, NOISE_SHARE)
 
     @property
     def doubts(self) -> list[str]:
         """For every step why the hold-out set does not confirm it; empty where it does."""
-        after = float(np.nanmean(self.errors[-1]))
+        after = float(known_mean(self.errors[-1]))
         return [
             doubt_of(after, without, self.noise_um, "on the hold-out set") for without in self.state.errors_without_um
         ]
@@ -103,15 +126,47 @@ class RecordResult:
             skill=self.skill,
         )
 
+    @property
+    def runs(self) -> list[RunResult]:
+        """Every run of a record of several: errors and verdict of those that are held out."""
+        return [self._run(number) for number in range(len(self.record.runs))]
+
+    def _run(self, number: int) -> RunResult:
+        """One run, judged by its own errors."""
+        here = self.record.run == number
+        if not self.record.runs[number].held_out:
+            return RunResult(number, here)
+        last, mean, declared, final = (
+            rmse(self.record, values, here)
+            for values in (
+                self.plain["last_value"],
+                self.plain["mean"],
+                self.predictions[0].predicted,
+                self.predictions[-1].predicted,
+            )
+        )
+        doubts = [
+            doubt_of(final, rmse(self.record, one.predicted, here), self.noise_um, "in this run")
+            for one in self.without
+        ]
+        word = verdict(
+            confirmed=not all(doubts),
+            doubtful=any(doubts),
+            tested=bool(self.state.unnamed(ENTRY_LEVEL)) or self.remainder.is_tested,
+            remains=exceeds_noise(final, self.noise_um, NOISE_SHARE),
+            skill=has_skill(final, last, mean, self.noise_um, NOISE_SHARE),
+        )
+        return RunResult(number, here, last, declared, final, word)
+
     def as_json(self) -> dict[str, Any]:
         """The ``loop`` part of results.json; errors are means over the channels."""
-        mean = np.nanmean(self.errors, axis=1)
+        mean = known_mean(self.errors, axis=1)
         last = self.state.rounds[-1].scores
         return {
             "declared": [term.effect for term in self.state.declared],
             "held_out": self.held_out,
             "noise_floor_um": self.noise_um,
-            "rmse_persistence_um": float(np.nanmean(self.persistence_um)),
+            "rmse_persistence_um": float(known_mean(self.persistence_um)),
             "rmse_declared_um": float(mean[0]),
             "rmse_final_um": float(mean[-1]),
             "steps": [self._step(place) for place in range(len(self.state.steps))],
@@ -123,7 +178,7 @@ class RecordResult:
                 "rms_um": self.remainder.rms_um,
                 "p_value": self.remainder.p_value,
                 "p_values": self.remainder.p_values,
-                "variance_share": float(np.nanmean(self.remainder.variance_share)),
+                "variance_share": float(known_mean(self.remainder.variance_share)),
                 "nearest": last[0].name if self.remainder.shape and last else "",
             },
             "channels": {
@@ -142,22 +197,38 @@ class RecordResult:
                     "last_h": part.last_h,
                     "in_training": part.in_training,
                     "effects": list(part.effects),
-                    "rmse_persistence_um": float(np.nanmean(part.rmse_persistence_um)),
-                    "rmse_declared_um": float(np.nanmean(part.rmse_declared_um)),
-                    "rmse_final_um": float(np.nanmean(part.rmse_final_um)),
+                    "rmse_persistence_um": float(known_mean(part.rmse_persistence_um)),
+                    "rmse_declared_um": float(known_mean(part.rmse_declared_um)),
+                    "rmse_final_um": float(known_mean(part.rmse_final_um)),
+                    **({"runs": list(part.runs)} if part.runs else {}),
                 }
                 for part in self.chained
             ],
+            **({"runs": [self._run_json(run) for run in self.runs]} if self.record.runs else {}),
             "search": [_round_json(scored) for scored in self.state.rounds],
             "not_tried": self.state.not_tried(),
             "blocked": self.state.blocked(),
+        }
+
+    def _run_json(self, run: RunResult) -> dict[str, Any]:
+        described = self.record.runs[run.number]
+        time = self.record.time[run.blocks]
+        return {
+            "file": described.name,
+            "held_out": described.held_out,
+            "duration_h": float((time[-1] - time[0]) / np.timedelta64(1, "s") + self.record.block_s) / 3600.0,
+            "blocks": int(run.blocks.sum()),
+            "rmse_persistence_um": run.last_value_um,
+            "rmse_declared_um": run.declared_um,
+            "rmse_final_um": run.final_um,
+            "verdict": run.verdict,
         }
 
     def _step(self, place: int) -> dict[str, Any]:
         step, term = self.state.steps[place], self.state.added[place]
         tied, runner_up = rivals(step.score, step.round.scores)
         squares = self.contribution(term) ** 2
-        before, after = np.nanmean(self.errors[place]), np.nanmean(self.errors[place + 1])
+        before, after = known_mean(self.errors[place]), known_mean(self.errors[place + 1])
         return {
             "effect": term.effect,
             "parameters": dict(term.candidate.parameters),

@@ -138,13 +138,17 @@ def plot_contributions(record: xr.Dataset, channel: str, *, ax: Axes | None = No
 
 
 def _shade_hold_out(record: xr.Dataset, ax: Axes) -> None:
-    """Shade the hold-out."""
-    hours = _hours(record)[record["sealed"].values]
-    if hours.size:
-        ax.axvspan(float(hours[0]), float(hours[-1]), color=ACCENT, alpha=0.07, linewidth=0)
+    """Shade the hold-out, every run that is held out by itself."""
+    hours, sealed = _hours(record), record["sealed"].values
+    run = record["run"].values if "run" in record else np.zeros(hours.size, int)
+    for number in np.unique(run[sealed]):
+        here = hours[sealed & (run == number)]
+        ax.axvspan(float(here[0]), float(here[-1]), color=ACCENT, alpha=0.07, linewidth=0)
 
 
 def _hours(record: xr.Dataset) -> np.ndarray:
-    """Return the time of every block since the start of the record in hours."""
+    """Return the time of every block since the start of the record in hours; of several runs, the time between them left out."""
+    if "elapsed" in record:
+        return np.asarray(record["elapsed"].values / 3600.0)
     time = record["time"].values
     return np.asarray((time - time[0]) / np.timedelta64(1, "h"), float)

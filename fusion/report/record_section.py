@@ -138,6 +138,7 @@ def describe_record(results: Results, provenance: Mapping[str, Any], record: xr.
         "refused": refused_effects(loop),
         "candidates": _candidates_table(loop),
         "chained": _chained_table(loop),
+        "runs": _runs_table(loop),
         "uncertainty": _uncertainty(loop),
         "glossary": _GLOSSARY,
     }
@@ -278,12 +279,26 @@ def _candidates_table(loop: RecordLoop) -> Table:
     return table(columns, rows)
 
 
+def _runs_table(loop: RecordLoop) -> Table:
+    """Return the runs of a record of several, with errors and verdict of those that are held out."""
+    rows = [
+        [
+            run.file,
+            number(run.duration_h, 3),
+            *((number(getattr(run, key), 3) if run.held_out else "–") for key in _ERROR_KEYS),
+            run.verdict.replace("_", " ") or "learnt from",
+        ]
+        for run in loop.runs
+    ]
+    return table([Words("Run"), "Length / h", *_ERRORS, Words("Verdict")], rows)
+
+
 def _chained_table(loop: RecordLoop) -> Table:
     """Return the errors of the forward-chained parts and their means."""
     rows = [
         Row(
             [
-                f"{number(part.first_h, 3)} to {number(part.last_h, 3)}",
+                join(list(part.runs)) or f"{number(part.first_h, 3)} to {number(part.last_h, 3)}",
                 join([effect_words(name).name for name in part.effects]) or "none",
                 *(number(getattr(part, key), 3) for key in _ERROR_KEYS),
             ]
@@ -292,7 +307,12 @@ def _chained_table(loop: RecordLoop) -> Table:
     ]
     means = [number(_mean_chained(loop, key), 3) for key in _ERROR_KEYS]
     return table(
-        [Words("Part / h"), Words("Effects found before it"), *_ERRORS], [*rows, Row(["mean", "", *means], marked=True)]
+        [
+            Words("Run" if loop.runs else "Part / h"),
+            Words("Effects found in the other runs" if loop.runs else "Effects found before it"),
+            *_ERRORS,
+        ],
+        [*rows, Row(["mean", "", *means], marked=True)],
     )
 
 

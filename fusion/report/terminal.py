@@ -19,7 +19,7 @@ from fusion.campaign.quantities import read_quantity
 from fusion.products.results import Results
 from fusion.products.results_axis import RegistrationPart
 from fusion.products.results_inputs import Figures
-from fusion.products.results_loop import Loop
+from fusion.products.results_loop import Loop, RecordLoop
 from fusion.products.store import write_atomically
 from fusion.report.findings import (
     anomaly_cause,
@@ -129,6 +129,20 @@ def _anomaly_lines(results: Results) -> list[str]:
     ]
 
 
+def _run_rows(loop: Loop) -> list[tuple[str, str]]:
+    """The runs that are held out of a record of several, each with its error before and after and its verdict."""
+    runs = loop.runs if isinstance(loop, RecordLoop) else ()
+    return [
+        (
+            f"run {run.file}",
+            f"{run.verdict}: {number(run.rmse_declared_um, 3)} -> {number(run.rmse_final_um, 3)} µm, "
+            f"its zero repeated {number(run.rmse_persistence_um, 3)} µm",
+        )
+        for run in runs
+        if run.held_out
+    ]
+
+
 def _loop_rows(results: Results, loop: Loop) -> list[tuple[str, str]]:
     rows = [("declared", ", ".join(loop.declared) or "nothing")]
     for step in loop.steps:
@@ -143,6 +157,7 @@ def _loop_rows(results: Results, loop: Loop) -> list[tuple[str, str]]:
         ("held-out error", _under(hold_out_errors(loop), results, "causes")),
         ("plain predictions", _under(baseline_errors(loop), results, "positions")),
         ("noise floor", _under(f"{number(loop.noise_floor_um, 3)} µm", results, "positions")),
+        *_run_rows(loop),
         ("verdict", f"{loop.verdict}: {conditional_headline(results)}"),
     ]
 

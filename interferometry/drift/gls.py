@@ -38,6 +38,8 @@ _LOG_RATIO_LIMITS = (-14.0, 4.0)
 _FIRST_STEP = 1.5
 #: A reading whose deletion residual exceeds this many standard deviations is down-weighted (robust fit).
 _OUTLIER_LIMIT = 3.0
+#: Multiple of that limit beyond which no residual is told from a larger one.
+_LARGEST_EXCESS = 1e6
 #: A whitened column is collinear with those before it where they leave less than this share of its squared length unexplained.
 _DEPENDENCE_TOLERANCE = 1e-10
 #: The drift is taken as an integrated random walk only if that raises the restricted log-likelihood by this much: where both fit,
@@ -306,7 +308,8 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
 
 def _downweight(fit: DriftFit) -> Array:
     """Relative variances (n,) under which a reading far from the others is down-weighted (redescending weight function)."""
-    excess = np.abs(np.nan_to_num(fit.deletion_residuals())) / _OUTLIER_LIMIT
+    # Where the others leave no scatter an outlier is any multiple of it; the square of that has to stay a number.
+    excess = np.minimum(np.abs(np.nan_to_num(fit.deletion_residuals())) / _OUTLIER_LIMIT, _LARGEST_EXCESS)
     return np.where(excess > 1.0, excess**2, 1.0)
 
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from fusion.campaign.config import load_campaign
-from fusion.campaign.logged_tables import TableError, read_drivers, read_record, split_heading
+from fusion.campaign.logged_tables import TableError, read_drivers, split_heading
+from fusion.campaign.record_runs import read_record
 
 RECORD = """\
 [campaign]

@@ -60,7 +60,7 @@ BLOCKS = 240
 
 def quiet(record: Record, used: np.ndarray | None = None) -> RecordFit:
     """A record and which of its blocks are used: what most grounds are asked of needs no fit."""
-    return RecordFit(record, np.ones(BLOCKS, bool) if used is None else used, (), (), ())
+    return RecordFit(record, np.ones(BLOCKS, bool) if used is None else used, (), (), (), ())
 
 
 def switching() -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fusion.campaign.config import load_campaign
-from fusion.campaign.logged_tables import read_record
+from fusion.campaign.record_runs import read_record
 from fusion.effects.effect import Candidate, Effect
 from fusion.effects.library import LIBRARY, library
 from fusion.loop.decisions import Decision, Reason

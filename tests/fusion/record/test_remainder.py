@@ -31,7 +31,7 @@ def quiet_fit(record: Record) -> RecordFit:
         system = drift_system(record.seconds[here], np.ones((here.size, 1)), order=1, ratios=np.array([1e-12]))
         fits.append(fit_fixed_effects(system, response[here], np.ones((here.size, 1))))
         rows.append(here)
-    return RecordFit(record, np.ones(BLOCKS, bool), (), tuple(fits), tuple(rows))
+    return RecordFit(record, np.ones(BLOCKS, bool), (), tuple(fits), tuple(rows), (1,) * len(fits))
 
 
 def examined(record: Record, *, hold_out_rmse: float = 0.0) -> RecordRemainder:

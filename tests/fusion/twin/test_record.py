@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from fusion.campaign.config import load_campaign
-from fusion.campaign.logged_tables import read_record
+from fusion.campaign.record_runs import read_record
 from fusion.twin import simulate
 from fusion.twin.instruments import simulate_campaign, truth_folder
 from fusion.twin.machine.recipe import AnomalyRecipe, EffectRecipe, Recipe, RecipeError
