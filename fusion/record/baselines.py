@@ -22,9 +22,8 @@ def plain_predictions(record: Record, train: NDArray[np.bool_]) -> dict[str, Arr
     Returns
     -------
     dict of (blocks, channels) ndarray
-        um: ``last_value`` of every channel (of a run that is held out as a whole, its zero) and ``mean``; ``least_squares`` and ``ridge`` on
-        temperatures and drivers (and their squares);
-        ``ridge_with_lags`` on lagged copies of them too.
+        um: ``last_value`` (of a run that is held out as a whole, its zero) and ``mean`` of every channel; ``least_squares`` and ``ridge``
+        on temperatures and drivers (and their squares); ``ridge_with_lags`` on lagged copies of them too.
     """
     now = np.column_stack([record.rise, *(values for powers in record.drivers.values() for values in powers.values())])
     late = [record.series(now, "1").lagged(60.0 * minutes).values for minutes in LAGS_MIN]

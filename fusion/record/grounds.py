@@ -111,7 +111,7 @@ class RecordGrounds:
                 for coefficients in (fit.coefficients, together.coefficients)
             )
             cancels = beside * delayed < 0.0 and abs(beside + delayed) < 0.5 * max(abs(beside), abs(delayed))
-            weight[cancels or alone * delayed < 0.0] += abs(delayed) / fit.sigma
+            weight[cancels or alone * delayed < 0.0] += abs(delayed) / max(fit.sigma, 1e-12)
         return weight[True] > weight[False]
 
     def advantage_over_smoothing(self, candidate: Candidate) -> float:

@@ -24,6 +24,7 @@ from fusion.model.null_simulation import random_walk
 from fusion.model.profile_gain import profile_gains
 from fusion.record.blocks import Record, RecordError, independent
 from interferometry.drift.gls import DriftFit, estimate
+from interferometry.drift.state_space import DriftModelError
 
 #: Readings per coefficient that a chained block needs before it, or its prediction says nothing.
 _LEAST_PER_COEFFICIENT = 2
@@ -103,10 +104,25 @@ def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -
             )
         # A displacement that follows the columns exactly leaves no noise to weigh with: it is given a millionth of its range.
         shaken = response[here] + 1e-6 * np.ptp(response[here]) * rng.standard_normal(here.size)
-        fits.append(estimate(record.seconds[here], np.ones((here.size, 1)), shaken, design, robust=True))
+        fits.append(_estimate(name, record.seconds[here], shaken, design))
         rows.append(here)
         levels.append(constants)
     return RecordFit(record, used, tuple(terms), tuple(fits), tuple(rows), tuple(levels))
+
+
+def _estimate(channel: str, seconds: Array, response: Array, design: Array) -> DriftFit:
+    """Robust estimate of one channel; where a column differs from others only in outliers, all blocks count alike."""
+    loadings = np.ones((seconds.size, 1))
+    try:
+        return estimate(seconds, loadings, response, design, robust=True)
+    except DriftModelError:
+        pass
+    try:
+        return estimate(seconds, loadings, response, design)
+    except DriftModelError as error:
+        raise RecordError(
+            f'channel "{channel}" cannot be fitted ({error}); leave it, or sensors that hardly move, out of [record]'
+        ) from None
 
 
 def _with_levels(record: Record, columns: Array, here: NDArray[np.intp]) -> tuple[Array, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -56,13 +56,13 @@ class RecordResult:
     hold_out : (blocks,) True for the hold-out set
     held_out : which part that is, in words
     predictions : of the declared model and after every added effect, from the training part
-    without : of the final model without each of its effects in turn
     errors : (1 + effects, channels) their errors on the hold-out set, um
     plain : (blocks, channels) each, plain predictions from the training part, by name
     cross_um : error of predicting every part from all others, um: of the final model, then without each of its effects
     whole : the final model fitted to all blocks, for its residual
     remainder : structure that the final model leaves
-    chained : every part from the third on, predicted by the whole procedure on the time before it
+    chained : every part from the third on, predicted by the whole procedure on the time before it; runs from the other runs
+    without : predictions of the final model without each of its effects in turn; of a record of several runs
     """
 
     state: RecordState
@@ -70,13 +70,13 @@ class RecordResult:
     hold_out: NDArray[np.bool_]
     held_out: str
     predictions: list[Prediction]
-    without: list[Prediction]
     errors: Array
     plain: Mapping[str, Array]
     cross_um: list[float]
     whole: RecordFit
     remainder: RecordRemainder
     chained: list[ChainedPart]
+    without: list[Prediction] = field(default_factory=list)
 
     @property
     def persistence_um(self) -> Array:

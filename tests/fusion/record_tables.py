@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 
 import numpy as np
@@ -36,6 +37,22 @@ def table_of(
         },
         attrs={"source": "record.csv"},
     )
+
+
+def runs_table(*levels: float, samples: int = 60) -> xr.Dataset:
+    """Runs a day apart, each with a channel that starts at its own level and follows one sensor by 2 um/K."""
+    rng = np.random.default_rng(3)
+    tables = []
+    for run, level in enumerate(levels):
+        temperature = 20.0 + run + np.cumsum(rng.normal(0.0, 0.1, (samples, 1)), axis=0)
+        displacement = level + 2.0 * (temperature - temperature[0])
+        load = ((np.arange(samples) // 20 + run) % 2).astype(float)
+        table = table_of(displacement, temperature, load)
+        table = table.assign_coords(time=table["time"].values + np.timedelta64(run, "D"))
+        tables.append(table.assign_coords(run=("time", np.full(samples, run))))
+    joined = xr.concat(tables, "time", data_vars="minimal", coords="minimal", compat="override")
+    names = [f"r{run + 1}.csv" for run in range(len(levels))]
+    return joined.assign_attrs(runs=json.dumps(names), test=json.dumps([len(levels) - 1]), own_zero=0)
 
 
 def twin_table(*effects: EffectRecipe, seed: int, hours: float = 24.0) -> xr.Dataset:

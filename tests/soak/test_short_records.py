@@ -36,8 +36,8 @@ RUNS = campaigns(2000)
 FIRST_SEED = first_seed(41_000)
 #: One record in so many goes through the whole command.
 WHOLE = 50
-DRAWS = 40
-BLOCKS = 150
+DRAWS = 20
+BLOCKS = 100
 EFFECTS = ("none", "thermal_lag", "unseen_heat_source", "step_event", "periodic_disturbance")
 
 

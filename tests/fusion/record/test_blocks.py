@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fusion.record.blocks import RecordError, chained_blocks, independent, reduce_record
-from tests.fusion.record_tables import linear_samples, record_of, table_of
+from tests.fusion.record_tables import linear_samples, record_of, runs_table, table_of
 
 
 def test_blocks_hold_the_means_of_their_samples(rng):
@@ -178,3 +178,50 @@ def test_a_start_of_the_load_early_late_or_soon_after_another_begins_no_part():
         speed[start : start + 20] = 1.0
     parts = chained_blocks(seconds, [speed])
     np.testing.assert_array_equal(np.flatnonzero(np.diff(parts)) + 1, [150, 300, 450, 600])
+
+
+def test_every_run_has_its_own_zero_and_nothing_crosses_a_border() -> None:
+    record = reduce_record(runs_table(5.0, -300.0, 40.0))
+    assert record.first == (0, 60, 120)
+    starts = list(record.first)
+    assert (record.displacement[starts] == 0.0).all()
+    assert (record.rise[starts] == 0.0).all()
+    np.testing.assert_allclose(record.displacement, 2.0 * record.rise, atol=1e-9)
+    # One block lies between two runs, whatever time passed.
+    assert np.diff(record.seconds)[59] == 2.0 * record.block_s
+    assert [str(one.start)[:10] for one in record.runs] == ["2026-01-05", "2026-01-06", "2026-01-07"]
+    assert str(record.time[60])[:16] == "2026-01-06T06:00"
+    lagged = record.series(record.temperature, "degC").lagged(3600.0).values
+    np.testing.assert_array_equal(lagged[starts], record.temperature[starts])
+    # A load that differs from the end of one run to the start of the next was not switched.
+    assert not record.switched()[[58, 59, 60, 61]].any()
+    assert record.switched()[[18, 19, 20, 21, 22]].all()
+    assert all(np.unique(record.run[record.chained == part]).size == 1 for part in np.unique(record.chained))
+
+
+def test_a_run_without_a_value_of_a_column_is_named() -> None:
+    table = runs_table(0.0, 0.0, 0.0)
+    table["temperature"].values[60:120] = np.nan
+    with pytest.raises(RecordError, match=r'r2\.csv: column "t1" has no value in this run'):
+        reduce_record(table)
+    table = runs_table(0.0, 0.0, 0.0)
+    table["displacement"].values[60:120] = np.nan
+    with pytest.raises(RecordError, match=r'r2\.csv: channel "ch1" has no value in this run'):
+        reduce_record(table)
+    with pytest.raises(RecordError, match="the run fills 5 blocks"):
+        reduce_record(runs_table(0.0, 0.0).isel(time=slice(0, 65)))
+
+
+def test_samples_that_no_instrument_measures_count_as_missing() -> None:
+    table = runs_table(0.0, 0.0)
+    table["displacement"].values[7] = 3.4e38
+    table["driver"].values[9] = -3.4e38
+    record = reduce_record(table)
+    assert record.impossible == {"ch1": 1, "speed": 1}
+    assert record.gaps["speed"] == 1
+    assert np.nanmax(np.abs(record.displacement)) < 100.0
+
+
+def test_a_constant_that_rounding_moves_is_no_column_of_its_own() -> None:
+    columns = np.column_stack([np.full(1000, 0.1), np.arange(1000.0)])
+    assert independent(columns) == [1]

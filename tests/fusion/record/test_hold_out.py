@@ -7,7 +7,7 @@ import pytest
 
 from fusion.record.blocks import RecordError, reduce_record
 from fusion.record.hold_out import declare, hold_out
-from tests.fusion.record_tables import record_of, twin_table
+from tests.fusion.record_tables import record_of, runs_table, twin_table
 
 
 def test_what_a_record_cannot_declare_is_refused():
@@ -42,3 +42,18 @@ def test_every_displacement_is_declared_linear_in_the_temperatures():
     np.testing.assert_array_equal(term.candidate.columns, [[0.0, 0.0], [1.0, 3.0], [2.0, 6.0]])
     assert (term.effect, term.candidate.units) == ("quasi_static", ("um/K", "um/K"))
     assert declare([], record) == []
+
+
+def test_runs_are_held_out_as_a_whole():
+    train, description = hold_out(reduce_record(runs_table(0.0, 1.0, 2.0)))
+    np.testing.assert_array_equal(train, np.arange(180) < 120)
+    assert description.startswith(
+        "run r3.csv held out; coefficients from runs r1.csv, r2.csv, every run from its own zero"
+    )
+
+
+def test_a_hold_out_set_without_a_displacement_is_refused():
+    displacement = np.zeros((100, 1))
+    displacement[70:] = np.nan
+    with pytest.raises(RecordError, match="no displacement was measured in what is held out"):
+        hold_out(record_of(displacement, np.zeros((100, 1))))

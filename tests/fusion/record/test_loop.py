@@ -16,7 +16,7 @@ from fusion.record.hold_out import hold_out
 from fusion.record.loop import close_record, without_unrepeated
 from fusion.record.problem import ChainedPart
 from fusion.twin.machine.recipe import EffectRecipe
-from tests.fusion.record_tables import searched, twin_table
+from tests.fusion.record_tables import runs_table, searched, twin_table
 
 
 def test_a_complete_model_stays_as_it_is():
@@ -136,3 +136,23 @@ def test_effects_are_withdrawn_one_after_the_other_and_the_others_stay():
 def test_an_event_is_not_judged_by_other_parts():
     state = added("step_event", event_s=5.0)
     assert without_unrepeated(Refitting(), state, [part(("step_event",), (1.0,), (2.0,))]) is state
+
+
+def test_runs_are_predicted_from_the_other_runs_and_judged_by_themselves():
+    """Three runs that start elsewhere: one model serves all of them, because each counts from its own zero."""
+    result = close_record(reduce_record(runs_table(5.0, -300.0, 40.0)), ["quasi_static"])
+    told = result.as_json()
+    assert [one["runs"] for one in told["chained"]] == [["r1.csv"], ["r2.csv"]]
+    assert [(one["file"], one["held_out"], one["verdict"]) for one in told["runs"]] == [
+        ("r1.csv", False, ""),
+        ("r2.csv", False, ""),
+        ("r3.csv", True, told["verdict"]),
+    ]
+    held_out = told["runs"][2]
+    assert held_out["rmse_final_um"] == pytest.approx(told["rmse_final_um"], rel=1e-9)
+    # The displacement follows the sensor exactly, but for the shrinkage that forward chaining chose.
+    assert held_out["rmse_final_um"] < 0.01 * held_out["rmse_persistence_um"]
+    assert held_out["duration_h"] == pytest.approx(1.0)
+    assert [
+        fit.design[:, :levels].sum() for fit, levels in zip(result.whole.channels, result.whole.levels, strict=True)
+    ] == [180 + 60 + 60]
