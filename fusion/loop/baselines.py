@@ -76,8 +76,10 @@ def error_interval(errors: Array, unit: NDArray[np.int64], rng: np.random.Genera
 
 def _rmse(squares: Array, number: Array) -> Array:
     """Root mean square over the last axis' channels, mean over those with a value."""
-    each = np.sqrt(np.where(number > 0.0, squares / np.maximum(number, 1.0), np.nan))
-    return np.asarray(np.nanmean(each, axis=-1))
+    known = number > 0.0
+    each = np.sqrt(np.where(known, squares / np.maximum(number, 1.0), 0.0))
+    channels = known.sum(axis=-1)
+    return np.asarray(np.where(channels > 0, each.sum(axis=-1) / np.maximum(channels, 1), np.nan))
 
 
 def plain_errors(readings: Readings, used: NDArray[np.bool_]) -> dict[str, Array]:

@@ -105,7 +105,7 @@ def sensor_notices(health: SensorHealth) -> list[Notice]:
     notices = []
     for fault in health.faults:
         name = health.names[fault.sensor]
-        told = f"{name} {describe_fault(fault)}"
+        told = f"{name} {describe_fault(fault)}" + (f" ({health.runs[fault.sensor]})" if health.runs else "")
         if fault.is_clear:
             error = health.errors_um[name]
             with_it = f"{number(error, 3)} µm with it" if np.isfinite(error) else "no model with it"

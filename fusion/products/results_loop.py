@@ -446,8 +446,10 @@ class SensorFaultPart(ResultPart):
     """What it does."""
     state: Literal["left_out", "suspected"]
     """Whether it was left out of the whole record, or stays because a machine may do the same."""
+    run: str = ""
+    """Run that shows it; absent in a record of one run."""
     onset_s: Number
-    """When it began, s from the start."""
+    """When it began, s from the start, of several runs from the start of that run."""
     onset_u_s: Number
     """Standard uncertainty of that, s."""
     size: Number

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,8 @@ class SensorHealth:
         Error of the declared model on the hold-out set with a faulty sensor, um, by sensor; nan where it has too few readings for a model.
     sound_um : float
         The same without all faulty sensors, um.
+    runs : mapping of int to str
+        Of a record of several runs, the one that shows the fault, by place of the sensor; onsets count from its start.
     """
 
     table: xr.Dataset
@@ -39,6 +42,7 @@ class SensorHealth:
     faults: tuple[SensorFault, ...]
     errors_um: dict[str, float]
     sound_um: float
+    runs: dict[int, str] = field(default_factory=dict)
 
     def as_json(self) -> list[dict[str, Any]]:
         """The part ``loop.sensor_faults`` of results.json."""
@@ -47,6 +51,7 @@ class SensorHealth:
                 "sensor": self.names[fault.sensor],
                 "kind": fault.kind.value,
                 "state": "left_out" if fault.is_clear else "suspected",
+                **({"run": self.runs[fault.sensor]} if self.runs else {}),
                 "onset_s": fault.onset_s,
                 "onset_u_s": fault.onset_u_s,
                 "size": fault.size,
@@ -69,7 +74,7 @@ def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
     Parameters
     ----------
     table : Dataset
-        As :func:`fusion.campaign.logged_tables.read_record` returns it.
+        As :func:`fusion.campaign.record_runs.read_record` returns it.
     declared : sequence of str
         Names of the declared effects.
 
@@ -83,11 +88,10 @@ def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
     Only temperatures and drivers are looked at, also of the time that is held out: they are known when it is predicted.
     """
     names = tuple(str(name) for name in table["sensor"].values)
-    seconds = np.asarray((table["time"].values - table["time"].values[0]) / np.timedelta64(1, "s"), np.float64)
-    faults = tuple(examine_sensors(seconds, table["temperature"].values, table["driver"].values))
+    faults, where = _examine_runs(table)
     faulty = [fault.sensor for fault in faults if fault.is_clear]
     if not faulty:
-        return SensorHealth(table, names, faults, {}, np.nan)
+        return SensorHealth(table, names, faults, {}, np.nan, where)
     kept = [k for k in range(len(names)) if k not in faulty]
     if not kept:
         told = "; ".join(
@@ -98,14 +102,30 @@ def examine_record(table: xr.Dataset, declared: Sequence[str]) -> SensorHealth:
         )
     errors = {names[k]: _declared_error(table.isel(sensor=sorted([*kept, k])), declared) for k in faulty}
     sound = table.isel(sensor=kept)
-    return SensorHealth(sound, names, faults, errors, _declared_error(sound, declared))
+    return SensorHealth(sound, names, faults, errors, _declared_error(sound, declared), where)
+
+
+def _examine_runs(table: xr.Dataset) -> tuple[tuple[SensorFault, ...], dict[int, str]]:
+    """Faults, at most one per sensor, and of several runs the one that shows it, by sensor; every run is examined by itself."""
+    runs = json.loads(table.attrs.get("runs", '[""]'))
+    number = table["run"].values if "run" in table.coords else np.zeros(table.sizes["time"], int)
+    chosen: dict[int, tuple[SensorFault, str]] = {}
+    for k, run in enumerate(runs):
+        here = table.isel(time=number == k)
+        seconds = np.asarray((here["time"].values - here["time"].values[0]) / np.timedelta64(1, "s"), np.float64)
+        for fault in examine_sensors(seconds, here["temperature"].values, here["driver"].values):
+            earlier = chosen.get(fault.sensor)
+            if earlier is None or (fault.is_clear and not earlier[0].is_clear):
+                chosen[fault.sensor] = (fault, run)
+    faults = tuple(chosen[sensor][0] for sensor in sorted(chosen))
+    return faults, {sensor: run for sensor, (_, run) in chosen.items() if run}
 
 
 def _declared_error(table: xr.Dataset, declared: Sequence[str]) -> float:
     """Error of the declared model on the hold-out set, um; nan where a sensor has too few readings."""
     try:
         record = reduce_record(table)
+        train, _ = hold_out(record)
     except RecordError:
         return np.nan
-    train, _ = hold_out(record)
     return rmse(record, predict(record, columns_of(record, declare(declared, record)), train).predicted, ~train)

@@ -194,7 +194,7 @@ def _sensor_faults_table(loop: RecordLoop) -> Table:
     """Return the sensors that are faulty or suspected, with the error of the declared model with and without each."""
     rows = [
         [
-            fault.sensor,
+            f"{fault.sensor}, {fault.run}" if fault.run else fault.sensor,
             f"{describe_fault(fault)}{f'; {fault.reason}' if fault.reason else ''}",
             number(fault.ratio, 3),
             number(fault.limit, 3),

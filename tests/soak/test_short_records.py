@@ -20,11 +20,12 @@ import pytest
 import xarray as xr
 
 from fusion.errors import FusionError
-from fusion.pipeline.record import RecordSource, model_record, record_notices
+from fusion.pipeline.record import RecordSource, model_record, record_notices, sensor_notices
 from fusion.pipeline.run import run_campaign
 from fusion.products.progress import silent
 from fusion.products.results import assemble
 from fusion.record.blocks import reduce_record
+from fusion.record.sensor_health import examine_record
 from fusion.twin.machine.recipe import EffectRecipe, Recipe, RecipeError
 from fusion.twin.record import RecordTruth, simulate_record, write_record
 from tests.fusion.record_tables import table_of
@@ -172,8 +173,10 @@ def model(truth: RecordTruth, seed: int) -> str:
     logged = seed % 4 != 0
     speed = table["speed"].values if logged else None
     whole = table_of(table["displacement"].values, table["temperature"].values, speed)
-    record = reduce_record(whole.assign_coords(time=table["time"].values))
-    source = RecordSource(record, ["quasi_static"], record_notices(record))
+    health = examine_record(whole.assign_coords(time=table["time"].values), ["quasi_static"])
+    record = reduce_record(health.table)
+    notices = [*sensor_notices(health), *record_notices(record)]
+    source = RecordSource(record, ["quasi_static"], notices, health)
     outcome = model_record(source, report=silent)
     results = assemble("short record", outcome.parts, outcome.notices)
     assert results.loop is not None
