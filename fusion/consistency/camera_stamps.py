@@ -28,6 +28,11 @@ _LARGEST_STEP = 0.2
 _LARGEST_SLIP = 0.1
 #: Share of the frames that may be stamped while the axis was away from position 0.
 _AWAY_SHARE = 0.5
+#: Share of the steps from name to name that may go back in time before the names tell no order: nobody sets a clock at every fifth frame.
+_SET_BACK_SHARE = 0.2
+#: In the order of their times frames are regular where no step is shorter or longer than these multiples of the median: a clock that was
+#: set back lays its frames between or upon those before.
+_REGULAR_STEPS = (0.8, 3.0)
 _FIGURES = "all fields at the readings, the declared coefficients, and every cause"
 _NUMBERED = re.compile(r"(.*?)(\d+)\D*")
 
@@ -50,11 +55,11 @@ def check_order(frames: Sequence[FrameReference]) -> list[Check]:
     if not timed:
         return []
     ordered = sorted(timed, key=lambda frame: (_numbered(frame.path), frame.index))
-    back = [
-        (before, after)
-        for before, after in itertools.pairwise(ordered)
-        if _follows(before, after) and after.time < before.time
-    ]
+    steps = [(before, after) for before, after in itertools.pairwise(ordered) if _follows(before, after)]
+    back = [(before, after) for before, after in steps if after.time < before.time]
+    if back and _renamed(back, len(steps), np.sort(np.array([frame.time for frame in timed]))):
+        told = f"The names of the frames do not follow their times ({len(back)} of {len(steps)} steps go back); the times were taken."
+        return [Check("camera_stamps", 0.0, 0.0, True, told, "", _FIGURES)]
     named = "; ".join(
         f"{after.path.name}{f' frame {after.index}' if after.index else ''} is {(before.time - after.time) / np.timedelta64(1, 's'):.0f} s "
         f"before {before.path.name}"
@@ -75,6 +80,17 @@ def check_order(frames: Sequence[FrameReference]) -> list[Check]:
             _FIGURES,
         )
     ]
+
+
+def _renamed(back: Sequence[tuple[FrameReference, FrameReference]], steps: int, times: NDArray[np.datetime64]) -> bool:
+    """Whether it is the names that are out of order, not the clock: of files alone, many, or regular in the order of their times."""
+    if any(before.path == after.path for before, after in back):
+        return False
+    if len(back) >= _SET_BACK_SHARE * steps and len(back) > 1:
+        return True
+    seconds = np.diff(times) / np.timedelta64(1, "s")
+    low, high = (multiple * float(np.median(seconds)) for multiple in _REGULAR_STEPS)
+    return bool(np.all((seconds >= low) & (seconds <= high)))
 
 
 def _numbered(path: Path) -> tuple[str, str, int]:

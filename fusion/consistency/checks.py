@@ -50,6 +50,7 @@ CODES = (
     "frozen_camera",
     "camera_place",
     "frames_left_out",
+    "frames_gaps",
     "frames_repeated",
     "scene_change",
     "expansion_coefficient",

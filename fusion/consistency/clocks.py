@@ -388,7 +388,7 @@ def check_camera_clock(readings: Readings) -> list[Check]:
     best = int(np.argmax(gain))
     more = float(gain[best] - gain[within].max())
     if more < _LEAST_GAIN or more < _GAIN_SHARE * gain[best]:
-        told = "No shift of the camera's clock suits field and drift better than a delay of the machine does (or it cannot be told)."
+        told = f"No shift of the camera's clock suits field and drift better than a delay of the machine does; {_noticed(gain)}."
         return [Check("camera_clock", 0.0, limit, True, told, "", endangered)]
     near = gain >= gain[best] - 2.0
     low, high = _CAMERA_SHIFTS_S[near].min() / 60.0, _CAMERA_SHIFTS_S[near].max() / 60.0
@@ -406,6 +406,21 @@ def check_camera_clock(readings: Readings) -> list[Check]:
             endangered,
         )
     ]
+
+
+def _noticed(gain: Array) -> str:
+    """From which shift on a wrong clock would have been noticed, as no delay of the machine does nearly as well beside it."""
+    best = float(gain.max())
+    needed = max(_LEAST_GAIN, _GAIN_SHARE * best)
+    least = None
+    for size in _CAMERA_SHIFTS_S[_CAMERA_SHIFTS_S > _STRUCTURE_DELAY_S][::-1]:
+        delays = [np.abs(_CAMERA_SHIFTS_S - shift) <= _STRUCTURE_DELAY_S for shift in (-size, size)]
+        if any(best - gain[inside].max() < needed for inside in delays):
+            break
+        least = float(size)
+    if least is None:
+        return f"a clock that is off by up to {_CAMERA_SHIFTS_S[-1] / 60.0:.0f} min would not be noticed here: cannot be told"
+    return f"one that is off by {least / 60.0:.0f} min or more would have been noticed"
 
 
 def _gain_of_shifts(readings: Readings) -> Array:

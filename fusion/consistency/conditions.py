@@ -49,6 +49,7 @@ _CONDITIONS = {
     "camera_parameters": Condition("the stored camera parameters are right", _CAMERA),
     "camera_range": Condition("the camera is right outside its range", _CAMERA),
     "frozen_camera": Condition("every frame was taken at its time", _CAMERA),
+    "frames_gaps": Condition("the table changed steadily while no frame was taken", (_ATTRIBUTION, _CAUSES)),
     "frames_repeated": Condition("every frame was taken at its time", _CAMERA),
     "frames_left_out": Condition("the frames that are left show the whole test", _CAMERA),
     "scene_change": Condition("the frames show one table throughout", _CAMERA),

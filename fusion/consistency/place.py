@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from fusion._typing import Array
 from fusion.consistency.checks import Check
@@ -26,6 +28,12 @@ _JUMP_K = 0.3
 _JUMP_SIGMAS = 8.0
 #: Share of the cells that must jump together.
 _JUMP_SHARE = 0.02
+#: A gap between frames is longer than this, s, half the time constant of an ordinary source of heat, ...
+_GAP_S = 600.0
+#: ... and than this multiple of the usual step.
+_GAP_STEPS = 3.0
+#: Largest share of the readings that may lie in gaps.
+_GAP_SHARE = 0.1
 _LEFT_OUT = {
     "frames_damaged": "damaged, or unlike those before and after them",
     "frames_obstructed": "with something before the table",
@@ -56,6 +64,92 @@ def check_place(fields: xr.Dataset) -> list[Check]:
     if "table_across" in fields:
         return [_across(fields), *common]
     return [_unchecked(fields, total), *common, _jump(fields)]
+
+
+def find_gaps(frame_time: NDArray[np.datetime64]) -> list[tuple[np.datetime64, np.datetime64]]:
+    """Find the gaps in the times of frames.
+
+    Parameters
+    ----------
+    frame_time : (n,) ndarray of datetime64
+        Sorted.
+
+    Returns
+    -------
+    list of (datetime64, datetime64)
+        Last frame before and first frame after every gap.
+    """
+    if frame_time.size < 2:
+        return []
+    seconds = np.diff(frame_time) / np.timedelta64(1, "s")
+    longest = max(_GAP_S, _GAP_STEPS * float(np.median(seconds)))
+    return [(frame_time[k], frame_time[k + 1]) for k in np.flatnonzero(seconds > longest)]
+
+
+def in_gaps(readings: xr.DataArray, gaps: Sequence[tuple[np.datetime64, np.datetime64]]) -> xr.DataArray:
+    """Tell which readings lie in gaps between frames.
+
+    Parameters
+    ----------
+    readings : DataArray
+        Times; NaT where a reading has none.
+    gaps : sequence of (datetime64, datetime64)
+        Of `find_gaps`.
+
+    Returns
+    -------
+    DataArray of bool
+    """
+    inside = xr.zeros_like(readings, dtype=bool)
+    for start, end in gaps:
+        inside |= (readings > start) & (readings < end)
+    return inside
+
+
+def check_gaps(frame_time: NDArray[np.datetime64], readings: xr.DataArray) -> list[Check]:
+    """Check that the readings lie between frames that show their field.
+
+    Parameters
+    ----------
+    frame_time : (n,) ndarray of datetime64
+        Times of the frames that are used, on the laser's clock, sorted.
+    readings : DataArray
+        Times of the readings along ``cycle`` and other dimensions; NaT where one has none.
+
+    Returns
+    -------
+    list of Check
+        ``frames_gaps``.
+    """
+    gaps = find_gaps(frame_time)
+    count, total = int(in_gaps(readings, gaps).sum()), max(int(readings.notnull().sum()), 1)
+    passed = count <= _GAP_SHARE * total
+    longest = max(gaps, key=lambda gap: gap[1] - gap[0], default=None)
+    where = "" if longest is None else f", the longest of {gap_words(longest)}"
+    return [
+        Check(
+            "frames_gaps",
+            count / total,
+            _GAP_SHARE,
+            passed,
+            f"{100.0 * count / total:.0f} % of the readings lie in {len(gaps)} gaps between frames{where}.",
+            "" if passed else "Give all frames of the test, or leave out the cycles that have none.",
+            "fields and rises at these readings, which are interpolated across the gap, and every cause that follows the field",
+        )
+    ]
+
+
+def gap_words(gap: tuple[np.datetime64, np.datetime64]) -> str:
+    """Return length, start and end of a gap as words.
+
+    Parameters
+    ----------
+    gap : (datetime64, datetime64)
+        Of `find_gaps`.
+    """
+    minutes = (gap[1] - gap[0]) / np.timedelta64(60, "s")
+    start, end = (np.datetime_as_string(time, unit="s") for time in gap)
+    return f"{minutes:.0f} min from {start}Z to {end}Z"
 
 
 def _unchecked(fields: xr.Dataset, total: int) -> Check:

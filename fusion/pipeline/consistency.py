@@ -19,7 +19,7 @@ from fusion.consistency.coefficients import check_coefficients
 from fusion.consistency.field_series import field_at, thin_fields
 from fusion.consistency.frames import check_frames
 from fusion.consistency.logs import check_log
-from fusion.consistency.place import check_place
+from fusion.consistency.place import check_gaps, check_place
 from fusion.consistency.readings import check_readings
 from fusion.consistency.registration import check_registration
 from fusion.consistency.signs import check_signs
@@ -115,6 +115,7 @@ def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[
         *check_load_scale(field, source.drivers, file=drivers_file),
         *check_material(near, source.environment, stated=place_mm is not None, file=environment_file),
         *check_place(fields),
+        *check_gaps(fields["time"].values, source.deviations["time"]),
     ]
 
 

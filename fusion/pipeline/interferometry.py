@@ -9,6 +9,7 @@ import xarray as xr
 
 from fusion.alignment.align import align
 from fusion.campaign.inputs import Source, counted, listed
+from fusion.consistency.place import find_gaps, gap_words, in_gaps
 from fusion.consistency.readings import find_gross_readings
 from fusion.products.grouped import group, joined
 from fusion.products.results import Notice, Outcome
@@ -141,7 +142,11 @@ def align_recordings(source: Source, fields: xr.Dataset, deviations: xr.Dataset)
     gross = find_gross_readings(group(deviations, "drift")["standardised"])
     used = deviations.assign(deviation=deviations["deviation"].where(~gross))
     fused = align(used, fields, source.axis, environment=source.environment, drivers=source.drivers)
-    return fused, [*_gross_notices(deviations["deviation"], gross), *_outside_notices(fused)]
+    return fused, [
+        *_gross_notices(deviations["deviation"], gross),
+        *_outside_notices(fused),
+        *_gap_notices(fields, deviations),
+    ]
 
 
 def _gross_notices(deviation: xr.DataArray, gross: xr.DataArray) -> list[Notice]:
@@ -163,6 +168,24 @@ def _names(marked: xr.DataArray) -> list[str]:
     """Return cycle, approach and target of every reading that is marked (cycle, direction, target)."""
     cycle, direction, target = (marked[name].values for name in marked.dims)
     return [f"cycle {cycle[c]} {direction[d]} target {target[t]}" for c, d, t in np.argwhere(marked.values)]
+
+
+def _gap_notices(fields: xr.Dataset, deviations: xr.Dataset) -> list[Notice]:
+    """Return a notice for gaps between the frames in which readings were taken, with the cycles that have no frame."""
+    gaps = find_gaps(fields["time"].values)
+    inside = in_gaps(deviations["time"], gaps)
+    if not inside.any():
+        return []
+    empty = fields["cycle"].values[~np.isfinite(fields["temperature"].values).any(axis=(1, 2))]
+    without = f"; cycles without a frame: {listed(str(cycle) for cycle in empty)}" if empty.size else ""
+    return [
+        Notice(
+            "frames_gaps",
+            f"{counted(len(gaps), 'gap')} between the frames: {listed(gap_words(gap) for gap in gaps)}{without}. The field of "
+            f"{counted(int(inside.sum()), 'reading')} in them is interpolated.",
+            "Give all frames of the test.",
+        )
+    ]
 
 
 def _outside_notices(fused: xr.Dataset) -> list[Notice]:

@@ -101,3 +101,33 @@ def test_frames_of_one_file_go_by_their_index(frames: list[FrameReference]) -> N
     assert check_order(sequence)[0].passed
     swapped = [replace(sequence[0], index=1), replace(sequence[1], index=0), *sequence[2:]]
     assert not check_order(swapped)[0].passed
+
+
+def numbered(seconds: np.ndarray, like: FrameReference) -> list[FrameReference]:
+    """Frames of consecutively numbered files with these times."""
+    start = np.datetime64("2026-03-09T06:30:00", "ms")
+    return [
+        replace(
+            like,
+            path=Path(f"/test/IR_{number:04d}.jpg"),
+            index=0,
+            time=start + np.timedelta64(round(1e3 * second), "ms"),
+        )
+        for number, second in enumerate(seconds)
+    ]
+
+
+def test_renamed_files_are_no_fault_of_the_clock(campaign_folder: Path) -> None:
+    like = index_frames(sorted((campaign_folder / "thermal").iterdir())[:1])[0][0]
+    seconds = 252.0 * np.arange(40)
+    shuffled = np.random.default_rng(3).permutation(seconds)
+    two_exchanged = seconds.copy()
+    two_exchanged[[7, 32]] = seconds[[32, 7]]
+    for renamed in (shuffled, two_exchanged):
+        (check,) = check_order(numbered(renamed, like))
+        assert check.passed and "the times were taken" in check.evidence
+    set_back = seconds - np.where(np.arange(40) >= 20, 600.0, 0.0)
+    other_year = seconds - np.where(np.arange(40) >= 20, 25 * 365 * 86400.0, 0.0)
+    for wrong in (set_back, other_year, seconds - np.where(np.arange(40) >= 20, 504.0, 0.0)):
+        (check,) = check_order(numbered(wrong, like))
+        assert not check.passed and "goes backwards 1 times" in check.evidence

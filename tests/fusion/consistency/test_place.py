@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from fusion.consistency.checks import Check
-from fusion.consistency.place import check_place
+from fusion.consistency.place import check_gaps, check_place, find_gaps, gap_words
 
 START = np.datetime64("2026-03-09T06:30", "ns")
 FRAMES, ROWS, COLUMNS = 40, 9, 35
@@ -105,3 +105,17 @@ def test_a_moving_table_is_not_displaced_across_its_axis_nor_lost() -> None:
     lost = failed(moving(straight, frames_unplaced=[f"a.seq#{i}" for i in range(60)]))
     assert "60 in which the moving table is not located" in lost["frames_left_out"].evidence
     assert failed(moving(straight[:4])) == {}
+
+
+def test_readings_in_a_gap_between_frames_are_counted() -> None:
+    dataset = fields()
+    readings = xr.DataArray(dataset["time"].values[:, None] + np.array([30, 60], "m8[s]"), dims=("cycle", "target"))
+    (sound,) = check_gaps(dataset["time"].values, readings)
+    assert sound.passed and sound.value == 0.0
+    kept = np.delete(dataset["time"].values, np.arange(14, 23))
+    (check,) = check_gaps(kept, readings)
+    # Nine frames are missing, so that ten intervals of 4.2 min lie between the frames about them.
+    assert not check.passed and check.value == 0.25
+    assert "42 min from 2026-03-09T07:24:36Z to 2026-03-09T08:06:36Z" in check.evidence
+    assert [gap_words(gap) for gap in find_gaps(kept)] == ["42 min from 2026-03-09T07:24:36Z to 2026-03-09T08:06:36Z"]
+    assert check_gaps(np.delete(kept, np.arange(1, len(kept))), readings)[0].passed

@@ -62,3 +62,16 @@ def test_an_error_of_reading_is_left_out_of_the_comparison_with_the_field_and_na
     assert np.isnan(fused["deviation"].values[10, 1, 3])
     sound["deviation"][10, 1, 3] = np.nan
     np.testing.assert_array_equal(fused["deviation"], sound["deviation"])
+
+
+def test_a_gap_between_the_frames_is_named_with_the_cycles_that_have_none(
+    campaign_folder: Path, results_folder: Path
+) -> None:
+    source = read_source(load_campaign(campaign_folder / "campaign.toml"))
+    fields = read_dataset(results_folder / "fields.nc")
+    fields = fields.isel(time=np.delete(np.arange(fields.sizes["time"]), np.arange(4, 9)))
+    fields["temperature"][4:9] = np.nan
+    _, notices = align_recordings(source, fields, evaluate_interferometry(source).dataset)
+    (gap,) = (notice for notice in notices if notice.code == "frames_gaps")
+    assert gap.message.startswith("1 gap between the frames: 18 min from ")
+    assert "; cycles without a frame: 5; 6; 7; 8; 9. The field of " in gap.message
