@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from fusion.twin.truth import deviations_of, fields_of
 from tests.fusion.consistency.twin_fields import late, scaled
 from tests.soak.rates import campaigns, first_seed, rate, wilson
 from tests.soak.test_sound_inputs import sound_recipe
+from thermography.fields.survey import stray_frames
 
 pytestmark = pytest.mark.slow
 
@@ -139,3 +141,90 @@ def test_wrong_emissivities(emissivity: float, capsys: pytest.CaptureFixture[str
             f"\nemissivity {emissivity:.2f} for 0.97: noticed with the sensor's place {rate(noticed[True], runs)}, without "
             f"{rate(noticed[False], runs)}"
         )
+
+
+def _of(log: xr.Dataset, **columns: np.ndarray) -> xr.Dataset:
+    """A log with other values in some columns."""
+    return log.assign({name: log[name].copy(data=values) for name, values in columns.items()})
+
+
+LYING_LOGS: dict[str, Callable[[Recorded], Recorded]] = {
+    "backwards": lambda test: replace(
+        test,
+        environment=_of(test.environment, material_temperature=test.environment["material_temperature"].values[::-1]),
+    ),
+    "another hour": lambda test: replace(
+        test,
+        environment=_of(
+            test.environment, material_temperature=np.roll(test.environment["material_temperature"].values, -60)
+        ),
+    ),
+    "stands still": lambda test: replace(
+        test,
+        environment=_of(
+            test.environment,
+            material_temperature=np.full(
+                test.environment.sizes["time"], test.environment["material_temperature"].values[0]
+            ),
+        ),
+    ),
+    "exchanged": lambda test: replace(
+        test,
+        environment=_of(
+            test.environment,
+            material_temperature=test.environment["air_temperature"].values,
+            air_temperature=test.environment["material_temperature"].values,
+        ),
+    ),
+    "per cent": lambda test: replace(
+        test,
+        drivers=_of(
+            test.drivers,
+            duty=test.drivers["duty"].values
+            * np.where(np.arange(test.drivers.sizes["time"]) < test.drivers.sizes["time"] // 2, 1.0, 100.0),
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("lie", LYING_LOGS)
+def test_lying_logs(lie: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The place of the sensor stated, and not; what is noticed, and by which checks."""
+    runs, noticed, codes = campaigns(40), Counter[bool](), Counter[str]()
+    for seed in range(first_seed(58000), first_seed(58000) + runs):
+        test = LYING_LOGS[lie](record(Recipe().vary(campaign={"seed": seed}, duty={"mean_hold_min": 25.0})))
+        for stated in (True, False):
+            failed = {check.code for check in of_logs(test, stated=stated) if not check.passed}
+            noticed[stated] += bool(failed)
+            codes.update(failed if stated else ())
+    with capsys.disabled():
+        print(
+            f"\nlog {lie}: noticed with the sensor's place {rate(noticed[True], runs)}, without {rate(noticed[False], runs)}; {dict(codes)}"
+        )
+
+
+def test_frames_of_another_campaign(capsys: pytest.CaptureFixture[str]) -> None:
+    """Levels of coarse cells stand for those of blocks of pixels; every campaign sound, then with one frame of another one."""
+    runs, rng = campaigns(100), np.random.default_rng(58)
+    levels = []
+    for seed in range(first_seed(92000), first_seed(92000) + runs):
+        cells = (
+            record(varied_recipe(seed)).fields["frame_temperature"].coarsen(x=4, y=4, boundary="trim").reduce(np.mean)
+        )
+        levels.append(cells.values.reshape(cells.sizes["time"], -1).astype(float))
+    doubted = sum(bool(stray_frames(one, ends=False)) for one in levels)
+    told: dict[str, list[bool]] = {"0.2 to 0.5 K": [], "0.5 to 1 K": [], "above 1 K": []}
+    for _ in range(20 * runs):
+        first, second = rng.choice(runs, 2, replace=False)
+        place, other = rng.integers(1, len(levels[first]) - 1), rng.integers(len(levels[second]))
+        mixed = levels[first].copy()
+        mixed[place] = levels[second][other]
+        off_K = float(np.sqrt(np.mean((mixed[place] - levels[first][place]) ** 2)))
+        if off_K >= 0.2:
+            size = "0.2 to 0.5 K" if off_K < 0.5 else "0.5 to 1 K" if off_K < 1.0 else "above 1 K"
+            told[size].append(int(place) in stray_frames(mixed, ends=False))
+    with capsys.disabled():
+        print(f"\nsound campaigns with a frame left out: {rate(doubted, runs)}")
+        for size, found in told.items():
+            print(f"one frame of another campaign, {size}: left out {rate(sum(found), len(found))}")
+    assert wilson(doubted, runs)[0] <= 0.01
