@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -51,7 +52,7 @@ def check_coefficients(loop: Mapping[str, Any], *, travel_mm: float) -> list[Che
     return [
         *(_expansion(entry) for entry in stated[:1]),
         *_sensitivities([*declared, *added], travel_mm),
-        *([] if line is None else [_axis_line(line)]),
+        *([] if line is None else [_axis_line(line, loop.get("unnamed", {}))]),
     ]
 
 
@@ -131,8 +132,10 @@ def _sensitivities(coefficients: list[Mapping[str, Any]], travel_mm: float) -> l
     ]
 
 
-def _axis_line(line: Mapping[str, Any]) -> Check:
+def _axis_line(line: Mapping[str, Any], unnamed: Mapping[str, float]) -> Check:
     limit = _LINE_GAIN_OVER_CAUSE if line["superfluous"] else line["gain_limit"]
+    # An effect that is significant but has no name yet is worth about -ln p; a line that explains less is no better explanation.
+    limit = max(limit, *(-math.log(max(p, sys.float_info.min)) for p in unnamed.values()), 0.0)
     passed = line["gain"] <= limit
     named = [name.replace("_", " ") for name in line["superfluous"]]
     without = f", and without {', '.join(named)}" if named else ""
@@ -163,6 +166,6 @@ def _no_better_line(line: Mapping[str, Any], limit: float) -> str:
     else:
         compared = (
             f"Of other lines on the plan, orders of the targets and signs of the deviations none explains the readings better than chance "
-            f"would (log-likelihood {line['gain']:+.1f} {line['alternative']}, limit {limit:.1f})"
+            f"or an effect without a name would (log-likelihood {line['gain']:+.1f} {line['alternative']}, limit {limit:.1f})"
         )
     return f"{compared}; lines that do so as well as the declared one ask for {low:.3g} to {high:.3g} ppm/K."
