@@ -92,6 +92,8 @@ def run(
     Temperature maps, drift, anomalies, the closed loop, and report.html.
     """
     from fusion.pipeline.run import run_campaign
+    from fusion.pipeline.two_campaigns import join_campaigns
+    from fusion.pipeline.two_records import join_records, of_one_kind
     from fusion.products.progress import Reporter
     from fusion.report.terminal import summary_table
 
@@ -101,15 +103,15 @@ def run(
 
     with _answering():
         folders = _folders(campaigns, out)
+        records = len(folders) == 2 and of_one_kind(campaigns)
         for campaign, folder in folders:
             with Reporter(console) as report:
                 results = run_campaign(campaign, folder, resume=resume, scheduler=scheduler, report=report)
             console.print(summary_table(results))
             console.print(f"report: {(folder / 'report.html').resolve()}", soft_wrap=True, highlight=False)
         if len(folders) == 2:
-            from fusion.pipeline.two_campaigns import join_campaigns
-
-            for name, text in join_campaigns([folder for _, folder in folders], folders[0][1].parent):
+            join = join_records if records else join_campaigns
+            for name, text in join([folder for _, folder in folders], folders[0][1].parent):
                 console.print(f"both campaigns, {name}: {text}", soft_wrap=True, highlight=False)
 
 

@@ -196,9 +196,10 @@ def _correlation(shocks: Array) -> Array:
     """Correlation of the channels' shocks (blocks, channels), NaN where one is missing; none where too few blocks hold all of them."""
     channels = shocks.shape[1]
     known = shocks[np.isfinite(shocks).all(axis=1)]
-    if known.shape[0] <= channels or not known.std(axis=0).all():
+    if channels == 1 or known.shape[0] <= channels or not known.std(axis=0).all():
         return np.eye(channels)
-    return np.corrcoef(np.clip(known / known.std(axis=0), -3.0, 3.0).T).reshape(channels, -1)
+    clipped = np.clip(known / known.std(axis=0), -3.0, 3.0)
+    return np.corrcoef(clipped.T) if clipped.std(axis=0).all() else np.eye(channels)
 
 
 def channel_gains(model: RecordFit, candidates: Sequence[Candidate], draws: Sequence[Array] = ()) -> Gains:

@@ -1,0 +1,100 @@
+"""Compare the finished runs of two records of one machine: which effects both show, in joint.json."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from fusion.campaign.config import CampaignError, load_campaign
+from fusion.products.results import Results, read_results
+from fusion.products.results_loop import RecordLoop
+from fusion.products.store import write_json
+from fusion.report.wording import effect_words, number
+
+
+def of_one_kind(paths: Sequence[Path]) -> bool:
+    """Return whether campaigns are records; checked before any of them is run.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Campaign files.
+
+    Raises
+    ------
+    CampaignError
+        If a file cannot be used, or some are records and others campaigns with both instruments.
+    """
+    records = {path: load_campaign(path).record is not None for path in paths}
+    if len(set(records.values())) > 1:
+        record = next(path for path, is_record in records.items() if is_record)
+        other = next(path for path, is_record in records.items() if not is_record)
+        raise CampaignError(
+            f"{record} holds a [record], {other} both instruments; two campaigns of one kind can be compared, run these one by one"
+        )
+    return all(records.values())
+
+
+def join_records(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
+    """Compare the effects that the loops of two finished records named.
+
+    Parameters
+    ----------
+    folders : sequence of Path
+        Results folders of two records of one machine.
+    out : Path
+        Folder for ``joint.json``.
+
+    Returns
+    -------
+    list of (str, str)
+        Every effect that either record names and who names it, for the terminal; what the records as wholes say where there is none.
+    """
+    results = [read_results(folder) for folder in folders]
+    confirmed = [_confirmed(one) for one in results]
+    names = list(dict.fromkeys(name for shown in confirmed for name in shown))
+    agreement = [
+        {"effect": name, "shown_by": [k for k, shown in enumerate(confirmed) if name in shown]} for name in names
+    ]
+    titles = [one.campaign for one in results]
+    write_json(
+        out / "joint.json",
+        {
+            "campaigns": titles,
+            "records": [_figures(one) for one in results],
+            "agreement": [{**one, "agrees": len(one["shown_by"]) == len(results)} for one in agreement],
+        },
+    )
+    rows = [(title, _sentence(one)) for title, one in zip(titles, results, strict=True)]
+    for one in agreement:
+        who = "both records" if len(one["shown_by"]) == len(results) else f"{titles[one['shown_by'][0]]} alone"
+        rows.append((effect_words(str(one["effect"])).name, f"confirmed by {who}"))
+    return rows
+
+
+def _loop(results: Results) -> RecordLoop:
+    assert isinstance(results.loop, RecordLoop)
+    return results.loop
+
+
+def _confirmed(results: Results) -> list[str]:
+    """Effects that a record names and its hold-out set confirms."""
+    return [step.effect for step in _loop(results).steps if step.confirmed]
+
+
+def _figures(results: Results) -> dict[str, object]:
+    """Verdict and errors of one record."""
+    loop = _loop(results)
+    return {
+        "title": results.campaign,
+        "verdict": loop.verdict,
+        "rmse_persistence_um": loop.rmse_persistence_um,
+        "rmse_declared_um": loop.rmse_declared_um,
+        "rmse_final_um": loop.rmse_final_um,
+    }
+
+
+def _sentence(results: Results) -> str:
+    """Verdict and errors of one record in words."""
+    loop = _loop(results)
+    return f"{loop.verdict}, held-out error {number(loop.rmse_declared_um, 3)} -> {number(loop.rmse_final_um, 3)} µm"
