@@ -53,22 +53,22 @@ def join_records(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
     results = [read_results(folder) for folder in folders]
     confirmed = [_confirmed(one) for one in results]
     names = list(dict.fromkeys(name for shown in confirmed for name in shown))
-    agreement = [
-        {"effect": name, "shown_by": [k for k, shown in enumerate(confirmed) if name in shown]} for name in names
-    ]
+    shown_by = {name: [k for k, shown in enumerate(confirmed) if name in shown] for name in names}
     titles = [one.campaign for one in results]
     write_json(
         out / "joint.json",
         {
             "campaigns": titles,
             "records": [_figures(one) for one in results],
-            "agreement": [{**one, "agrees": len(one["shown_by"]) == len(results)} for one in agreement],
+            "agreement": [
+                {"effect": name, "shown_by": who, "agrees": len(who) == len(results)} for name, who in shown_by.items()
+            ],
         },
     )
     rows = [(title, _sentence(one)) for title, one in zip(titles, results, strict=True)]
-    for one in agreement:
-        who = "both records" if len(one["shown_by"]) == len(results) else f"{titles[one['shown_by'][0]]} alone"
-        rows.append((effect_words(str(one["effect"])).name, f"confirmed by {who}"))
+    for name, who in shown_by.items():
+        told = "both records" if len(who) == len(results) else f"{titles[who[0]]} alone"
+        rows.append((effect_words(name).name, f"confirmed by {told}"))
     return rows
 
 
