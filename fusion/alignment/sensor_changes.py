@@ -27,8 +27,6 @@ _ITERATIONS = 8
 _INSTANTS = 32
 #: A driver is switched where it changes by this share of its range.
 _SWITCHED = 0.05
-#: Shares of the record between which a drift may begin.
-_DRIFT_FROM, _DRIFT_TO = 0.3, 0.9
 
 
 @dataclass(frozen=True)
@@ -166,15 +164,6 @@ class Excursion:
     first: int
     last: int
     peak: int
-    ratio: float
-
-
-@dataclass(frozen=True)
-class LevelDeparture:
-    """A level that leaves for good the range that it kept before: first and last step, departure over half that range."""
-
-    first: int
-    last: int
     ratio: float
 
 
@@ -324,41 +313,6 @@ def excursions(changes: Changes) -> list[Excursion]:
     first, last = int(changes.before[low]) - margin, int(changes.after[high]) + margin
     final = int(changes.after[-1])
     return [Excursion(max(0, first), min(final, last), int(changes.before[peak]), ratio)]
-
-
-def departures(grid: Grid, sensor: int, others: list[int]) -> LevelDeparture | None:
-    """Departure of a sensor's level from its prediction by the others, over the range of the time before.
-
-    The range of a quantity that wanders grows in proportion to time at most (Hurst exponent 1), so that it stays within a few times the
-    range of the first third; the coefficients are those of the longest changes.
-
-    Parameters
-    ----------
-    grid : Grid
-        The coarse one.
-    sensor : int
-        The sensor.
-    others : list of int
-        Those that predict it.
-
-    Returns
-    -------
-    LevelDeparture or None
-        None where nothing predicts it.
-    """
-    if not others:
-        return None
-    level = level_beyond_prediction(grid, sensor, others)
-    smooth = np.median(np.lib.stride_tricks.sliding_window_view(level, _LEAST_MEDIAN), axis=-1)
-    best = None
-    for share in np.arange(_DRIFT_FROM, _DRIFT_TO, 0.05):
-        at = int(share * smooth.size)
-        low, high = smooth[:at].min(), smooth[:at].max()
-        half = max(0.5 * float(high - low), float(grid.resolution[sensor]))
-        end = float(np.median(smooth[-max(_LEAST_MEDIAN, smooth.size // 50) :])) - 0.5 * (low + high)
-        if best is None or abs(end) / half > best.ratio:
-            best = LevelDeparture(at, smooth.size - 1, float(abs(end) / half))
-    return best
 
 
 def level_beyond_prediction(grid: Grid, sensor: int, others: list[int]) -> Array:

@@ -18,9 +18,7 @@ from fusion._typing import Array
 from fusion.alignment.sensor_changes import (
     Excursion,
     Grid,
-    LevelDeparture,
     Ramp,
-    departures,
     excursions,
     fit_ramp,
     lay_grid,
@@ -69,7 +67,6 @@ class Kind(StrEnum):
     STUCK = "stuck"
     JUMP = "jump"
     RAMP = "ramp"
-    DRIFT = "drift"
     NOISE = "noise"
 
 
@@ -104,6 +101,35 @@ class SensorFault:
     ratio: float = np.nan
     limit: float = np.nan
     reason: str = ""
+
+    @property
+    def words(self) -> str:
+        """What the sensor does and from when on, as it follows its name."""
+        return describe_fault(self.kind, self.size if np.isfinite(self.size) else None, self.onset_s, self.onset_u_s)
+
+
+def describe_fault(kind: str, size: float | None, onset_s: float | None, onset_u_s: float | None) -> str:
+    """Return what a sensor does and from when on, as it follows the sensor's name.
+
+    Parameters
+    ----------
+    kind : str
+        One of :class:`Kind`.
+    size : float or None, K
+        Change; of noise its ratio; None where there is no signal.
+    onset_s, onset_u_s : float or None, s
+        When it began, and the standard uncertainty of that.
+    """
+    told = f"{abs(size or 0.0):.2g}"
+    words = {
+        Kind.NO_SIGNAL: "gives no signal",
+        Kind.STUCK: "repeats one reading",
+        Kind.JUMP: f"jumps by {told} K",
+        Kind.RAMP: f"ramps by {told} K",
+        Kind.NOISE: f"has {told} times its noise",
+    }
+    onset_h, onset_u_h = (onset_s or 0.0) / 3600.0, (onset_u_s or 0.0) / 3600.0
+    return f"{words[Kind(kind)]} from {onset_h:.2f} h on (standard uncertainty {onset_u_h:.1g} h)"
 
 
 def excursion_limit(tests: int) -> float:
@@ -242,12 +268,12 @@ class _Suspicion:
 
     sensor: int
     excess: float
-    found: Excursion | LevelDeparture
+    found: Excursion
     grid: Grid
 
 
 def _changed(grids: list[Grid], kept: Sequence[int]) -> list[SensorFault]:
-    """Sensors that jump, ramp or drift away from their prediction."""
+    """Sensors that jump or ramp away from their prediction."""
     faults: list[SensorFault] = []
     left = list(kept)
     while left:
@@ -270,7 +296,7 @@ def _changed(grids: list[Grid], kept: Sequence[int]) -> list[SensorFault]:
 
 def _strongest(grids: list[Grid], sensor: int, others: list[int], sensors: int) -> _Suspicion:
     """The strongest excursion of a sensor from what others, loads and its past predict, over all durations."""
-    limit = excursion_limit(sensors * (1 + sum(len(grid.durations()) for grid in grids)))
+    limit = excursion_limit(sensors * sum(len(grid.durations()) for grid in grids))
     chosen = None
     for grid in grids:
         for duration in grid.durations():
@@ -279,12 +305,8 @@ def _strongest(grids: list[Grid], sensor: int, others: list[int], sensors: int) 
                 excess = found.ratio / limit
                 if chosen is None or excess > chosen.excess:
                     chosen = _Suspicion(sensor, excess, found, grid)
-    coarse = grids[-1]
-    away = departures(coarse, sensor, others)
-    if away is not None and (chosen is None or (chosen.excess <= 1.0 and away.ratio / limit > chosen.excess)):
-        chosen = _Suspicion(sensor, away.ratio / limit, away, coarse)
     if chosen is None:
-        return _Suspicion(sensor, 0.0, LevelDeparture(0, 0, 0.0), coarse)
+        return _Suspicion(sensor, 0.0, Excursion(0, 0, 0, 0.0), grids[-1])
     return chosen
 
 
@@ -315,14 +337,13 @@ def _describe(
     ramp = _timed(grids, suspicion, sound)
     fine_s, duration_s = grids[0].step_s, ramp.end_s - ramp.begin_s
     quick = duration_s <= max(2.0 * fine_s, _FAST_S)
-    lasting = isinstance(found, LevelDeparture) and not quick
-    kind = Kind.DRIFT if lasting else Kind.JUMP if quick else Kind.RAMP
+    kind = Kind.JUMP if quick else Kind.RAMP
     fast = quick and fine_s <= _FAST_S
     switched, otherwise = coarse.switchings(ramp.begin_s - 2.0 * coarse.step_s, ramp.end_s + 2.0 * coarse.step_s)
     reasons = {
         "another sensor deviates at the same time": not alone,
-        "other sensors respond, so that it may be a source of heat": responding and not lasting,
-        "a load was switched then, too rarely to compare": switched and otherwise < _LEAST_SWITCHINGS and not lasting,
+        "other sensors respond, so that it may be a source of heat": responding,
+        "a load was switched then, too rarely to compare": switched and otherwise < _LEAST_SWITCHINGS,
         "too little of what it does is predicted by the others to tell a fault from a source of heat": not (
             fast or _shared_by_others(coarse, suspicion.sensor, sound) >= _PREDICTABLE
         ),
@@ -350,8 +371,7 @@ def _timed(grids: list[Grid], suspicion: _Suspicion, sound: list[int]) -> Ramp:
     """Begin, end and size of a change: on the grid where it stands out, and on the fine one where it takes a block or two."""
     grid, found = suspicion.grid, suspicion.found
     level = level_beyond_prediction(grid, suspicion.sensor, sound)
-    first = 0 if isinstance(found, LevelDeparture) else found.first
-    ramp = fit_ramp(grid.seconds[first : found.last + 1], level[first : found.last + 1])
+    ramp = fit_ramp(grid.seconds[found.first : found.last + 1], level[found.first : found.last + 1])
     fine = grids[0]
     if fine is grid or ramp.end_s - ramp.begin_s > 3.0 * grid.step_s:
         return ramp

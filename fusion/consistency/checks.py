@@ -26,6 +26,7 @@ CODES = (
     "target_order",
     "mirrored_readings",
     "environment_coverage",
+    "contact_sensors",
     "drivers_coverage",
     "camera_settings",
     "camera_parameters",

@@ -44,6 +44,7 @@ _CONDITIONS = {
     "datum": Condition("the datum of the laser stayed the same", _LASER),
     "zeroed_cycles": Condition("the laser was not set to zero in every cycle", _LASER),
     "environment_coverage": Condition("the environment log belongs to this test", (_CAUSES,)),
+    "contact_sensors": Condition("the contact sensors of the logs are sound", (_CAUSES,)),
     "drivers_coverage": Condition("the drivers' log belongs to this test", (_CAUSES,)),
     "camera_settings": Condition("the camera's settings stayed the same", _CAMERA),
     "camera_parameters": Condition("the stored camera parameters are right", _CAMERA),

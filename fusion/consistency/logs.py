@@ -1,4 +1,4 @@
-"""Checks of the logs: whether they cover the time of the readings."""
+"""Checks of the logs: whether they cover the time of the readings, and whether their temperature sensors are sound."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from fusion.alignment.sensor_health import examine_sensors
 from fusion.alignment.zone_shift import likely_zone_shift
 from fusion.consistency.checks import Check, Severity
 
+#: Temperatures of the environment log.
+_CONTACT_SENSORS = ("air_temperature", "material_temperature")
 #: Share of the readings that a log has to cover.
 _LEAST_COVERED = 0.9
 #: A gap is a stretch without a sample that is longer than this, s, and ten times the usual step.
@@ -69,6 +72,56 @@ def check_log(
             ),
             endangers,
             Severity.CONTRADICTION if covered == 0.0 or clear else Severity.DOUBT,
+        )
+    ]
+
+
+def check_contact_sensors(environment: xr.Dataset | None, drivers: xr.Dataset | None, *, file: str) -> list[Check]:
+    """Check that the temperature sensors of the environment log are sound.
+
+    Parameters
+    ----------
+    environment : Dataset or None
+        Along ``time`` (UTC) with ``air_temperature`` and ``material_temperature``, degC.
+    drivers : Dataset or None
+        Logged loads, and temperatures (unit degC), which take part in the prediction and are examined as well.
+    file : str
+        The environment log, for the message.
+
+    Returns
+    -------
+    list of Check
+        ``contact_sensors``: how many are clearly faulty (docs/method/sensor-health.md); empty where nothing was logged.
+    """
+    if environment is None or environment.sizes["time"] == 0:
+        return []
+    start = environment["time"].values[0]
+    seconds = np.asarray((environment["time"].values - start) / np.timedelta64(1, "s"), float)
+    columns = {name: environment[name].values for name in _CONTACT_SENSORS if name in environment}
+    loads = []
+    if drivers is not None:
+        at = np.asarray((drivers["time"].values - start) / np.timedelta64(1, "s"), float)
+        for name, values in drivers.data_vars.items():
+            if values.attrs.get("units") == "degC":
+                columns[str(name)] = np.interp(seconds, at, values.values, left=np.nan, right=np.nan)
+            else:
+                loads.append(np.interp(seconds, at, values.values))
+    faults = examine_sensors(
+        seconds, np.column_stack(list(columns.values())), np.column_stack(loads) if loads else None
+    )
+    clear = [fault for fault in faults if fault.is_clear]
+    names = [f"{list(columns)[fault.sensor].replace('_', ' ')} {fault.words}" for fault in clear]
+    return [
+        Check(
+            "contact_sensors",
+            float(len(clear)),
+            0.0,
+            not clear,
+            f"{file}: {'; '.join(names)}."
+            if clear
+            else f"No contact sensor of {file} jumps, ramps, sticks or falls silent by itself.",
+            f"Look at contact and cable, and leave the log out from then on ({file})." if clear else "",
+            "compensation by the log, and every cause that follows it",
         )
     ]
 

@@ -18,7 +18,7 @@ from fusion.consistency.clocks import check_camera_clock, check_load_clock, chec
 from fusion.consistency.coefficients import check_coefficients
 from fusion.consistency.field_series import field_at, thin_fields
 from fusion.consistency.frames import check_frames
-from fusion.consistency.logs import check_log
+from fusion.consistency.logs import check_contact_sensors, check_log
 from fusion.consistency.place import check_gaps, check_place
 from fusion.consistency.readings import check_readings
 from fusion.consistency.registration import check_registration
@@ -72,6 +72,7 @@ def check_source(source: Source) -> list[Check]:
             file=drivers.file if drivers is not None else "the drivers' log",
             endangers="every effect that follows a load, and the verdict that none is missing",
         ),
+        *check_contact_sensors(source.environment, source.drivers, file=environment_file or "the environment log"),
         *check_order(source.frames),
         *_phase(source),
         *check_frames(source.frames, overridden=set(overridden_parameters(source.thermography))),

@@ -20,7 +20,7 @@ from fusion.record.loop import close_record
 from fusion.record.prediction import known_mean
 from fusion.record.result import RecordResult
 from fusion.record.sensor_health import SensorHealth, examine_record
-from fusion.report.wording import describe_fault, duration, number
+from fusion.report.wording import duration, number
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def sensor_notices(health: SensorHealth) -> list[Notice]:
     notices = []
     for fault in health.faults:
         name = health.names[fault.sensor]
-        told = f"{name} {describe_fault(fault)}" + (f" ({health.runs[fault.sensor]})" if health.runs else "")
+        told = f"{name} {fault.words}" + (f" ({health.runs[fault.sensor]})" if health.runs else "")
         if fault.is_clear:
             error = health.errors_um[name]
             with_it = f"{number(error, 3)} µm with it" if np.isfinite(error) else "no model with it"

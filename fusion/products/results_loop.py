@@ -442,7 +442,7 @@ class SensorFaultPart(ResultPart):
 
     sensor: str
     """Name of the sensor."""
-    kind: Literal["no signal", "stuck", "jump", "ramp", "drift", "noise"]
+    kind: Literal["no signal", "stuck", "jump", "ramp", "noise"]
     """What it does."""
     state: Literal["left_out", "suspected"]
     """Whether it was left out of the whole record, or stays because a machine may do the same."""

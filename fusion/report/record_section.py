@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
+from fusion.alignment.sensor_health import describe_fault
 from fusion.products.results import Results
 from fusion.products.results_loop import RecordLoop, RecordScorePart
 from fusion.record.problem import ENTRY_LEVEL
@@ -15,7 +16,6 @@ from fusion.report import plots_record
 from fusion.report.model_section import DECIDED_BEFORE, errors_table, parameters, refused_effects, steps_table
 from fusion.report.tables import Row, Table, Words, table
 from fusion.report.wording import (
-    describe_fault,
     duration,
     effect_words,
     join,
@@ -195,7 +195,7 @@ def _sensor_faults_table(loop: RecordLoop) -> Table:
     rows = [
         [
             f"{fault.sensor}, {fault.run}" if fault.run else fault.sensor,
-            f"{describe_fault(fault)}{f'; {fault.reason}' if fault.reason else ''}",
+            f"{describe_fault(fault.kind, fault.size, fault.onset_s, fault.onset_u_s)}{f'; {fault.reason}' if fault.reason else ''}",
             number(fault.ratio, 3),
             number(fault.limit, 3),
             fault.state.replace("_", " "),

@@ -9,11 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fusion.alignment.sensor_health import SensorFault
 from fusion.effects.library import describe_effect
 from fusion.products.results import Results
 from fusion.products.results_inputs import Figures, InputsPart
-from fusion.products.results_loop import Loop, RecordLoop, SensorFaultPart
+from fusion.products.results_loop import Loop, RecordLoop
 from fusion.products.results_part import Quantity
 
 _FIGURE_WORDS: dict[Figures, str] = {
@@ -250,27 +249,6 @@ def verdict_numbers(loop: Loop) -> str:
     errors = f"{declared} µm with the declared model, {final} µm after" if loop.steps else f"{declared} µm"
     plain = f"{number(loop.rmse_persistence_um, 2)} µm for repeating the last value"
     return f"Error on {where}: {errors}, {plain}; the noise of {noise} is {number(loop.noise_floor_um, 2)} µm."
-
-
-def describe_fault(fault: SensorFault | SensorFaultPart) -> str:
-    """Return what a sensor does and from when on, as it follows the sensor's name.
-
-    Parameters
-    ----------
-    fault : SensorFault or SensorFaultPart
-        As it was found, or as results.json holds it.
-    """
-    size = f"{abs(fault.size or 0.0):.2g}"
-    words = {
-        "no signal": "gives no signal",
-        "stuck": "repeats one reading",
-        "jump": f"jumps by {size} K",
-        "ramp": f"ramps by {size} K",
-        "drift": f"drifts by {size} K",
-        "noise": f"has {size} times its noise",
-    }
-    onset_h, onset_u_h = (fault.onset_s or 0.0) / 3600.0, (fault.onset_u_s or 0.0) / 3600.0
-    return f"{words[fault.kind]} from {onset_h:.2f} h on (standard uncertainty {number(onset_u_h, 1)} h)"
 
 
 def conditional_headline(results: Results) -> str:

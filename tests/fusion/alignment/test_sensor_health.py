@@ -1,4 +1,4 @@
-"""Sensors that break, ramp, stick, drift, fall silent or become noisy; and sound ones."""
+"""Sensors that break, ramp, stick, fall silent or become noisy; and sound ones."""
 
 from __future__ import annotations
 

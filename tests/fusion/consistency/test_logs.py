@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from fusion.consistency.checks import Check, Severity
-from fusion.consistency.logs import check_log
+from fusion.consistency.logs import check_contact_sensors, check_log
 
 START = np.datetime64("2026-03-09T06:30", "ns")
 READINGS = START + np.arange(0, 4 * 3600, 8).astype("m8[s]")
@@ -71,3 +71,38 @@ def test_what_was_not_logged_is_not_checked() -> None:
     assert check_log(None, READINGS, name="drivers", file="", endangers="") == []
     nothing = np.full(3, np.datetime64("NaT"))
     assert check_log(log(0.0, 60.0), nothing, name="drivers", file="", endangers="") == []
+
+
+def environment(jump_K: float = 0.0) -> xr.Dataset:
+    """Five hours of air and material temperature once a minute, of which the material jumps after three."""
+    rng = np.random.default_rng(8)
+    course = 22.0 + np.cumsum(rng.normal(0.0, 0.01, 300))
+    columns = {"air_temperature": course, "material_temperature": course + jump_K * (np.arange(300) >= 180)}
+    time = START + np.arange(300) * np.timedelta64(60, "s")
+    noisy = {name: ("time", np.round(one + rng.normal(0.0, 0.01, 300), 2)) for name, one in columns.items()}
+    return xr.Dataset(noisy, coords={"time": time})
+
+
+def drivers(jump_K: float) -> xr.Dataset:
+    """A load and the temperature of a screw nut, logged with the environment."""
+    logged = environment(jump_K)
+    load = (np.arange(300) // 20 % 2).astype(float)
+    nut = logged["material_temperature"].values
+    return xr.Dataset(
+        {"speed": ("time", load, {"units": "1/min"}), "nut": ("time", nut, {"units": "degC"})},
+        coords={"time": logged["time"]},
+    )
+
+
+def test_a_contact_sensor_that_jumps_alone_is_doubted_by_name() -> None:
+    (sound,) = check_contact_sensors(environment(), drivers(0.0), file="environment.csv")
+    assert (sound.code, sound.passed, sound.value) == ("contact_sensors", True, 0.0)
+    (doubted,) = check_contact_sensors(environment(2.0), None, file="environment.csv")
+    assert not doubted.passed
+    assert doubted.evidence.startswith("environment.csv: material temperature jumps by 2 K from 2.9")
+    assert check_contact_sensors(None, None, file="environment.csv") == []
+
+
+def test_a_temperature_among_the_drivers_is_examined_and_its_load_is_not() -> None:
+    (doubted,) = check_contact_sensors(environment(), drivers(3.0), file="environment.csv")
+    assert doubted.evidence.startswith("environment.csv: nut jumps by 3 K from 2.9")

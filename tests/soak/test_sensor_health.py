@@ -1,0 +1,130 @@
+"""Faults planted into a measured record, and sound records: docs/method/sensor-health.md.
+
+THERMOFUSE_RUNS sets the number of plants per kind of fault (5 by default); 20 times as many records of the twin, and 6 times as many
+cuttings of the measured record, are examined for false alarms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from fusion.alignment.sensor_health import examine_sensors
+from fusion.campaign.config import load_campaign
+from fusion.campaign.logged_tables import read_record
+from fusion.record.sensor_health import examine_record
+from tests.fusion.record.test_problem import CAIVIAC
+from tests.fusion.record_tables import twin_table
+from tests.soak.rates import campaigns
+
+pytestmark = pytest.mark.slow
+
+RUNS = campaigns(5)
+#: Size in K and duration in h of what is added for good.
+CHANGES = {
+    "jump 5 K": (5.0, 0.0),
+    "jump 1 K": (1.0, 0.0),
+    "ramp 28 K in 0.25 h": (28.0, 0.25),
+    "ramp 5 K in 1.5 h": (5.0, 1.5),
+    "ramp 2 K in 0.4 h": (2.0, 0.4),
+    "drift 6 K in 10 h": (6.0, 10.0),
+    "drift 3 K in 10 h": (3.0, 10.0),
+}
+OTHERS = ("stuck", "noise x 10", "open circuit")
+
+
+@pytest.fixture
+def spindle(tmp_path: Path, real_file: Callable[[str], Path]) -> xr.Dataset:
+    """The public spindle record (CAIVIAC/FL_THERMAL), 46.3 h, 16 sensors."""
+    path = real_file("CAIVIAC__FL_THERMAL/data/data.xlsx")
+    (tmp_path / "campaign.toml").write_text(CAIVIAC.format(file=path.as_posix()), encoding="utf-8")
+    return read_record(load_campaign(tmp_path / "campaign.toml"))
+
+
+def seconds_of(table: xr.Dataset) -> np.ndarray:
+    return (table["time"].values - table["time"].values[0]) / np.timedelta64(1, "s")
+
+
+def planted(table: xr.Dataset, kind: str, sensor: int, onset: int, rng: np.random.Generator) -> xr.Dataset:
+    """The record with a fault of one sensor from one sample on."""
+    spoilt, seconds = table.copy(deep=True), seconds_of(table)
+    values = spoilt["temperature"].values[:, sensor]
+    if kind in CHANGES:
+        size, hours = CHANGES[kind]
+        values += size * np.clip((seconds - seconds[onset] + 1e-3) / max(3600.0 * hours, 1e-3), 0.0, 1.0)
+    elif kind == "stuck":
+        values[onset:] = values[onset]
+    elif kind == "open circuit":
+        values[onset:] = 850.0
+    else:
+        noise = 1.4826 * np.median(np.abs(np.diff(values, 2))) / np.sqrt(6.0)
+        values[onset:] += rng.normal(0.0, 10.0 * noise, values.size - onset)
+    return spoilt
+
+
+@pytest.mark.real_data
+def test_planted_faults_are_named_and_no_other_sensor(spindle: xr.Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    rng, seconds = np.random.default_rng(20261122), seconds_of(spindle)
+    assert examine_record(spindle, ["quasi_static"]).faults == ()
+    wrong = 0
+    for kind in (*CHANGES, *OTHERS):
+        clear, suspected, others, late_min, covered, with_um, without_um = 0, 0, 0, [], 0, [], []
+        for _ in range(RUNS):
+            sensor, onset = int(rng.integers(16)), int(rng.uniform(0.35, 0.95) * seconds.size)
+            health = examine_record(planted(spindle, kind, sensor, onset, rng), ["quasi_static"])
+            for fault in health.faults:
+                if fault.sensor != sensor:
+                    others += 1
+                    continue
+                clear, suspected = clear + fault.is_clear, suspected + (not fault.is_clear)
+                late = fault.onset_s - seconds[onset]
+                late_min.append(late / 60.0)
+                covered += abs(late) <= 2.0 * fault.onset_u_s + 15.0
+                if fault.is_clear:
+                    with_um.append(health.errors_um[health.names[sensor]])
+                    without_um.append(health.sound_um)
+        wrong += others
+        with capsys.disabled():
+            print(
+                f"{kind:20s} left out {clear}, suspected {suspected} of {RUNS}; other sensors {others}; onset off by "
+                f"{np.median(np.abs(late_min)) if late_min else np.nan:.1f} min (median), {covered} within 2 u; held-out error "
+                f"{np.nanmedian(with_um) if with_um else np.nan:.2f} (largest {np.nanmax(with_um) if with_um else np.nan:.2f}) um with, "
+                f"{np.median(without_um) if without_um else np.nan:.2f} um without",
+                flush=True,
+            )
+    # A sound sensor beside a faulty one is named no more often than one in a sound record.
+    assert wrong <= 0.02 * RUNS * (len(CHANGES) + len(OTHERS)) + 2
+
+
+@pytest.mark.real_data
+def test_sound_records_are_left_alone(spindle: xr.Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    rng, seconds = np.random.default_rng(7), seconds_of(spindle)
+    cuttings, twins = [], []
+    for _ in range(6 * RUNS):
+        hours = float(rng.choice([6.0, 12.0, 24.0]))
+        first = rng.uniform(0.0, seconds[-1] - 3600.0 * hours)
+        inside = (seconds >= first) & (seconds <= first + 3600.0 * hours)
+        chosen = rng.choice(16, int(rng.choice([3, 6, 12])), replace=False)
+        drivers = spindle["driver"].values[inside] if rng.uniform() < 0.5 else None
+        cuttings.append(examine_sensors(seconds[inside], spindle["temperature"].values[inside][:, chosen], drivers))
+    for seed in range(50_000, 50_000 + 20 * RUNS):
+        table = twin_table(seed=seed, hours=float(rng.choice([12.0, 24.0])))
+        drivers = table["driver"].values if rng.uniform() < 0.5 else None
+        twins.append(examine_sensors(seconds_of(table), table["temperature"].values, drivers))
+    with capsys.disabled():
+        for name, records in (("cuttings of the spindle record", cuttings), ("records of the twin", twins)):
+            told = [fault for faults in records for fault in faults]
+            print(
+                f"{name}: {len(records)}; with a faulty sensor {sum(any(f.is_clear for f in one) for one in records)}, "
+                f"with one suspected {sum(any(not f.is_clear for f in one) for one in records)}: "
+                f"{[(f.kind.value, f.is_clear, round(f.ratio, 1), round(f.limit, 1), f.reason[:20]) for f in told]}",
+                flush=True,
+            )
+    # Two in a hundred, and three standard deviations of the count.
+    for records in (cuttings, twins):
+        named = sum(any(fault.is_clear for fault in one) for one in records)
+        assert named <= 0.02 * len(records) + 3.0 * np.sqrt(0.02 * len(records))
