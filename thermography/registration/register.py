@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from thermography._typing import Array
 from thermography.registration.consensus import fit_agreeing
@@ -435,6 +436,8 @@ def _registration(
     observations = observations.select(agree)
     residual = np.linalg.norm(observations.residuals_mm(projection), axis=1)
     factor, freedom = variance_factor(observations, projection, coefficients)
+    unchecked = _unchecked(observations, projection, coefficients, discs, factor)
+    factor_u = factor * _student_factor(freedom)
     names = [disc.name for disc in discs]
     leave_one_out = leave_one_out_mm(observations, projection, coefficients)
     magnification = np.sqrt(np.abs(np.linalg.det(projection.jacobian(observations.centres_mm))))
@@ -451,15 +454,40 @@ def _registration(
         scatter_mm=float(np.sqrt(factor) * np.median(observations.u_px / magnification)),
         scatter_px=float(np.sqrt(factor) * np.median(observations.u_px)),
         area_ratio=area_ratio(located, discs, projection),
-        unchecked=_unchecked(observations, projection, coefficients, discs, factor),
+        unchecked=unchecked,
         left_out=left_out,
         masked=tuple(observed.get(disc.name, disc) for disc in listed),
         shape=shape,
         lens=lens,
         covariance=parameter_covariance(
-            observations, projection, len(LENS_SPREAD) if lens is None else 0, factor=factor
+            _with_places_unchecked(observations, projection, discs, unchecked, factor_u),
+            projection,
+            len(LENS_SPREAD) if lens is None else 0,
+            factor=factor_u,
         ),
     )
+
+
+def _student_factor(freedom: float) -> float:
+    """Square of the half-width of Student's t that holds 68 %: few residuals tell their scatter badly (JCGM 100:2008, annex G)."""
+    return float(stats.t.ppf(stats.norm.cdf(1.0), freedom)) ** 2 if freedom >= 1.0 else 1.0
+
+
+def _with_places_unchecked(
+    observations: DiscObservations,
+    projection: Projection,
+    discs: Sequence[Fiducial],
+    unchecked: Sequence[str],
+    factor: float,
+) -> DiscObservations:
+    """The observations with what the place of a disc may err by unnoticed: up to its diameter, rectangular (JCGM 100:2008, 4.3.7).
+
+    What is hidden is not part of the scatter, so that the variance factor leaves it as it is.
+    """
+    px_per_mm = np.sqrt(np.abs(np.linalg.det(projection.jacobian(observations.centres_mm))))
+    reach_mm = np.array([disc.diameter_mm if disc.name in unchecked else 0.0 for disc in discs])
+    hidden_px = reach_mm * px_per_mm / np.sqrt(3.0 * factor)
+    return replace(observations, u_px=np.hypot(observations.u_px, hidden_px))
 
 
 def _unchecked(
