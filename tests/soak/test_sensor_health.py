@@ -15,7 +15,7 @@ import xarray as xr
 
 from fusion.alignment.sensor_health import examine_sensors
 from fusion.campaign.config import load_campaign
-from fusion.campaign.logged_tables import read_record
+from fusion.campaign.record_runs import read_record
 from fusion.record.sensor_health import examine_record
 from tests.fusion.record.test_problem import CAIVIAC
 from tests.fusion.record_tables import twin_table
