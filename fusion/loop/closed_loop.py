@@ -122,7 +122,8 @@ def choose(
         # Where a stronger effect could not be confirmed, a much weaker one may only stand in for it.
         if unconfirmed is not None and score.excess < unconfirmed.excess - TIE_GAIN:
             beside = p_value_beside(problem, state.model, score, unconfirmed)
-            if beside > limit:
+            # A lasting effect may predict in place of another even where both are significant together; an event happens at its instant.
+            if beside > limit or not score.is_event:
                 evidence: dict[str, float | str] = {
                     "p_value": score.family_wise_p,
                     "stronger": unconfirmed.name,

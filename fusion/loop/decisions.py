@@ -89,8 +89,8 @@ _SENTENCES: Mapping[Reason, str] = {
         "{after_um:.3g} µm)"
     ),
     Reason.STANDS_IN: (
-        "significant (p = {p_value:.2g}), but much weaker than {stronger}, which is not confirmed, and with that in the model no longer "
-        "(p = {beside_p:.2g}): it explains a part of the same"
+        "significant (p = {p_value:.2g}; with {stronger} in the model {beside_p:.2g}), but much weaker than {stronger}, which is not "
+        "confirmed: it may explain a part of the same"
     ),
     Reason.SUPERFLUOUS: "removed: an effect added later explains the same (log-likelihood lost without it: {loss:.1f})",
     Reason.TOO_MANY_EVENTS: "more than {most} events would be needed: that is a switching, for which the library has no name",

@@ -26,6 +26,7 @@ from fusion.loop.state import Confirmation, Confirmed, LoopState, Round, Score
 from fusion.model.fit import Term
 
 CANDIDATE = Candidate(np.zeros((2, 1)), {}, ("um",))
+EVENT = Candidate(np.zeros((2, 1)), {}, ("um",), 1.0)
 LEVEL = 0.02
 
 
@@ -145,15 +146,20 @@ def test_a_refusal_is_recorded_and_does_not_stand_in_the_way_of_a_weaker_effect(
         (16.9, 40.0, "b"),
     ],
 )
-def test_a_much_weaker_effect_is_held_against_a_stronger_one_that_was_not_confirmed(excess, loss, name):
+def test_a_much_weaker_event_is_held_against_a_stronger_one_that_was_not_confirmed(excess, loss, name):
     problem = Script(not_confirmed=frozenset({"a"}), losses={"b": loss})
-    weaker = replace(score("b", excess), gain=30.0)
+    weaker = replace(score("b", excess), gain=30.0, candidate=EVENT)
     state, chosen = choose(problem, start(score("a", 20.0, 0.003), weaker))
     assert (chosen.name if chosen else None) == name
     decision, *others = state.decisions
     assert decision == Decision("a", Reason.NOT_CONFIRMED, {"p_value": 0.003})
     # What is passed over is never left without a reason.
     assert [other.reason for other in others] == ([] if name else [Reason.STANDS_IN])
+
+
+def test_a_much_weaker_lasting_effect_may_stand_in_for_one_that_was_not_confirmed():
+    _, chosen = choose(Script(not_confirmed=frozenset({"a"})), start(score("a", 20.0), score("b", 16.9)))
+    assert chosen is None
 
 
 def test_what_a_weaker_effect_gains_is_measured_with_both_in_the_model():
@@ -168,7 +174,7 @@ def test_what_a_weaker_effect_gains_is_measured_with_both_in_the_model():
 
 def test_the_strongest_of_those_not_confirmed_sets_the_limit():
     problem = Script(not_confirmed=frozenset({"a", "b"}), losses={"c": 0.0})
-    scores = (score("a", 20.0), score("b", 18.0), replace(score("c", 16.0), gain=30.0))
+    scores = (score("a", 20.0), score("b", 18.0), replace(score("c", 16.0), gain=30.0, candidate=EVENT))
     _, chosen = choose(problem, start(*scores))
     assert chosen is None
 

@@ -116,9 +116,12 @@ def test_a_long_record_tries_every_second_block_and_a_closer_look_all():
     events = candidates("step_event", of)
     np.testing.assert_allclose(np.diff([c.event_s for c in events]), 600.0)
     instant = float(of.seconds[200])
-    closer = [c.event_s for c in candidates("step_event", of, near(instant, time_s=instant))]
-    # A hundredth of 399 blocks on either side.
-    np.testing.assert_array_equal(closer, of.seconds[197:204])
+    closer = candidates("step_event", of, near(instant, time_s=instant))
+    # A hundredth of 399 blocks on either side, and eight instants within each.
+    np.testing.assert_array_equal([c.event_s for c in closer], np.repeat(of.seconds[197:204], 8))
+    within = closer[26]
+    assert within.parameters == {"time_s": of.seconds[200] - 0.25 * of.block_s}
+    np.testing.assert_array_equal(within.columns[198:202, 0], [0.0, 0.25, 1.0, 1.0])
 
 
 def test_a_rhythm_has_six_periods_and_four_blocks_in_each():
