@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from fusion.campaign.config import load_campaign
-from fusion.campaign.logged_tables import read_record
+from fusion.campaign.record_runs import read_record
 from fusion.record import blocks, effects
 from fusion.record.baselines import plain_predictions
 from fusion.record.blocks import Record, reduce_record

@@ -71,15 +71,18 @@ def test_without_uncertain_inputs_the_noise_is_left() -> None:
     np.testing.assert_allclose(done["temperature_rise_u"], done["temperature_rise_noise_u"])
 
 
-def test_what_a_correction_of_the_zero_leaves_is_in_the_rise_and_replaces_the_drift() -> None:
+def test_of_a_drift_that_is_stated_and_what_a_correction_leaves_the_larger_is_in_the_rise() -> None:
     drifting = InputUncertainty(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.1)
     black = override(CAMERA, emissivity=1.0, object_distance_m=0.0)
     stated = evaluate_uncertainty(fields(noise_K=0.0), [black] * 3, drifting).isel(y=1, x=1)
     np.testing.assert_allclose(stated["temperature_rise_u"], [0.0, 0.1, 0.1], rtol=1e-3)
     corrected = fields(noise_K=0.0).assign(camera_correction_u=("cycle", [0.0, 0.03, 0.04]))
-    for camera in (black, CAMERA):
-        left = evaluate_uncertainty(corrected, [camera] * 3, replace(NONE, camera_drift_K=0.1)).isel(y=1, x=1)
-        np.testing.assert_allclose(left["temperature_rise_u"], [0.0, 0.03, 0.04], rtol=2e-3)
+    left = evaluate_uncertainty(corrected, [CAMERA] * 3, replace(NONE, camera_drift_K=0.02)).isel(y=1, x=1)
+    np.testing.assert_allclose(left["temperature_rise_u"], [0.0, 0.03, 0.04], rtol=2e-3)
+    # A black surface without air before it reads as warm as the camera reads it.
+    for stated_K, expected in ((0.02, [0.0, 0.03, 0.04]), (0.035, [0.0, 0.035, 0.04]), (0.1, [0.0, 0.1, 0.1])):
+        left = evaluate_uncertainty(corrected, [black] * 3, replace(NONE, camera_drift_K=stated_K)).isel(y=1, x=1)
+        np.testing.assert_allclose(left["temperature_rise_u"], expected, rtol=2e-3)
     unexamined = fields(noise_K=0.0).assign(camera_correction_u=("cycle", [0.0, 0.0, 0.0]))
     left = evaluate_uncertainty(unexamined, [black] * 3, drifting).isel(y=1, x=1)
     np.testing.assert_allclose(left["temperature_rise_u"], [0.0, 0.1, 0.1], rtol=1e-3)
