@@ -73,7 +73,7 @@ _CONDITIONS = {
     "material_rise": Condition("the emissivity is right", _CAMERA),
     "material_level": Condition("the level of the camera's temperature is right", _CAMERA),
     "expansion_coefficient": Condition(
-        "the emissivity, the expansion coefficient and the axis on the plan are right", (_CAUSES,)
+        "the scale of the temperatures, the expansion coefficient and the axis on the plan are right", (_CAUSES,)
     ),
     "sensitivity": Condition("the scales of temperature and deviation are right", (_CAUSES,)),
     "axis_line": Condition("the axis on the plan, the order of the targets and the signs are right", _CLOCK),

@@ -97,7 +97,6 @@ _SECTIONS = (
 )
 #: Section of the report -> what its figures rest on.
 _RESTS_ON: dict[str, tuple[Figures, ...]] = {
-    "registration": ("field",),
     "fields": ("field",),
     "drift": ("positions",),
     "paper": ("positions",),

@@ -154,7 +154,7 @@ def _loop_rows(results: Results, loop: Loop) -> list[tuple[str, str]]:
     ]
     return [
         *rows,
-        ("held-out error", _under(hold_out_errors(loop), results, "causes")),
+        ("held-out error", _under(hold_out_errors(loop), results, "positions")),
         ("plain predictions", _under(baseline_errors(loop), results, "positions")),
         ("noise floor", _under(f"{number(loop.noise_floor_um, 3)} µm", results, "positions")),
         *_run_rows(loop),
