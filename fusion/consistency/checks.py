@@ -47,6 +47,7 @@ CODES = (
     "fiducials_unchecked",
     "fiducial_hints",
     "fiducial_diameters",
+    "fiducials_span",
     "plan_mirrored",
     "frozen_camera",
     "camera_place",

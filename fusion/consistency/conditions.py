@@ -57,6 +57,7 @@ _CONDITIONS = {
     "camera_place": Condition("the camera stayed in its place", _CAMERA),
     "fiducials_found": Condition("the plan is registered right", _CAMERA),
     "fiducial_diameters": Condition("the places of the fiducials are right", _CAMERA),
+    "fiducials_span": Condition("the plan has the size of the table", _CAMERA),
     "fiducials_unchecked": Condition("the plan is registered right", _CAMERA),
     "fiducial_hints": Condition("the plan is registered right", _CAMERA),
     "plan_mirrored": Condition("the plan is not mirrored", _CAMERA),

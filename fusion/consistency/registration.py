@@ -1,4 +1,4 @@
-"""Checks of the registration: fiducials that are missing or that nothing checks, hints that contradict, a mirrored plan."""
+"""Checks of the registration: fiducials that are missing or unchecked, hints that contradict, a plan of another size or mirrored."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ _LARGEST_CONTRADICTED = 0.5
 #: Ratio of imaged to listed area of the discs beyond which scale and diameters disagree: five times what noise and a sharp lens do to it,
 #: 2.5 % of the scale of the plan.
 _LARGEST_AREA_RATIO = 1.05
+#: Least share of the plan that the fiducials span; beyond them the registration is extrapolated. Discs around a measured line span two
+#: thirds of its table; a plan twice as long and wide as the table leaves a quarter of that.
+_LEAST_SPAN = 0.25
 _FIGURES = (
     "the place of every temperature on the plan, rises along the measured line, and every cause that follows the field"
 )
@@ -34,8 +37,8 @@ def check_registration(registration: Mapping[str, Any], *, file: str) -> list[Ch
     Returns
     -------
     list of Check
-        Of the share that agrees, of fiducials that the others do not check, of hints, of diameters against the scale of the places, and
-        of a plan seen as in a mirror.
+        Of the share that agrees, of fiducials that the others do not check, of hints, of diameters against the scale of the places, of
+        the plan's size, and of a plan seen as in a mirror.
     """
     used, listed = list(registration["leave_one_out_mm"]), int(registration["fiducials_listed"])
     unchecked, hints = list(registration["unchecked"]), list(registration["contradicted_hints"])
@@ -78,6 +81,7 @@ def check_registration(registration: Mapping[str, Any], *, file: str) -> list[Ch
             _FIGURES,
         ),
         _diameters(registration["area_ratio"], file),
+        _span(registration["span"], file),
         Check(
             "plan_mirrored",
             float(mirrored),
@@ -92,6 +96,22 @@ def check_registration(registration: Mapping[str, Any], *, file: str) -> list[Ch
             "place and direction of the measured line on the plan, and every cause that follows the field",
         ),
     ]
+
+
+def _span(span: float, file: str) -> Check:
+    """Size of the plan against the area that the fiducials span."""
+    wide = span >= _LEAST_SPAN
+    return Check(
+        "fiducials_span",
+        span,
+        _LEAST_SPAN,
+        wide,
+        f"The fiducials in use span {100 * span:.0f} % of the plan.",
+        ""
+        if wide
+        else f"Check size under [plan], and that {file} belongs to this table; else paint discs over the whole plan.",
+        _FIGURES,
+    )
 
 
 def _diameters(area_ratio: float | None, file: str) -> Check:

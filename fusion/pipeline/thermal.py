@@ -8,6 +8,7 @@ from itertools import compress
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import xarray as xr
 
@@ -28,6 +29,7 @@ from thermography.radiometry.overrides import Overrides
 from thermography.radiometry.planck import calibrate
 from thermography.registration.clock_offset import ClockOffset, estimate_clock_offset
 from thermography.registration.evidence import RegistrationError
+from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration, register
 
 #: Number of first frames whose mean is registered: the noise falls, and the table has hardly warmed.
@@ -280,10 +282,18 @@ def _registration_part(registration: Registration, source: Source) -> dict[str, 
         "contradicted_hints": registration.contradicted_hints,
         "mirrored": registration.mirrored,
         "area_ratio": registration.area_ratio,
+        "span": _span(registration, source.grid),
         "model": registration.model,
         "leave_one_out_mm": registration.leave_one_out_mm,
         "frames_rejected": source.frames_rejected,
     }
+
+
+def _span(registration: Registration, grid: PlanGrid) -> float:
+    """Return the share of the plan that the fiducials in use span."""
+    places = [registration.fiducials[name] for name in registration.leave_one_out_mm]
+    hull = cv2.convexHull(np.array([(place.x_mm, place.y_mm) for place in places], dtype=np.float32))
+    return float(cv2.contourArea(hull)) / (grid.width_mm * grid.height_mm)
 
 
 def _registration_notices(registration: Registration) -> list[Notice]:

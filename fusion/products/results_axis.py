@@ -40,6 +40,8 @@ class RegistrationPart(ResultPart):
     """Fiducials that lie far from their rough pixel positions."""
     area_ratio: Number = None
     """Median ratio of the imaged to the listed area of the discs; null for points."""
+    span: Number = None
+    """Share of the plan's area that the fiducials in use span."""
     mirrored: bool = False
     """Whether the plan appears as in a mirror."""
     model: str = ""

@@ -11,6 +11,7 @@ SOUND = {
     "unchecked": [],
     "contradicted_hints": [],
     "mirrored": False,
+    "span": 0.66,
     "area_ratio": 1.004,
 }
 
@@ -39,6 +40,7 @@ def test_a_sound_registration_is_not_doubted():
         ({"unchecked": ["F1", "F3"]}, "fiducials_unchecked", "If F1, F3 stood elsewhere than fiducials.csv says"),
         ({"contradicted_hints": list("ABCDEFG")}, "fiducial_hints", "7 of 12 fiducials lie more than 25 px"),
         ({"area_ratio": 1.06}, "fiducial_diameters", "1.060 times the area that diameter_mm of fiducials.csv says"),
+        ({"span": 0.24}, "fiducials_span", "The fiducials in use span 24 % of the plan"),
         ({"mirrored": True}, "plan_mirrored", "appears mirrored"),
     ],
 )
