@@ -53,6 +53,18 @@ def test_a_coefficient_that_rests_on_one_target_alone_contradicts_nothing(moved:
     assert check.passed and check.value == 0.0 and "do not determine" in check.evidence
 
 
+@pytest.mark.parametrize(
+    ("effect", "tied"), [("material_compensation", ()), ("thermal_lag", ("material_compensation",))]
+)
+def test_an_added_error_of_the_compensation_may_be_a_wrong_coefficient(effect: str, tied: tuple[str, ...]) -> None:
+    step = {"effect": effect, "tied": tied, "coefficients": []}
+    check = check_coefficients({**declared(11.5, 0.2), "steps": [step]}, travel_mm=300.0)[0]
+    assert not check.passed and check.evidence.endswith("which a wrong coefficient imitates.")
+    assert check_coefficients(
+        {**declared(11.5, 0.2), "steps": [{**step, "tied": (), "effect": "dead_path"}]}, travel_mm=300.0
+    )[0].passed
+
+
 def test_readings_that_say_nothing_contradict_nothing() -> None:
     entry = {"effect": "axis_expansion", "value": 11.7, "u": 2.0, "prior": 11.7, "prior_u": 2.0, "unit": "ppm/K"}
     check = by_code({"declared_coefficients": [entry]})["expansion_coefficient"]
