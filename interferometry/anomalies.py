@@ -263,7 +263,8 @@ def _scatter_direction(estimated: xr.Dataset, target: int, others: NDArray[np.in
     weak = int(np.argmin(variance / typical))
     strong = 1 - weak
     weak_is_ordinary = stats.chi2.sf(variance[weak] / typical[weak] * freedom[weak], freedom[weak]) > 0.05
-    ratio = (variance[strong] / typical[strong]) / (variance[weak] / typical[weak])
+    # Noise with memory can leave the scatter of one direction at zero.
+    ratio = (variance[strong] / typical[strong]) / (variance[weak] / typical[weak]) if variance[weak] > 0 else np.inf
     directions_differ = stats.f.sf(ratio, freedom[strong], freedom[weak]) < 0.025
     return str(names[strong]) if weak_is_ordinary and directions_differ else "both"
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from interferometry.anomalies import Anomaly, detect_anomalies, generalised_esd
+from interferometry.anomalies import Anomaly, _scatter_direction, detect_anomalies, generalised_esd
 from interferometry.drift.estimate import estimate_drift
 from interferometry.errors import InterferometryError
 from tests.interferometry.simulated_campaigns import SIGMA_UM, simulate
@@ -139,3 +139,16 @@ def test_noise_with_memory_that_all_positions_have_makes_no_anomaly() -> None:
         flagged += any(anomaly.stands_out for anomaly in detect_anomalies(estimate_drift(deviations), deviations))
     # At 5 % two of six have a probability of 0.03; with cycles permuted as they are, five of six were flagged.
     assert flagged <= 1
+
+
+def test_a_direction_without_any_scatter_leaves_the_excess_to_the_other() -> None:
+    scatter = np.full((2, 8), 0.4)
+    scatter[:, 2] = 0.9, 0.0
+    estimated = xr.Dataset(
+        {
+            "scatter": (("direction", "target"), scatter),
+            "scatter_freedom": (("direction", "target"), np.full((2, 8), 80.0)),
+        },
+        coords={"direction": ["positive", "negative"]},
+    )
+    assert _scatter_direction(estimated, 2, np.array([0, 1, 3, 4, 5, 6, 7])) == "positive"
