@@ -258,7 +258,8 @@ def predicted_changes(grid: Grid, sensor: int, others: list[int], duration: int)
     now, past = differences[earlier:], differences[:-earlier]
     own, regressors = now[:, 0], np.hstack([now[:, 1:], past])
     most = max(1.0, differences.shape[0] / earlier / _CHANGES_PER_COEFFICIENT)
-    residual = own - _robust_ridge(own, regressors, most)
+    coefficients = _robust_ridge(own, regressors, most)
+    residual = own - (regressors - np.median(regressors, axis=0)) @ coefficients
     before = np.arange(own.size) + earlier + length - 1
     known = grid.known[:, sensor]
     residual = np.where(known[before] & known[before + duration], residual, 0.0)
@@ -266,7 +267,7 @@ def predicted_changes(grid: Grid, sensor: int, others: list[int], duration: int)
 
 
 def _robust_ridge(own: Array, regressors: Array, most: float) -> Array:
-    """Prediction of a column by ridge regression with Huber's weights and `most` effective coefficients at most."""
+    """Coefficients of the centred regressors, by ridge regression with Huber's weights and `most` effective ones at most."""
     centred = regressors - np.median(regressors, axis=0)
     spread = centred.std(axis=0)
     standard = centred / np.where(spread > 0.0, spread, np.inf)
@@ -275,18 +276,17 @@ def _robust_ridge(own: Array, regressors: Array, most: float) -> Array:
     penalties = np.geomspace(1e-6, 1e4, 101)
     used = (values / (values + penalties[:, None])).sum(axis=1)
     penalty = np.diag(np.full(values.size, float(penalties[np.argmax(used <= most)])))
-    weights, predicted = np.ones(own.size), np.zeros(own.size)
+    weights, coefficients = np.ones(own.size), np.zeros(values.size)
     for _ in range(_ITERATIONS):
         weighted = standard * weights[:, None]
         coefficients = np.linalg.solve(weighted.T @ standard / own.size + penalty, weighted.T @ own / own.size)
-        predicted = standard @ coefficients
-        missed = np.abs(own - predicted)
+        missed = np.abs(own - standard @ coefficients)
         scale = max(1.4826 * float(np.median(missed)), 1e-9)
         weights = 1.0 / np.maximum(1.0, missed / (_HUBER * scale))
-    return predicted
+    return np.asarray(coefficients / np.where(spread > 0.0, spread, np.inf))
 
 
-def excursions(changes: Changes) -> list[Excursion]:
+def largest_excursion(changes: Changes) -> Excursion | None:
     """The largest excursion of a sensor, with its size over that of the next, which shares no sample with it.
 
     Parameters
@@ -296,8 +296,8 @@ def excursions(changes: Changes) -> list[Excursion]:
 
     Returns
     -------
-    list of Excursion
-        One, or none where nothing is left to compare.
+    Excursion or None
+        None where nothing is left to compare.
     """
     size = np.abs(changes.residual)
     peak = int(size.argmax())
@@ -307,12 +307,12 @@ def excursions(changes: Changes) -> list[Excursion]:
     high = int(apart[apart > peak].min(initial=size.size)) - 1
     rest = np.r_[size[: max(0, low - changes.reach)], size[high + changes.reach + 1 :]]
     if rest.size == 0:
-        return []
+        return None
     ratio = float(size[peak] / max(float(rest.max()), changes.least_K))
     margin = changes.reach // 2
     first, last = int(changes.before[low]) - margin, int(changes.after[high]) + margin
     final = int(changes.after[-1])
-    return [Excursion(max(0, first), min(final, last), int(changes.before[peak]), ratio)]
+    return Excursion(max(0, first), min(final, last), int(changes.before[peak]), ratio)
 
 
 def level_beyond_prediction(grid: Grid, sensor: int, others: list[int]) -> Array:
@@ -333,7 +333,5 @@ def level_beyond_prediction(grid: Grid, sensor: int, others: list[int]) -> Array
     duration = grid.durations()[-1]
     differences, length = _differences(grid.temperature[:, [sensor, *others]], duration)
     most = max(1.0, differences.shape[0] / (length + duration) / _CHANGES_PER_COEFFICIENT)
-    predicted = _robust_ridge(differences[:, 0], differences[:, 1:], most)
-    centred = differences[:, 1:] - np.median(differences[:, 1:], axis=0)
-    coefficients = np.linalg.lstsq(centred, predicted, rcond=None)[0]
+    coefficients = _robust_ridge(differences[:, 0], differences[:, 1:], most)
     return np.asarray(own - grid.temperature[:, others] @ coefficients)

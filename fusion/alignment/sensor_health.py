@@ -19,8 +19,8 @@ from fusion.alignment.sensor_changes import (
     Excursion,
     Grid,
     Ramp,
-    excursions,
     fit_ramp,
+    largest_excursion,
     lay_grid,
     level_beyond_prediction,
     predicted_changes,
@@ -300,11 +300,9 @@ def _strongest(grids: list[Grid], sensor: int, others: list[int], sensors: int) 
     chosen = None
     for grid in grids:
         for duration in grid.durations():
-            changes = predicted_changes(grid, sensor, others, duration)
-            for found in excursions(changes)[:1]:
-                excess = found.ratio / limit
-                if chosen is None or excess > chosen.excess:
-                    chosen = _Suspicion(sensor, excess, found, grid)
+            found = largest_excursion(predicted_changes(grid, sensor, others, duration))
+            if found is not None and (chosen is None or found.ratio / limit > chosen.excess):
+                chosen = _Suspicion(sensor, found.ratio / limit, found, grid)
     if chosen is None:
         return _Suspicion(sensor, 0.0, Excursion(0, 0, 0, 0.0), grids[-1])
     return chosen
@@ -323,9 +321,9 @@ def _responds(grids: list[Grid], suspicion: _Suspicion, others: list[int]) -> bo
     for duration in coarse.durations():
         end = float(suspicion.grid.seconds[suspicion.found.last]) + 2.0 * duration * coarse.step_s
         for k in others:
-            for found in excursions(predicted_changes(coarse, k, [j for j in others if j != k], duration))[:1]:
-                if found.ratio >= _RESPONSE and begin <= coarse.seconds[found.peak] <= end:
-                    return True
+            found = largest_excursion(predicted_changes(coarse, k, [j for j in others if j != k], duration))
+            if found is not None and found.ratio >= _RESPONSE and begin <= coarse.seconds[found.peak] <= end:
+                return True
     return False
 
 

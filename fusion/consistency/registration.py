@@ -43,7 +43,6 @@ def check_registration(registration: Mapping[str, Any], *, file: str) -> list[Ch
     used, listed = list(registration["leave_one_out_mm"]), int(registration["fiducials_listed"])
     unchecked, hints = list(registration["unchecked"]), list(registration["contradicted_hints"])
     share, against = len(used) / listed, len(hints) / len(used)
-    mirrored = bool(registration["mirrored"])
     return [
         Check(
             "fiducials_found",
@@ -82,20 +81,25 @@ def check_registration(registration: Mapping[str, Any], *, file: str) -> list[Ch
         ),
         _diameters(registration["area_ratio"], file),
         _span(registration["span"], file),
-        Check(
-            "plan_mirrored",
-            float(mirrored),
-            0.0,
-            not mirrored,
-            f"The plan of {file} appears mirrored in the frames."
-            if mirrored
-            else "The plan turns in the frames as it is drawn.",
-            "Check the signs of x_mm and y_mm, and [plan.axis]; if the plan is drawn with y upwards, accept this doubt."
-            if mirrored
-            else "",
-            "place and direction of the measured line on the plan, and every cause that follows the field",
-        ),
+        _mirrored(bool(registration["mirrored"]), file),
     ]
+
+
+def _mirrored(mirrored: bool, file: str) -> Check:
+    """Sense in which the plan turns in the frames."""
+    return Check(
+        "plan_mirrored",
+        float(mirrored),
+        0.0,
+        not mirrored,
+        f"The plan of {file} appears mirrored in the frames."
+        if mirrored
+        else "The plan turns in the frames as it is drawn.",
+        "Check the signs of x_mm and y_mm, and [plan.axis]; if the plan is drawn with y upwards, accept this doubt."
+        if mirrored
+        else "",
+        "place and direction of the measured line on the plan, and every cause that follows the field",
+    )
 
 
 def _span(span: float, file: str) -> Check:

@@ -179,11 +179,7 @@ def examine_camera(source: Source, survey: Survey, registration: Registration) -
     SourceError
         The reference patch shows a part of the plan, whose warming it would take out.
     """
-    shifts = np.zeros((0, 2))
-    if source.thermography.table == "moving":
-        travel = float(np.abs(source.deviations["position"].values).max())
-        shifts = np.linspace(-travel, travel, _POSITIONS)[:, None] * np.array(source.plan.axis.direction)
-    blocks = locate_blocks(survey, registration, source.grid, shifts)
+    blocks = locate_blocks(survey, registration, source.grid, _travel_shifts(source))
     _refuse_patch_on_plan(source, blocks)
     disturbed = disturbed_frames(survey, blocks, still=source.thermography.table == "still")
     left_out = [
@@ -230,6 +226,14 @@ def examine_camera(source: Source, survey: Survey, registration: Registration) -
         part,
         [*notices, *_correction_notices(correction, frames, float(u_K.max()))],
     )
+
+
+def _travel_shifts(source: Source) -> Array:
+    """Places between which a moving table travels, (positions, 2) mm on the plan; none of a table at rest."""
+    if source.thermography.table != "moving":
+        return np.zeros((0, 2))
+    travel = float(np.abs(source.deviations["position"].values).max())
+    return np.asarray(np.linspace(-travel, travel, _POSITIONS)[:, None] * np.array(source.plan.axis.direction))
 
 
 def camera_corrected(part: Mapping[str, Any]) -> bool:

@@ -145,6 +145,29 @@ def record_notices(record: Record) -> list[Notice]:
                 "",
             )
         )
+    notices += _sample_notices(record)
+    if record.duplicates:
+        notices.append(
+            Notice(
+                "record_sensors_dependent",
+                f"Left out because the other sensors tell the same: {listed(record.duplicates)}.",
+                "Name each sensor once under record.temperatures.",
+            )
+        )
+    if not record.drivers:
+        notices.append(
+            Notice(
+                "no_drivers",
+                "No driver was logged, so a heat source that no sensor sees cannot be told from a drift.",
+                "Log spindle speed, load or duty in the same table, and name the column under record.drivers.",
+            )
+        )
+    return notices
+
+
+def _sample_notices(record: Record) -> list[Notice]:
+    """Notices of samples that are missing or impossible, and of pauses."""
+    notices = []
     if record.gaps:
         named = [f"{name} ({number} blocks)" for name, number in record.gaps.items()]
         notices.append(
@@ -181,22 +204,6 @@ def record_notices(record: Record) -> list[Notice]:
                 "record_displacements_missing",
                 f"{counted(missing, 'block mean')} of {record.displacement.size} of the displacements missing; left out of every fit.",
                 "",
-            )
-        )
-    if record.duplicates:
-        notices.append(
-            Notice(
-                "record_sensors_dependent",
-                f"Left out because the other sensors tell the same: {listed(record.duplicates)}.",
-                "Name each sensor once under record.temperatures.",
-            )
-        )
-    if not record.drivers:
-        notices.append(
-            Notice(
-                "no_drivers",
-                "No driver was logged, so a heat source that no sensor sees cannot be told from a drift.",
-                "Log spindle speed, load or duty in the same table, and name the column under record.drivers.",
             )
         )
     return notices

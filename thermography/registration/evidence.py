@@ -178,11 +178,10 @@ def refuse_scatter(scatter_mm: float, missed_mm: Mapping[str, float], fiducials:
     """
     limit = _LARGEST_SCATTER * float(np.median([disc.diameter_mm for disc in fiducials]))
     if scatter_mm > limit:
-        worst = sorted(missed_mm, key=lambda name: -missed_mm[name])[:3]
-        named = ", ".join(f"{name} is missed by the others by {missed_mm[name]:.1f} mm" for name in worst)
         raise RegistrationError(
             f"the places of the fiducials contradict one another by {scatter_mm:.1f} mm (standard deviation; up to {limit:.1f} mm, a tenth "
-            f"of their diameter, is measured amiss, more is another list): {named}; check x_mm, y_mm of these and of their neighbours"
+            f"of their diameter, is measured amiss, more is another list): {_worst(missed_mm)}; check x_mm, y_mm of these and of their "
+            "neighbours"
         )
 
 
@@ -202,12 +201,16 @@ def refuse_picks(scatter_px: float, missed_mm: Mapping[str, float]) -> None:
         The scatter exceeds 3 px.
     """
     if scatter_px > _LARGEST_PICK_SCATTER_PX:
-        worst = sorted(missed_mm, key=lambda name: -missed_mm[name])[:3]
-        named = ", ".join(f"{name} is missed by the others by {missed_mm[name]:.1f} mm" for name in worst)
         raise RegistrationError(
-            f"the picked points contradict one another by {scatter_px:.1f} px (standard deviation; a hand errs by 1 px): {named}; check "
-            "their column_px, row_px and their x_mm, y_mm"
+            f"the picked points contradict one another by {scatter_px:.1f} px (standard deviation; a hand errs by 1 px): "
+            f"{_worst(missed_mm)}; check their column_px, row_px and their x_mm, y_mm"
         )
+
+
+def _worst(missed_mm: Mapping[str, float]) -> str:
+    """The three points that the others miss by most, in words."""
+    names = sorted(missed_mm, key=lambda name: -missed_mm[name])[:3]
+    return ", ".join(f"{name} is missed by the others by {missed_mm[name]:.1f} mm" for name in names)
 
 
 def refuse_sizes(ratio: float, fiducials: Sequence[Fiducial]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusion.alignment.sensor_changes import excursions, fit_ramp, lay_grid, predicted_changes
+from fusion.alignment.sensor_changes import fit_ramp, largest_excursion, lay_grid, predicted_changes
 
 
 def wandering(n: int = 600, sensors: int = 4, seed: int = 1) -> np.ndarray:
@@ -49,7 +49,8 @@ def test_a_jump_is_an_excursion_of_its_own_sensor_alone(sensor):
     (grid,) = lay_grid(np.arange(600.0), temperature, None)
     ratios = []
     for k in range(4):
-        (found,) = excursions(predicted_changes(grid, k, [j for j in range(4) if j != k], 1))
+        found = largest_excursion(predicted_changes(grid, k, [j for j in range(4) if j != k], 1))
+        assert found is not None
         ratios.append(found.ratio)
         if k == sensor:
             assert found.first < 350 <= found.last
