@@ -1,0 +1,109 @@
+"""Values of a campaign file as types: quantities with their unit, shares, patches of pixels, time zones; each names what is wrong."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
+
+from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
+from pydantic_core import PydanticCustomError
+
+from fusion.campaign.messages import suggest
+from fusion.campaign.quantities import QuantityError, read_quantity
+
+
+def _quantity(unit: str) -> BeforeValidator:
+    """Return a validator from text with unit to a number in `unit`."""
+
+    def validate(value: object) -> float:
+        try:
+            return read_quantity(value, unit)
+        except QuantityError as error:
+            raise PydanticCustomError("quantity", "{text}", {"text": str(error)}) from None
+
+    return BeforeValidator(validate)
+
+
+def _within(low: float, high: float, meaning: str) -> AfterValidator:
+    """Return a validator that accepts ``low < value <= high``."""
+
+    def validate(value: float) -> float:
+        if not low < value <= high:
+            text = f"{meaning} lies above {low:g} and up to {high:g}"
+            raise PydanticCustomError("range", "{text}", {"text": text})
+        return value
+
+    return AfterValidator(validate)
+
+
+def _share_u(value: float) -> float:
+    """Accept a standard uncertainty that is a share: 0 to 1."""
+    if not 0.0 <= value <= 1.0:
+        text = (
+            f'the standard uncertainty {value:g} of a share lies outside 0 to 1; write a number such as 0.02, or "2 %"'
+        )
+        raise PydanticCustomError("range", "{text}", {"text": text})
+    return value
+
+
+def _fraction(value: object) -> object:
+    """Accept ``"45 %"`` beside ``0.45``."""
+    if isinstance(value, str) and (match := re.fullmatch(r"\s*([\d.]+)\s*%\s*", value)):
+        return float(match.group(1)) / 100.0
+    return value
+
+
+def _written(example: str) -> WithJsonSchema:
+    """How a quantity looks in the file, for the JSON Schema."""
+    return WithJsonSchema({"type": "string", "description": "number with unit", "examples": [example]})
+
+
+Millimetres = Annotated[float, _quantity("mm"), _written("5 mm")]
+PositiveMillimetres = Annotated[float, _quantity("mm"), _within(0.0, 1e5, "this length in mm"), _written("5 mm")]
+Metres = Annotated[float, _quantity("mm"), AfterValidator(lambda mm: mm / 1e3), _written("1.2 m")]
+Celsius = Annotated[float, _quantity("degC"), _within(-273.15, 3000.0, "a temperature in degC"), _written("22 degC")]
+Seconds = Annotated[float, _quantity("s"), _written("37 s")]
+PositiveSeconds = Annotated[float, _quantity("s"), _within(0.0, 1e6, "this time in s"), _written("2 s")]
+PartsPerMillion = Annotated[
+    float, _quantity("ppm/K"), _within(-10.0, 200.0, "an expansion coefficient in ppm/K"), _written("11.7 ppm/K")
+]
+Feed = Annotated[float, _quantity("mm/min"), _within(0.0, 1e6, "a feed rate in mm/min"), _written("300 mm/min")]
+Fraction = Annotated[float, BeforeValidator(_fraction), _within(0.0, 1.0, "this fraction")]
+#: Standard uncertainties.
+FractionU = Annotated[
+    float, BeforeValidator(_fraction), AfterValidator(_share_u), Field(json_schema_extra={"minimum": 0, "maximum": 1})
+]
+PartsPerMillionU = Annotated[
+    float, _quantity("ppm/K"), _within(1e-3, 200.0, "a standard uncertainty in ppm/K"), _written("0.5 ppm/K")
+]
+KelvinU = Annotated[float, _quantity("K"), Field(ge=0.0), _written("1 K")]
+MetresU = Annotated[float, _quantity("mm"), AfterValidator(lambda mm: mm / 1e3), Field(ge=0.0), _written("5 cm")]
+
+
+def _zone(name: str) -> str:
+    """Accept the IANA name of a time zone."""
+    try:
+        ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        text = f'there is no such time zone; {suggest(name, available_timezones())}write an IANA name such as "Europe/Vienna", or "UTC"'
+        raise PydanticCustomError("zone", "{text}", {"text": text}) from None
+    return name
+
+
+TimeZone = Annotated[str, AfterValidator(_zone)]
+
+
+def _patch(values: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
+    """Accept a patch that holds a pixel."""
+    if min(values[:2]) < 0 or min(values[2:]) < 1:
+        text = (
+            "this patch holds no pixel of a frame; write first column and first row, from 0 on, and the number of columns and of rows, at "
+            "least 1 each, for example [8, 8, 24, 16]"
+        )
+        raise PydanticCustomError("patch", "{text}", {"text": text})
+    return values
+
+
+#: First column and row, number of columns and rows.
+PixelPatch = Annotated[tuple[int, int, int, int], AfterValidator(_patch)]

@@ -1,0 +1,45 @@
+"""Tests of the types of values: what is written, the number in the unit of the name, and the sentence about what cannot be."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+from fusion.campaign import value_types
+
+
+@pytest.mark.parametrize(
+    ("name", "written", "value"),
+    [
+        ("Millimetres", "2 cm", 20.0),
+        ("Metres", "1.2 m", 1.2),
+        ("Celsius", "295.15 K", 22.0),
+        ("PositiveSeconds", "5 min", 300.0),
+        ("PartsPerMillion", "11.7 ppm/K", 11.7),
+        ("Fraction", "45 %", 0.45),
+        ("KelvinU", "20 mK", 0.02),
+        ("TimeZone", "Europe/Vienna", "Europe/Vienna"),
+        ("PixelPatch", [8, 8, 24, 16], (8, 8, 24, 16)),
+    ],
+)
+def test_a_value_comes_in_the_unit_of_its_name(name: str, written: Any, value: Any) -> None:
+    read = TypeAdapter(getattr(value_types, name)).validate_python(written)
+    assert read == (pytest.approx(value) if isinstance(value, float) else value)
+
+
+@pytest.mark.parametrize(
+    ("name", "written", "fault"),
+    [
+        ("Seconds", 5, "a time needs its unit in the value"),
+        ("PositiveMillimetres", "-1 mm", "this length in mm lies above 0"),
+        ("Fraction", 1.5, "this fraction lies above 0 and up to 1"),
+        ("FractionU", 2.0, "the standard uncertainty 2 of a share lies outside 0 to 1"),
+        ("TimeZone", "Europe/Wien", "there is no such time zone; did you mean"),
+        ("PixelPatch", [0, 0, 0, 5], "this patch holds no pixel of a frame"),
+    ],
+)
+def test_a_value_that_cannot_be_is_named(name: str, written: Any, fault: str) -> None:
+    with pytest.raises(ValidationError, match=fault):
+        TypeAdapter(getattr(value_types, name)).validate_python(written)
