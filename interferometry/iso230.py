@@ -269,7 +269,7 @@ def _largest(values: np.ndarray) -> float:
 
 
 def _name_window(cycles: np.ndarray, left_out: Sequence[str]) -> str:
-    name = f"cycles {cycles[0]}..{cycles[-1]}" if cycles.size > 1 else f"cycle {cycles[0]}"
+    name = f"cycles {cycles[0]} to {cycles[-1]}" if cycles.size > 1 else f"cycle {cycles[0]}"
     if cycles.size != STANDARD_CYCLES:
         name += f" ({cycles.size} cycles, not the {STANDARD_CYCLES} of the standard's acceptance test)"
     return name + (f"; without targets {', '.join(left_out)} (fewer than two readings)" if left_out else "")

@@ -115,6 +115,7 @@ def close_loop(
     state = keep_right_patterns(problem, look_again(problem, state))
     left = examine_remainder(state.model, seed, set_aside)
     steps = report_steps(state, wrong_patterns(state.model, state.added, effects))
+    errors = errors_on_hold_out(problem, {"declared": terms, "final": decided}) | plain_errors(readings, used)
     result = LoopResult(
         declared=list(declared),
         declared_coefficients=declared_coefficients(without_doubtful(state, steps), len(terms)),
@@ -122,7 +123,8 @@ def close_loop(
         noise_floor_um=state.model.fit.sigma,
         rmse_declared_um=state.errors_um[0],
         rmse_final_um=state.errors_um[-1],
-        hold_out=hold_out_intervals(problem, {"declared": terms, "final": decided}, seed),
+        hold_out=hold_out_intervals(errors, readings.cycle[~used], seed),
+        hold_out_errors=errors,
         skill=problem.has_skill(state),
         steps=steps,
         unnamed=state.unnamed(SECOND_LEVEL),
@@ -302,7 +304,7 @@ def hold_out(readings: Readings) -> tuple[NDArray[np.bool_], str]:
     first = numbers[-max(2, round(HOLD_OUT_SHARE * numbers.size))]
     return (
         readings.cycle < first,
-        f"cycles {first}-{numbers[-1]} held out; coefficients frozen at cycle {first - 1}, drift state carried in open loop",
+        f"cycles {first} to {numbers[-1]} held out; coefficients frozen at cycle {first - 1}, drift state carried in open loop",
     )
 
 
@@ -408,21 +410,26 @@ def without_doubtful(state: AxisState, steps: Sequence[AddedEffect]) -> ModelFit
     return state.model if not doubtful else fit_model(state.model.readings, state.kept(doubtful))
 
 
-def hold_out_intervals(
-    problem: AxisProblem, models: Mapping[str, Sequence[Term]], seed: int
-) -> dict[str, ErrorInterval]:
-    """Errors on the hold-out cycles with their intervals: of some models, and of plain predictions.
+def errors_on_hold_out(problem: AxisProblem, models: Mapping[str, Sequence[Term]]) -> dict[str, Array]:
+    """Open-loop errors on the hold-out cycles of some models, (n_held_out,) each, um.
 
     Parameters
     ----------
     problem : the campaign
     models : terms by the name of the model
+    """
+    return {name: problem.hold_out_errors(terms) for name, terms in models.items()}
+
+
+def hold_out_intervals(errors: Mapping[str, Array], cycles: NDArray[np.int64], seed: int) -> dict[str, ErrorInterval]:
+    """Root mean square errors on the hold-out cycles with their intervals.
+
+    Parameters
+    ----------
+    errors : (n_held_out,) each, um, by the name of the model or of the plain prediction
+    cycles : (n_held_out,) cycle of every reading
     seed : of the bootstrap
     """
-    readings, used = problem.readings, problem.used
-    errors = {name: problem.hold_out_errors(terms) for name, terms in models.items()}
-    errors |= plain_errors(readings, used)
-    cycles = readings.cycle[~used]
     return {name: error_interval(values, cycles, np.random.default_rng(seed)) for name, values in errors.items()}
 
 
@@ -477,13 +484,15 @@ def on_corrected_fields(
     model = fit_model(readings, terms)
     late = {id(term) for term, step in zip(result.state.added, result.state.steps, strict=True) if step.is_late_entry}
     decided = [term for term, old in zip(terms, kept, strict=True) if id(old) not in late]
-    hold_out_now = hold_out_intervals(problem, {"final": decided}, seed)
+    errors_now = errors_on_hold_out(problem, {"final": decided})
+    hold_out_now = hold_out_intervals(errors_now, readings.cycle[~used], seed)
     return replace(
         result,
         declared_coefficients=declared_coefficients(model, len(result.declared)),
         noise_floor_um=model.fit.sigma,
         rmse_final_um=hold_out_now["final"].rmse_um,
-        hold_out={**result.hold_out, "final": hold_out_now["final"]},
+        hold_out={**result.hold_out, **hold_out_now},
+        hold_out_errors={**result.hold_out_errors, **errors_now},
         remainder=examine_remainder(model, seed, ()),
         nuisance=nuisance_size(model),
         after=model,

@@ -15,7 +15,7 @@ from fusion.loop.decisions import Decision
 from fusion.loop.parameter_ranges import Range
 from fusion.loop.state import Confirmation, Confirmed, HoldOutQuestion, LoopState, Score, Step, rivals
 from fusion.loop.verdict import doubt_of, verdict
-from fusion.model.cross_prediction import cross_rmse
+from fusion.model.cross_prediction import cross_errors
 from fusion.model.fit import ModelFit, Term, fit_model, unexplained_drift
 from fusion.model.jackknife import coefficient_spread
 from fusion.products.results_loop import Verdict
@@ -34,8 +34,8 @@ class AddedEffect:
     rmse_before_um, rmse_after_um : open-loop error on the hold-out set before and after it entered; NaN for an effect that entered when
         the hold-out set had been opened
     rmse_without_um : open-loop error on the hold-out set of all other effects without it; NaN likewise
-    cross_rmse_before_um, cross_rmse_after_um : error of predicting blocks of all cycles from the others, without it and with it; of an
-        event only the block around it
+    cross_errors_before_um, cross_errors_after_um : (n,) errors of predicting blocks of all cycles from the others, without it and with
+        it, NaN where there is none; of an event only the block around it
     rms_um : size of its contribution, root mean square after the static profile is removed
     tied : effects that these data cannot separate from it
     runner_up : the next best effect, its p-value and how far behind it is in log-likelihood
@@ -54,8 +54,8 @@ class AddedEffect:
     rmse_before_um: float
     rmse_after_um: float
     rmse_without_um: float
-    cross_rmse_before_um: float
-    cross_rmse_after_um: float
+    cross_errors_before_um: Array
+    cross_errors_after_um: Array
     rms_um: float
     tied: list[str]
     runner_up: dict[str, float | str]
@@ -64,9 +64,26 @@ class AddedEffect:
     confirmed_by: str
     event_cycle: int | None
 
+    @property
+    def cross_rmse_before_um(self) -> float:
+        """Root mean square error of the blocks that are left out without it, um."""
+        return rmse(self.cross_errors_before_um)
+
+    @property
+    def cross_rmse_after_um(self) -> float:
+        """Root mean square error of the blocks that are left out with it, um."""
+        return rmse(self.cross_errors_after_um)
+
     def as_json(self) -> dict[str, object]:
         """One entry of ``loop.steps``."""
-        return {**vars(self), "parameters": dict(self.parameters), "parameter_ranges": dict(self.parameter_ranges)}
+        told = {name: value for name, value in vars(self).items() if not name.startswith("cross_errors")}
+        return {
+            **told,
+            "parameters": dict(self.parameters),
+            "parameter_ranges": dict(self.parameter_ranges),
+            "cross_rmse_before_um": self.cross_rmse_before_um,
+            "cross_rmse_after_um": self.cross_rmse_after_um,
+        }
 
 
 @dataclass(frozen=True)
@@ -81,6 +98,7 @@ class LoopResult:
     noise_floor_um : standard deviation of one reading beside the final model
     rmse_declared_um, rmse_final_um : hold-out error of the declared model, and with the effects that were decided on the training part
     hold_out : the same errors with their intervals, as ``declared`` and ``final``, and those of plain predictions
+    hold_out_errors : (n_held_out,) each, the errors of single readings behind them, um, by the same names
     skill : whether the model predicts the hold-out cycles better than their last values and means
     steps : effects that were added
     unnamed : effects that are significant and have no name, with their p-value
@@ -98,6 +116,7 @@ class LoopResult:
     rmse_declared_um: float
     rmse_final_um: float
     hold_out: Mapping[str, ErrorInterval]
+    hold_out_errors: Mapping[str, Array]
     skill: bool
     steps: list[AddedEffect]
     unnamed: Mapping[str, float]
@@ -223,11 +242,11 @@ def _added_effect(
     if not step.is_late_entry:
         before_um, after_um, without_um = *state.errors_um[place : place + 2], state.errors_without_um[place]
     without = fit_model(model.readings, state.kept([place]), used=model.used)
-    cross_before_um, cross_after_um = (cross_rmse(one, event_s) for one in (without, model))
+    cross_before_um, cross_after_um = (cross_errors(one, event_s) for one in (without, model))
     # The drift that is carried into the hold-out set has learnt an early step by then, and what happened only in the hold-out set makes
     # every error there larger.
     held_out_tells = event_s is None and not any(one.is_late_entry for one in state.steps)
-    judged = (state.errors_um[-1], without_um) if held_out_tells else (cross_after_um, cross_before_um)
+    judged = (state.errors_um[-1], without_um) if held_out_tells else (rmse(cross_after_um), rmse(cross_before_um))
     doubt = doubt_of(
         *judged, model.fit.sigma, "on the hold-out set" if held_out_tells else "of blocks that are left out"
     )
@@ -243,8 +262,8 @@ def _added_effect(
         rmse_before_um=before_um,
         rmse_after_um=after_um,
         rmse_without_um=without_um,
-        cross_rmse_before_um=cross_before_um,
-        cross_rmse_after_um=cross_after_um,
+        cross_errors_before_um=cross_before_um,
+        cross_errors_after_um=cross_after_um,
         rms_um=_size(model, term),
         tied=tied,
         runner_up=runner_up,

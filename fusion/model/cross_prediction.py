@@ -20,8 +20,8 @@ from fusion.model.least_squares import solve
 _BLOCKS = 5
 
 
-def cross_rmse(model: ModelFit, event_s: float | None = None) -> float:
-    """Root mean square error of predicting blocks of cycles from all others, um.
+def cross_errors(model: ModelFit, event_s: float | None = None) -> Array:
+    """Errors of predicting blocks of cycles from all others.
 
     Parameters
     ----------
@@ -31,12 +31,13 @@ def cross_rmse(model: ModelFit, event_s: float | None = None) -> float:
 
     Returns
     -------
-    float
-        um; readings of a site that the other blocks do not hold are left out.
+    (n,) ndarray, um
+        NaN at a reading that no block holds, and at one of a site that the other blocks do not hold.
     """
-    blocks = _cycle_blocks(model) if event_s is None else [_around(model, event_s)]
-    errors = np.concatenate([_left_out(model, block) for block in blocks])
-    return float(np.sqrt(np.nanmean(errors**2)))
+    errors = np.full(int(model.used.sum()), np.nan)
+    for block in _cycle_blocks(model) if event_s is None else [_around(model, event_s)]:
+        errors[block] = _left_out(model, block)
+    return errors
 
 
 def _cycle_blocks(model: ModelFit) -> list[NDArray[np.bool_]]:

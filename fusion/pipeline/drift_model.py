@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import xarray as xr
@@ -26,6 +27,14 @@ from fusion.products import store
 from fusion.products.grouped import joined
 from fusion.products.progress import Report
 from fusion.products.results import Notice, Outcome
+
+_READING = ("cycle", "direction", "target")
+#: Predictions of the hold-out cycles whose errors are kept reading by reading, in words.
+_PREDICTIONS = {
+    "declared": "declared model",
+    "final": "with the added effects",
+    "last_value": "last value repeated",
+}
 
 
 @dataclass(frozen=True)
@@ -71,7 +80,9 @@ def model_drift(
     errors = [] if corrected is None else corrected.errors
     models = both_models(result)
     tests = {name: examine_residual(model, np.random.default_rng(1)) for name, model in models.items()}
-    variables = loop_variables(fused, models, tests).assign(correction_variables(corrected, fields, fused))
+    variables = loop_variables(fused, models, tests).assign(
+        {**prediction_variables(fused, result), **correction_variables(corrected, fields, fused)}
+    )
     report("anomalies", 0, 1)
     positions = judge_positions(fused, deviations, variables["contribution"].sum("effect", skipna=False))
     result = set_aside_sites(result, sites_of(positions, deviations.sizes["target"]))
@@ -241,20 +252,8 @@ def loop_variables(fused: xr.Dataset, models: Mapping[str, ModelFit], tests: Map
         Residuals and contributions in um, innovations in standard deviations; NaN where there is no reading.
     """
     final = models["final"]
-    readings = final.readings
-    dims = ("cycle", "direction", "target")
-    shape = tuple(fused.sizes[name] for name in dims)
-    place = (
-        np.searchsorted(fused["cycle"].values, readings.cycle),
-        np.where(readings.sign > 0, 0, 1),
-        readings.target_index,
-    )
-
-    def spread(values: np.ndarray) -> np.ndarray:
-        laid = np.full(shape, np.nan)
-        laid[place] = values
-        return laid
-
+    spread = partial(lay_out, fused, final.readings)
+    shape = tuple(fused.sizes[name] for name in _READING)
     terms = final.terms
     names = [term.effect for term in terms]
     unique = [name if names.count(name) == 1 else f"{name} {at + 1}" for at, name in enumerate(names)]
@@ -262,11 +261,11 @@ def loop_variables(fused: xr.Dataset, models: Mapping[str, ModelFit], tests: Map
     um = {"units": "um"}
     return xr.Dataset(
         {
-            **{f"residual_{name}": (dims, spread(_centred(model)), um) for name, model in models.items()},
-            "contribution": (("effect", *dims), contribution, um),
+            **{f"residual_{name}": (_READING, spread(_centred(model)), um) for name, model in models.items()},
+            "contribution": (("effect", *_READING), contribution, um),
             **{
                 f"innovation_{name}": (
-                    dims,
+                    _READING,
                     spread(one.innovations),
                     {
                         "units": "1",
@@ -293,6 +292,63 @@ def loop_variables(fused: xr.Dataset, models: Mapping[str, ModelFit], tests: Map
             "period": ("period", tests["final"].periods_min, {"units": "min", "long_name": "period"}),
         },
     )
+
+
+def prediction_variables(fused: xr.Dataset, result: LoopResult) -> dict[str, xr.Variable]:
+    """Lay the errors that the loop reports out by cycle, direction and target: those on the hold-out cycles, and of left-out blocks.
+
+    Parameters
+    ----------
+    fused : both recordings on one clock
+    result : of the loop
+
+    Returns
+    -------
+    dict of Variable
+        Measured minus predicted, um, NaN where nothing was predicted. Of the hold-out: ``held_out_error_declared`` and ``..._final``, and
+        ``..._last_value`` of repeating the last value. Of every step: ``block_error_before`` and ``block_error_after`` (step, ...), without
+        it and with it. The root mean square of each is the error in results.json.
+    """
+    held_out = result.before.readings.subset(~result.before.used)
+    variables = {
+        f"held_out_error_{name}": xr.Variable(
+            _READING,
+            lay_out(fused, held_out, result.hold_out_errors[name]),
+            {"units": "um", "long_name": f"measured minus predicted in the hold-out cycles, {words}"},
+        )
+        for name, words in _PREDICTIONS.items()
+    }
+    if not result.steps:
+        return variables
+    readings = result.state.model.readings
+    for stage in ("before", "after"):
+        errors = [getattr(step, f"cross_errors_{stage}_um") for step in result.steps]
+        variables[f"block_error_{stage}"] = xr.Variable(
+            ("step", *_READING),
+            np.array([lay_out(fused, readings, values) for values in errors]),
+            {"units": "um", "long_name": f"measured minus predicted from the other blocks of cycles, {stage} the step"},
+        )
+    return variables
+
+
+def lay_out(fused: xr.Dataset, readings: Readings, values: np.ndarray) -> np.ndarray:
+    """Lay values of readings out by cycle, direction and target.
+
+    Parameters
+    ----------
+    fused : both recordings on one clock
+    readings : n of its readings
+    values : (n,) in any unit
+
+    Returns
+    -------
+    (cycle, direction, target) ndarray
+        NaN where there is none of these readings.
+    """
+    laid = np.full(tuple(fused.sizes[name] for name in _READING), np.nan)
+    place = np.searchsorted(fused["cycle"].values, readings.cycle)
+    laid[place, np.where(readings.sign > 0, 0, 1), readings.target_index] = values
+    return laid
 
 
 def _centred(fit: ModelFit) -> np.ndarray:

@@ -228,7 +228,6 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
     drivers = np.array([powers[1] for powers in record.drivers.values()]).reshape(-1, record.seconds.size).T
     um: dict[str, Any] = {"units": "um"}
     dims = ("time", "channel")
-    final = result.predictions[-1]
     # What forward chaining has shown the model to miss by, where it can be known: not smaller than on the hold-out set.
     chained = np.array([one.rmse_final_um for one in result.chained]).reshape(-1, len(record.channels))
     spread = np.fmax(result.errors[-1], np.sqrt(known_mean(chained**2, axis=0)) if len(chained) else 0.0)
@@ -241,8 +240,7 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
                 {"units": "degC", "units_metadata": "temperature: on_scale"},
             ),
             "driver": (("time", "driver_name"), drivers, {"units": "1", "long_name": "driver over its largest size"}),
-            "predicted_declared": (dims, result.predictions[0].predicted, um),
-            "predicted_final": (dims, final.predicted, um),
+            **_predictions(record, result),
             "predicted_u": (
                 "channel",
                 spread,
@@ -280,3 +278,24 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
             {"units": "s", "long_name": "time since the start, time between runs left out"},
         ),
     )
+
+
+def _predictions(record: Record, result: RecordResult) -> dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]]:
+    """Predictions from the training part, and the errors of predicting every part from all others before and after each step, um."""
+    dims = ("time", "channel")
+    named = {
+        "declared": result.predictions[0].predicted,
+        "final": result.predictions[-1].predicted,
+        "last_value": result.plain["last_value"],
+    }
+    variables: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]] = {
+        f"predicted_{name}": (dims, values, {"units": "um"}) for name, values in named.items()
+    }
+    after, *before = (record.displacement - predicted for predicted in result.left_out)
+    if before:
+        told = "measured minus predicted from the other parts"
+        stages = {"before": before, "after": [after] * len(before)}
+        for stage, errors in stages.items():
+            described = {"units": "um", "long_name": f"{told}, {stage} the step"}
+            variables[f"block_error_{stage}"] = ("step", *dims), np.array(errors), described
+    return variables

@@ -45,7 +45,7 @@ FILES = {
 
 
 #: Number of the products' layout: stages that were kept in another one are computed again.
-PRODUCT_LAYOUT = 3
+PRODUCT_LAYOUT = 4
 
 
 @dataclass

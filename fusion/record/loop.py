@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from fusion._typing import Array
 from fusion.effects.effect import Effect
 from fusion.loop.closed_loop import MOST_EFFECTS, Progress, no_progress, open_hold_out, withdraw
 from fusion.loop.decisions import Decision, Reason
@@ -19,7 +20,7 @@ from fusion.record.baselines import plain_predictions
 from fusion.record.blocks import Record
 from fusion.record.hold_out import declare, hold_out
 from fusion.record.model import columns_of, fit_record
-from fusion.record.prediction import channel_rmse, known_mean, left_out_rmse
+from fusion.record.prediction import channel_rmse, known_mean, predict_left_out
 from fusion.record.problem import EARNED, ChainedPart, RecordProblem, RecordState, chain_forward, search_record
 from fusion.record.remainder import examine
 from fusion.record.result import RecordResult
@@ -76,16 +77,16 @@ def close_record(
         without=[problem.predict(state.kept([place])) for place in range(len(state.steps))] if record.runs else [],
         errors=errors,
         plain=plain_predictions(record, train),
-        cross_um=[cross_rmse(problem, [*state.declared, *state.added])]
-        + [cross_rmse(problem, state.kept([place])) for place in range(len(state.steps))],
+        left_out=[left_out(problem, [*state.declared, *state.added])]
+        + [left_out(problem, state.kept([place])) for place in range(len(state.steps))],
         whole=whole,
         remainder=examine(whole, errors[-1], np.random.default_rng(seed)),
         chained=chained,
     )
 
 
-def cross_rmse(problem: RecordProblem, terms: Sequence[Term]) -> float:
-    """Error of predicting every part of the record from all others, um; the penalty is that of the prediction from the training part.
+def left_out(problem: RecordProblem, terms: Sequence[Term]) -> Array:
+    """Prediction of every part of the record from all others, (blocks, channels) um; the penalty is that from the training part.
 
     Parameters
     ----------
@@ -93,7 +94,7 @@ def cross_rmse(problem: RecordProblem, terms: Sequence[Term]) -> float:
     terms : of the model
     """
     record = problem.record
-    return left_out_rmse(record, columns_of(record, terms), problem.predict(terms).penalty)
+    return predict_left_out(record, columns_of(record, terms), problem.predict(terms).penalty)
 
 
 def without_unrepeated(problem: RecordProblem, state: RecordState, chained: Sequence[ChainedPart]) -> RecordState:

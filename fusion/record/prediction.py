@@ -121,8 +121,8 @@ def persistence_rmse(record: Record, train: NDArray[np.bool_], where: NDArray[np
     return channel_rmse(record, last_values(record, train), where)
 
 
-def left_out_rmse(record: Record, columns: Array, penalty: float) -> float:
-    """Error of predicting every part of a record, or every run of several, from all others, earlier and later ones.
+def predict_left_out(record: Record, columns: Array, penalty: float) -> Array:
+    """Predict every part of a record, or every run of several, from all others, earlier and later ones.
 
     Parameters
     ----------
@@ -132,8 +132,7 @@ def left_out_rmse(record: Record, columns: Array, penalty: float) -> float:
 
     Returns
     -------
-    float
-        Root mean square over all blocks, mean over the channels, um.
+    (blocks, channels) ndarray, um
     """
     predicted = np.full(record.displacement.shape, np.nan)
     place = int(np.flatnonzero(penalty == PENALTIES)[0])
@@ -141,7 +140,7 @@ def left_out_rmse(record: Record, columns: Array, penalty: float) -> float:
     for number in np.unique(numbers):
         part = numbers == number
         predicted[part] = _paths(record, columns, ~part)[place][0][part]
-    return rmse(record, predicted, np.ones(part.size, bool))
+    return predicted
 
 
 def chained_parts(record: Record, train: NDArray[np.bool_]) -> list[int]:

@@ -58,7 +58,7 @@ class RecordResult:
     predictions : of the declared model and after every added effect, from the training part
     errors : (1 + effects, channels) their errors on the hold-out set, um
     plain : (blocks, channels) each, plain predictions from the training part, by name
-    cross_um : error of predicting every part from all others, um: of the final model, then without each of its effects
+    left_out : (blocks, channels) each, predictions of every part from all others, um: by the final model, then without each of its effects
     whole : the final model fitted to all blocks, for its residual
     remainder : structure that the final model leaves
     chained : every part from the third on, predicted by the whole procedure on the time before it; runs from the other runs
@@ -72,7 +72,7 @@ class RecordResult:
     predictions: list[Prediction]
     errors: Array
     plain: Mapping[str, Array]
-    cross_um: list[float]
+    left_out: list[Array]
     whole: RecordFit
     remainder: RecordRemainder
     chained: list[ChainedPart]
@@ -87,6 +87,12 @@ class RecordResult:
     def noise_um(self) -> float:
         """Noise of a block mean, mean over the channels, um."""
         return float(np.mean(self.whole.sigma))
+
+    @property
+    def cross_um(self) -> list[float]:
+        """Error of predicting every part from all others, um: of the final model, then without each of its effects."""
+        everywhere = np.ones(self.hold_out.size, bool)
+        return [rmse(self.record, predicted, everywhere) for predicted in self.left_out]
 
     @property
     def hold_out_intervals(self) -> dict[str, ErrorInterval]:

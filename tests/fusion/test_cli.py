@@ -108,7 +108,7 @@ def test_inspect_tells_what_files_hold(campaign_folder: Path, tmp_path: Path) ->
 def test_iso230_evaluates_a_window(campaign_folder: Path) -> None:
     result = invoke("iso230", campaign_folder / "laser.csv", "--cycles", "1-5")
     assert result.exit_code == 0, result.output
-    assert "laser.csv, cycles 1..5" in result.output
+    assert "laser.csv, cycles 1 to 5" in result.output
     for bad, message in (
         ("one", 'thermofuse: --cycles "one" is not a window of cycles; write for example 1-5\n'),
         ("20-30", 'thermofuse: --cycles "20-30" asks for cycles that were not measured; there are 1 to 24\n'),

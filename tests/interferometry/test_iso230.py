@@ -72,7 +72,7 @@ def test_published_tests_give_their_printed_values(real_file: Callable[[str], Pa
         assert result[f"{quantity}_unidirectional"].values == pytest.approx(pair, abs=PRINTED_TOLERANCE)
     for quantity, value in by_hand(deviations["deviation"].values).items():
         assert float(result[quantity]) == pytest.approx(value, rel=1e-12)
-    assert result.attrs["window"] == "cycles 1..5"
+    assert result.attrs["window"] == "cycles 1 to 5"
 
 
 def read_report_tables(path: Path) -> xr.Dataset:
@@ -125,7 +125,7 @@ def test_a_target_read_once_is_left_out_by_name(rng: np.random.Generator) -> Non
     x[1:, 1, 3] = np.nan
     x[0, 1, 3] = 100.0
     result = evaluate_iso230(test_made(x))
-    assert result.attrs["window"] == "cycles 1..5; without targets 4 negative (fewer than two readings)"
+    assert result.attrs["window"] == "cycles 1 to 5; without targets 4 negative (fewer than two readings)"
     assert float(result["A"]) < 50.0
     assert np.isnan(float(result["reversal"][3]))
 
@@ -142,18 +142,18 @@ def test_windows_that_cannot_be_evaluated_are_refused(rng: np.random.Generator) 
 
 def test_short_tests_and_empty_windows_have_the_windows_that_can_be_evaluated(rng: np.random.Generator) -> None:
     short = evaluate_windows(test_made(rng.normal(0, 1, (4, 2, 4))))
-    assert short["window"].values.tolist() == ["cycles 1..4 (4 cycles, not the 5 of the standard's acceptance test)"]
+    assert short["window"].values.tolist() == ["cycles 1 to 4 (4 cycles, not the 5 of the standard's acceptance test)"]
     x = rng.normal(0, 1, (15, 2, 4))
     x[5:10] = np.nan
-    assert evaluate_windows(test_made(x))["window"].values[:2].tolist() == ["cycles 1..5", "cycles 11..15"]
+    assert evaluate_windows(test_made(x))["window"].values[:2].tolist() == ["cycles 1 to 5", "cycles 11 to 15"]
 
 
 def test_windows_show_how_drift_enters_repeatability_and_accuracy(rng: np.random.Generator) -> None:
     deviations, _ = simulate(rng, kind="warmup", cycles=40)
     windows = evaluate_windows(deviations)
     assert windows.sizes["window"] == 9
-    assert windows["window"].values[0] == "cycles 1..5"
-    assert windows["window"].values[-1] == "cycles 1..40 (40 cycles, not the 5 of the standard's acceptance test)"
+    assert windows["window"].values[0] == "cycles 1 to 5"
+    assert windows["window"].values[-1] == "cycles 1 to 40 (40 cycles, not the 5 of the standard's acceptance test)"
     assert float(windows["R"][-1]) > 3 * float(windows["R"][:-1].median())
     assert float(windows["A"][-1]) > float(windows["A"][:-1].max())
 

@@ -22,7 +22,7 @@ from fusion.loop.result import (
     rmse,
 )
 from fusion.loop.state import Confirmation, Confirmed, DetectionLimit, HoldOutQuestion, LoopState, Round, Score, Step
-from fusion.model.cross_prediction import cross_rmse
+from fusion.model.cross_prediction import cross_errors
 from fusion.model.fit import ModelFit, fit_model, unexplained_drift
 from fusion.model.jackknife import coefficient_spread
 from tests.fusion.small_campaign import RATIOS, campaign, model_of, term
@@ -93,11 +93,12 @@ def result(looped: LoopState[ModelFit], left: Remainder) -> LoopResult:
     return LoopResult(
         declared=["axis_expansion"],
         declared_coefficients=declared_coefficients(model, 1),
-        held_out="cycles 11-12 held out",
+        held_out="cycles 11 to 12 held out",
         noise_floor_um=0.1,
         rmse_declared_um=0.8,
         rmse_final_um=0.3,
         hold_out=HOLD_OUT,
+        hold_out_errors={},
         skill=True,
         steps=report_steps(looped, {}),
         unnamed={},
@@ -145,11 +146,13 @@ def test_a_step_is_reported_with_its_errors_rivals_and_cycle():
     assert step.confirmed_by == str(Confirmed.OTHER_TARGETS)
     # The drift has learnt an early step by the time of the hold-out set: the block around it tells.
     without = fit_model(model.readings, [model.terms[0]])
-    assert (step.cross_rmse_before_um, step.cross_rmse_after_um) == (
-        cross_rmse(without, 655.0),
-        cross_rmse(model, 655.0),
-    )
-    assert step.cross_rmse_after_um < step.cross_rmse_before_um and step.confirmed and step.doubt == ""
+    np.testing.assert_array_equal(step.cross_errors_before_um, cross_errors(without, 655.0))
+    np.testing.assert_array_equal(step.cross_errors_after_um, cross_errors(model, 655.0))
+    told = step.as_json()
+    assert told["cross_rmse_before_um"] == step.cross_rmse_before_um == rmse(step.cross_errors_before_um)
+    assert told["cross_rmse_after_um"] == rmse(step.cross_errors_after_um) < step.cross_rmse_before_um
+    assert not any(isinstance(value, np.ndarray) for value in told.values())
+    assert step.confirmed and step.doubt == ""
     # 655 s lies between the third and the fourth reading of cycle 6.
     assert step.event_cycle == 6
     # A coefficient times a column of zeros and ones, about its mean at every site.

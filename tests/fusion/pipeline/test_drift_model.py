@@ -13,6 +13,7 @@ from fusion.alignment.readings import Series
 from fusion.effects.effect import Prior
 from fusion.effects.library import library
 from fusion.loop.camera_correction import FieldFault
+from fusion.loop.result import rmse
 from fusion.model.fit import fit_model
 from fusion.pipeline.drift_model import (
     CorrectedCamera,
@@ -24,6 +25,7 @@ from fusion.pipeline.drift_model import (
     join_fusion,
     library_for,
     loop_variables,
+    prediction_variables,
 )
 from tests.fusion.small_campaign import campaign, logged, model_of, term
 
@@ -175,6 +177,40 @@ def test_residuals_hold_the_drift_and_have_mean_zero(laid):
         expected = model.readings.response - model.fit.design @ model.fit.coefficients
         np.testing.assert_allclose(residual[0, 0], (expected - expected.mean())[:4])
         assert dataset[f"residual_{name}"].attrs == {"units": "um"}
+
+
+def test_the_errors_that_the_loop_reports_are_kept_reading_by_reading():
+    """Each root mean square is that of the result, and every error lies at its reading."""
+    whole = campaign(cycles=12)
+    readings = replace(whole, response=np.random.default_rng(2).standard_normal(whole.seconds.size))
+    late = readings.cycle > 9
+    random = np.random.default_rng(3)
+    errors = {name: random.standard_normal(late.sum()) for name in ("declared", "final", "last_value")}
+    blocks = [np.where(readings.cycle > 2, random.standard_normal(late.size), np.nan) for _ in range(2)]
+    result = SimpleNamespace(
+        before=model_of(readings, [], ~late),
+        state=SimpleNamespace(model=model_of(readings)),
+        hold_out_errors=errors,
+        steps=[SimpleNamespace(cross_errors_before_um=blocks[0], cross_errors_after_um=blocks[1])],
+    )
+    fused = xr.Dataset(
+        {"deviation": (("cycle", "direction", "target"), np.zeros((12, 2, 4)))}, coords={"cycle": np.arange(1, 13)}
+    )
+    variables = prediction_variables(fused, result)
+    for name, values in errors.items():
+        laid_out = variables[f"held_out_error_{name}"].values
+        assert np.isnan(laid_out[:9]).all()
+        assert np.sqrt(np.nanmean(laid_out**2)) == pytest.approx(rmse(values), rel=1e-14)
+        k = int(np.flatnonzero(late)[5])
+        place = (readings.cycle[k] - 1, 0 if readings.sign[k] > 0 else 1, readings.target[k] - 1)
+        assert laid_out[place] == values[5]
+    for name, values in zip(("before", "after"), blocks, strict=True):
+        laid_out = variables[f"block_error_{name}"].values
+        assert laid_out.shape == (1, 12, 2, 4) and np.isnan(laid_out[0, :2]).all()
+        assert np.sqrt(np.nanmean(laid_out**2)) == pytest.approx(rmse(values), rel=1e-14)
+    assert set(prediction_variables(fused, SimpleNamespace(**{**vars(result), "steps": []}))) == {
+        f"held_out_error_{name}" for name in errors
+    }
 
 
 def test_effects_that_enter_twice_are_numbered(laid):

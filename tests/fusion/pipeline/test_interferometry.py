@@ -30,7 +30,7 @@ def test_gaps_and_outliers_are_noted_with_what_they_cost(copied: Path) -> None:
 
 def test_parts_agree_with_the_product(campaign_folder: Path) -> None:
     outcome = evaluate_interferometry(read_source(load_campaign(campaign_folder / "campaign.toml")))
-    assert outcome.parts["iso230"]["window"] == "cycles 1..5"
+    assert outcome.parts["iso230"]["window"] == "cycles 1 to 5"
     assert outcome.parts["iso230"]["A_um"]["value"] == pytest.approx(float(outcome.dataset["iso_A"][0]))
     profile = outcome.dataset["drift_profile"]
     assert by_direction(profile)["negative"] == profile.sel(direction="negative").values.tolist()

@@ -109,6 +109,8 @@ def result_of(record: Record, *, names: tuple[str, ...], chained: list[tuple[flo
         contribution=lambda term: np.full((50, 2), 10.0 + places[id(term)]),
         whole=SimpleNamespace(sigma=np.array([0.1, 0.2])),
         hold_out=np.arange(50) >= 40,
+        plain={"last_value": np.full((50, 2), 7.0)},
+        left_out=[np.full((50, 2), 4.0), np.full((50, 2), 6.0)],
     )
 
 
@@ -121,6 +123,10 @@ def test_the_product_holds_the_record_on_its_blocks():
     np.testing.assert_array_equal(dataset["driver"], speed[:, None])
     np.testing.assert_array_equal(dataset["predicted_declared"], 0.0)
     np.testing.assert_array_equal(dataset["predicted_final"], 2.0)
+    np.testing.assert_array_equal(dataset["predicted_last_value"], 7.0)
+    # Of the one step, without it and with it.
+    np.testing.assert_array_equal(dataset["block_error_before"][0], record.displacement - 6.0)
+    np.testing.assert_array_equal(dataset["block_error_after"][0], record.displacement - 4.0)
     np.testing.assert_array_equal(dataset["sealed"], np.arange(50) >= 40)
     # Parts are numbered from 1.
     assert (int(dataset["part"].min()), int(dataset["part"].max())) == (1, 8)

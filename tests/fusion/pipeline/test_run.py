@@ -13,7 +13,7 @@ import xarray as xr
 
 from fusion.pipeline.run import run_campaign
 from fusion.products.contracts import check
-from fusion.products.results import results_schema
+from fusion.products.results import AxisLoop, read_results, results_schema
 from fusion.products.store import OutputError, file_sha256, read_dataset
 from thermography.contract import FIELDS
 from thermography.io.openexr import read_maps
@@ -101,6 +101,29 @@ def test_an_older_result_is_not_overwritten(results_folder: Path, campaign_folde
     with pytest.raises(OutputError, match="is not empty; add --resume"):
         run_campaign(campaign_folder / "campaign.toml", results_folder)
     assert (results_folder / "results.json").read_bytes() == before
+
+
+def test_the_errors_of_the_results_are_those_of_the_stored_readings(results_folder: Path) -> None:
+    """Root mean squares over the hold-out cycles, and over the blocks that were left out for every step."""
+    fusion, loop = read_dataset(results_folder / "fusion.nc"), read_results(results_folder).loop
+    assert isinstance(loop, AxisLoop) and loop.steps
+
+    def rms(errors: xr.DataArray) -> float:
+        return float(np.sqrt((errors**2).mean()))
+
+    held_out = {name: fusion[f"loop_held_out_error_{name}"] for name in ("declared", "final", "last_value")}
+    printed = {
+        "declared": (loop.rmse_declared_um, loop.errors.declared.rmse_um),
+        "final": (loop.rmse_final_um, loop.errors.final.rmse_um),
+        "last_value": (loop.rmse_persistence_um, loop.baselines.last_value.rmse_um),
+    }
+    for name, figures in printed.items():
+        assert figures == pytest.approx((rms(held_out[name]),) * 2, rel=1e-12)
+        held = held_out[name]["cycle"].values[held_out[name].notnull().any(["direction", "target"]).values]
+        assert f"cycles {held[0]} to {held[-1]} held out" in loop.held_out
+    for k, step in enumerate(loop.steps):
+        for stage, figure in (("before", step.cross_rmse_before_um), ("after", step.cross_rmse_after_um)):
+            assert figure == pytest.approx(rms(fusion[f"loop_block_error_{stage}"].isel(step=k)), rel=1e-12)
 
 
 def test_residuals_lie_at_their_own_reading(results_folder: Path) -> None:

@@ -60,7 +60,7 @@ def result(*, shape: str = "") -> RecordResult:
         ],
         errors=np.array([[1.0, 3.0], [0.5, np.nan]]),
         plain={name: np.full((4, 2), [4.0, 6.0]) for name in ("last_value", "mean", "ridge")},
-        cross_um=[0.6, 1.8],
+        left_out=[np.full((4, 2), 0.6), np.full((4, 2), 1.8)],
         whole=SimpleNamespace(sigma=np.array([0.1, 0.3])),
         remainder=RecordRemainder(0.5, {"rhythm": 0.5}, shape, 0.2, np.array([0.1, 0.3])),
         chained=[
@@ -137,7 +137,7 @@ def test_an_added_effect_is_told_with_its_size_and_its_rivals():
     }
     assert step["confirmed_by"] == str(Confirmed.LATER_PARTS) and step["event_s"] is None
     assert (step["confirmed"], step["doubt"], step["rmse_without_um"]) == (True, "", 2.0)
-    assert (step["cross_rmse_before_um"], step["cross_rmse_after_um"]) == (1.8, 0.6)
+    assert (step["cross_rmse_before_um"], step["cross_rmse_after_um"]) == (pytest.approx(1.8), pytest.approx(0.6))
 
 
 def test_a_contribution_is_that_of_the_terms_own_columns():

@@ -19,7 +19,7 @@ from fusion.products.results_loop import Baselines, ErrorInterval, ModelErrors, 
 from fusion.report import findings
 
 ISO = Iso230Part(
-    window="cycles 1..5",
+    window="cycles 1 to 5",
     B_of_scatter_um=0.4379,
     **{f"{name}_um": Quantity(value=9.9017, u=1.378) for name in (*"BREMA", "mean_reversal")},
 )
