@@ -345,7 +345,7 @@ def test_the_last_fifth_of_the_cycles_is_held_out_but_two_at_least(cycles, first
     readings = campaign(cycles=cycles)
     used, description = hold_out(readings)
     np.testing.assert_array_equal(used, readings.cycle < first)
-    assert description.startswith(f"cycles {first}-{cycles} held out; coefficients frozen at cycle {first - 1}")
+    assert description.startswith(f"cycles {first} to {cycles} held out; coefficients frozen at cycle {first - 1}")
 
 
 def test_cycles_that_are_missing_do_not_count():
