@@ -7,10 +7,8 @@ import io
 import json
 import re
 from collections.abc import Callable, Mapping
-from importlib import resources
 from typing import TYPE_CHECKING, Any
 
-import jinja2
 import numpy as np
 import xarray as xr
 
@@ -18,7 +16,9 @@ from fusion.products.grouped import group, has
 from fusion.products.results import Results
 from fusion.report import plots_attribution, plots_model, plots_plan, record_section, summary_section
 from fusion.report.attribution_section import leading_region
-from fusion.report.wording import number
+from fusion.report.charts.drift import plot_drift, plot_profile
+from fusion.report.charts.style import Chart
+from fusion.report.page import render_page
 from interferometry import figures
 
 if TYPE_CHECKING:
@@ -72,27 +72,37 @@ def render_report(
     >>> from pathlib import Path
     >>> page = render_report(read_results(Path("results")), provenance, datasets)  # doctest: +SKIP
     """
-    loader = jinja2.FileSystemLoader(str(resources.files("fusion.report") / "templates"))
-    environment = jinja2.Environment(
-        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
-    )
-    environment.filters["number"] = number
     if "record" in datasets:
-        return environment.get_template("record.html.j2").render(
+        return render_page(
+            "record.html.j2",
+            {},
             results=results,
             provenance=provenance,
             summary=record_section.describe_record(results, provenance, datasets["record"]),
-            figures={
+            drawings={
                 name: _svg_text(draw, name) for name, draw in record_section.draw_record(datasets["record"]).items()
             },
         )
-    return environment.get_template("report.html.j2").render(
+    return render_page(
+        "report.html.j2",
+        _draw_charts(datasets),
         results=results,
         provenance=provenance,
         summary=summary_section.describe_campaign(results, provenance, datasets, joint),
-        figures=_draw_figures(results, datasets),
+        drawings=_draw_figures(results, datasets),
         maps=_embed_maps(datasets["fields"], results) if "fields" in datasets else None,
     )
+
+
+def _draw_charts(datasets: Mapping[str, Any]) -> dict[str, Chart]:
+    """Return every chart that the data allow, by name."""
+    charts: dict[str, Chart] = {}
+    if "deviations" in datasets:
+        deviations = datasets["deviations"]
+        drift = group(deviations, "drift")
+        charts["drift"] = plot_drift(drift, deviations)
+        charts["profile"] = plot_profile(drift, deviations["position"])
+    return charts
 
 
 def _draw_figures(results: Results, datasets: Mapping[str, Any]) -> dict[str, str]:
@@ -134,8 +144,6 @@ def _drift_charts(results: Results, deviations: xr.Dataset) -> dict[str, Callabl
         "mean_differences": lambda: figures.plot_mutual_deviations(group(deviations, "neighbours")),
         "chart": lambda: figures.plot_reference_chart(chart.assign(position=position.sel(target=chart["target"]))),
         "windows": lambda: plots_model.plot_windows(group(deviations, "iso")),
-        "drift": lambda: plots_model.plot_drift(drift, deviations),
-        "profile": lambda: plots_model.plot_profile(drift, position),
         "reversal": lambda: plots_model.plot_reversal(drift, position),
         "anomalies": lambda: plots_model.plot_position_scatter(drift, flagged),
     }

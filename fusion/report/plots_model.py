@@ -14,7 +14,6 @@ from interferometry.figures import (
     INK,
     MARKERS,
     MUTED,
-    TIME_MAP,
     hours_since_start,
     new_axes,
 )
@@ -23,62 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _BEFORE = "#9aa7ad"
-
-
-def plot_profile(drift: xr.Dataset, position: xr.DataArray, *, ax: Axes | None = None) -> Axes:
-    """Plot the drift-free profile of both approaches with its 95 % band.
-
-    Parameters
-    ----------
-    drift : Dataset
-        Group ``drift`` of deviations.nc.
-    position : (target,) DataArray
-        Target positions, mm.
-    ax : Axes, optional
-        Axes to draw into; left out: those of a new figure.
-    """
-    ax = new_axes(ax)
-    for direction in drift["direction"].values:
-        row = drift.sel(direction=direction)
-        value, band = row["profile"], 2 * row["profile_u"]
-        ax.plot(position, value, MARKERS[direction], linestyle="-", color=COLOURS[direction], label=ARROWS[direction])
-        ax.fill_between(position, value - band, value + band, color=COLOURS[direction], alpha=0.18, linewidth=0)
-    ax.set(xlabel="position / mm", ylabel="profile / µm")
-    ax.legend()
-    return ax
-
-
-def plot_drift(drift: xr.Dataset, deviations: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot the drift of every position over time, mean of both approaches, coloured by position.
-
-    Parameters
-    ----------
-    drift : Dataset
-        Group ``drift`` of deviations.nc.
-    deviations : Dataset
-        Content of deviations.nc.
-    ax : Axes, optional
-        Axes to draw into; left out: those of a new figure.
-    """
-    import matplotlib as mpl
-
-    ax = new_axes(ax)
-    hours = hours_since_start(deviations).mean("direction")
-    lines = drift["drift"].mean("direction")
-    position = deviations["position"].values
-    low, high = float(position.min()), float(position.max())
-    colour = mpl.colormaps[TIME_MAP]
-    for target, place in zip(deviations["target"].values, position, strict=True):
-        ax.plot(
-            hours.sel(target=target),
-            lines.sel(target=target),
-            color=colour(0.95 * (place - low) / (high - low)),
-            linewidth=0.9,
-        )
-    scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(low, high), TIME_MAP)
-    ax.figure.colorbar(scale, ax=ax, label="position / mm", pad=0.02, aspect=30).outline.set_visible(False)
-    ax.set(xlabel="time since first reading / h", ylabel="drift / µm")
-    return ax
 
 
 def plot_reversal(drift: xr.Dataset, position: xr.DataArray, *, ax: Axes | None = None) -> Axes:

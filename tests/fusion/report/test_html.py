@@ -70,7 +70,7 @@ def test_every_section_and_figure_is_there(opened: tuple[Page, list[str]]) -> No
         "glossary",
     ):
         assert page.locator(f"section#{section}").count() == 1, section
-    figures = page.locator("figure svg")
+    figures = page.locator("figure svg, figure .drawing")
     assert figures.count() >= 18
     for at in range(figures.count()):
         box = figures.nth(at).bounding_box()

@@ -23,13 +23,10 @@ def loop(results_folder: Path) -> xr.Dataset:
     return group(read_dataset(results_folder / "fusion.nc"), "loop")
 
 
-def test_profile_and_reversal_are_those_of_the_joint_estimate(deviations: xr.Dataset) -> None:
+def test_reversal_is_that_of_the_joint_estimate(deviations: xr.Dataset) -> None:
     drift = group(deviations, "drift")
-    ax = plots_model.plot_profile(drift, deviations["position"])
-    np.testing.assert_array_equal(ax.lines[0].get_ydata(), drift["profile"].sel(direction="positive"))
     ax = plots_model.plot_reversal(drift, deviations["position"])
     np.testing.assert_array_equal(ax.lines[0].get_ydata(), drift["reversal"])
-    assert len(plots_model.plot_drift(drift, deviations).lines) == deviations.sizes["target"]
 
 
 def test_flagged_positions_are_shaded(deviations: xr.Dataset) -> None:

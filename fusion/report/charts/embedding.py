@@ -1,0 +1,103 @@
+"""Charts in a page: the scripts once, each chart with its caption, its text alternative and its data."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+from bokeh.embed import json_item
+from bokeh.models import ColumnDataSource, Plot
+from markupsafe import Markup
+
+from fusion.report.charts.style import Chart
+
+
+@dataclass(frozen=True)
+class EmbeddedChart:
+    """A chart as the macro ``draw`` of ``templates/charts.html.j2`` reads it.
+
+    Attributes
+    ----------
+    name : str
+        Unique in its page; a word of letters, digits and underscores.
+    seen : str
+        Text alternative.
+    height : int
+        CSS px that are kept free until it is drawn.
+    item : Markup
+        Bokeh's document as JSON that may stand in a ``<script>``.
+    """
+
+    name: str
+    seen: str
+    height: int
+    item: Markup
+
+
+def embed(charts: Mapping[str, Chart]) -> dict[str, EmbeddedChart]:
+    """Return charts ready for a template.
+
+    Parameters
+    ----------
+    charts : mapping of str to Chart
+        By name; a name is unique in its page.
+
+    Returns
+    -------
+    dict of str to EmbeddedChart
+        For the variable ``figures`` of a template, which puts each in its place with ``{{ draw(name, caption) }}`` of
+        ``charts.html.j2`` and ends with ``{{ chart_scripts() }}``.
+
+    Notes
+    -----
+    The columns for download travel in the Bokeh document (as its tag), compressed like every array in it; text in them is protected
+    against being read as a formula when the file is written.
+    """
+    return {name: _embedded(name, chart) for name, chart in charts.items()}
+
+
+def _embedded(name: str, chart: Chart) -> EmbeddedChart:
+    columns = {heading: _compact(np.asarray(values)) for heading, values in chart.columns.items()}
+    chart.figure.tags = [ColumnDataSource(columns)]
+    text = json.dumps(json_item(chart.figure, f"drawing-{name}"), separators=(",", ":"))
+    return EmbeddedChart(name, chart.seen, _height(chart), _in_script(text, "</"))
+
+
+def _compact(values: np.ndarray) -> np.ndarray:
+    """Return a column as it travels: numbers in single precision (seven digits), everything else as text."""
+    if values.dtype.kind in "fiub":
+        return values.astype(np.float32 if values.dtype.kind == "f" else np.int32)
+    return values.astype(str).astype(object)
+
+
+def _height(chart: Chart) -> int:
+    """Return the height of a chart in CSS px: its own, or the sum of what a column of charts holds."""
+    own = chart.figure.height
+    return int(own) if own is not None else sum(int(part.height or 0) for part in chart.figure.select({"type": Plot}))
+
+
+@cache
+def chart_scripts() -> Markup:
+    """Return BokehJS and what draws the charts, as script elements; once per page, after the last chart.
+
+    Notes
+    -----
+    BokehJS is the copy that the installed Bokeh brings (BSD-3-Clause), without its widgets and tables.
+    """
+    import bokeh
+
+    library = (Path(bokeh.__file__).parent / "server" / "static" / "js" / "bokeh.min.js").read_text(encoding="utf-8")
+    own = (resources.files("fusion.report") / "templates" / "charts.js").read_text(encoding="utf-8")
+    return Markup("").join(
+        Markup("<script>{}</script>\n").format(_in_script(text, "</script")) for text in (library, own)
+    )
+
+
+def _in_script(text: str, closing: str) -> Markup:
+    """Return a text that may stand in a script element: nothing in its strings closes the element."""
+    return Markup(text.replace(closing, closing.replace("</", "<\\/")))

@@ -1,0 +1,302 @@
+"""What all charts share: sizes, axes, colours that hold on white and for colour-blind readers, legends, hover."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from bokeh.models import (
+    ColorBar,
+    ColorMapper,
+    FixedTicker,
+    GlyphRenderer,
+    HoverTool,
+    LayoutDOM,
+    Legend,
+    PanTool,
+    Range1d,
+    WheelZoomTool,
+)
+from bokeh.plotting import figure
+
+from interferometry.figures import COLOURS, GRID, INK, MUTED
+
+#: Colours of named lines, each readable on white and told apart by colour-blind readers together with the dashes of `DASHES`.
+CATEGORIES = (COLOURS["positive"], COLOURS["negative"], "#6a3d9a", INK, "#4d7c0f", "#a0447f", "#1f66b0", "#7a5c00")
+DASHES = ("solid", "dashed", "dotdash", "dotted")
+#: Colour of what a model said before anything was added.
+BEFORE = "#76858c"
+#: Marker of each direction of approach.
+MARKERS = {"positive": "triangle", "negative": "inverted_triangle"}
+#: Perceptually uniform scale for quantities, and a diverging one with its middle at zero; both hold for colour-blind readers.
+SEQUENTIAL, DIVERGING = "inferno", "RdBu_r"
+#: Share of the scale of ordered lines that is dark enough to be read on white (contrast of at least 3 : 1).
+_DARK_SHARE = 0.6
+_FONT = "system-ui, Segoe UI, Roboto, Helvetica Neue, DejaVu Sans, sans-serif"
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart as a page shows it.
+
+    Attributes
+    ----------
+    figure : LayoutDOM
+        Bokeh figure, or a layout of several.
+    seen : str
+        One sentence that says what is seen, for readers who do not see it: extent, extremes, direction of change.
+    columns : mapping of str to sequence
+        What the reader can download: heading with unit, values; all of one length.
+    """
+
+    figure: LayoutDOM
+    seen: str
+    columns: Mapping[str, Sequence[Any] | np.ndarray]
+
+
+def new_figure(
+    *,
+    x: str,
+    y: str,
+    title: str = "",
+    height: int = 320,
+    x_range: tuple[float, float] | Sequence[str] | None = None,
+    y_range: tuple[float, float] | Sequence[str] | None = None,
+    x_type: str = "auto",
+    y_type: str = "auto",
+    legend_columns: int = 2,
+    like: figure | None = None,
+) -> figure:
+    """Return an empty figure in the common style: as wide as its place in the page, legend above the data.
+
+    Parameters
+    ----------
+    x, y : str
+        Labels of the axes, "quantity / unit".
+    title : str
+        Above the legend; empty: none.
+    height : int
+        CSS px.
+    x_range, y_range : tuple of float or sequence of str, optional
+        Ends of an axis, or its categories; None: from the data.
+    x_type, y_type : {"auto", "linear", "log", "datetime"}
+        Scale of an axis. A logarithmic one is announced in its label.
+    legend_columns : int
+        Entries of the legend beside each other; two fit on a phone.
+    like : figure, optional
+        Shares both ranges with this one, so that several figures zoom together.
+
+    Returns
+    -------
+    bokeh.plotting.figure
+        Pan and wheel zoom are there but not active: scrolling over a chart scrolls the page until the reader switches them on.
+    """
+    ranges: dict[str, Any] = {"x_range": x_range, "y_range": y_range}
+    if like is not None:
+        ranges = {"x_range": like.x_range, "y_range": like.y_range}
+    drawn = figure(
+        height=height, sizing_mode="stretch_width", tools="", toolbar_location=None, title=title or None,
+        x_axis_label=_announced(x, x_type), y_axis_label=_announced(y, y_type), x_axis_type=x_type, y_axis_type=y_type,
+        background_fill_color="#ffffff", border_fill_color="#ffffff", outline_line_color=None, min_border_right=14,
+        **{name: given for name, given in ranges.items() if given is not None},
+    )  # fmt: skip
+    drawn.add_tools(PanTool(), WheelZoomTool())
+    drawn.toolbar.active_drag = drawn.toolbar.active_scroll = None
+    for axis in drawn.axis:
+        axis.update(
+            axis_label_text_font=_FONT, axis_label_text_font_size="12px", axis_label_text_font_style="normal",
+            axis_label_text_color=INK, major_label_text_font=_FONT, major_label_text_font_size="11px",
+            major_label_text_color=INK, axis_line_color=MUTED, major_tick_line_color=MUTED, minor_tick_line_color=None,
+        )  # fmt: skip
+    drawn.grid.grid_line_color = GRID
+    if title:
+        drawn.title.update(text_font=_FONT, text_font_size="13px", text_color=INK)
+    drawn.add_layout(
+        Legend(
+            orientation="horizontal", ncols=legend_columns, border_line_color=None, background_fill_alpha=0.0, margin=0, padding=2,
+            label_text_font=_FONT, label_text_font_size="11px", label_text_color=INK, click_policy="hide", spacing=8, label_height=14,
+        ),
+        "above",
+    )  # fmt: skip
+    return drawn
+
+
+def _announced(label: str, scale: str) -> str:
+    return f"{label} (logarithmic)" if scale == "log" else label
+
+
+def add_hover(
+    drawn: figure, tips: Sequence[tuple[str, str]], renderers: Sequence[GlyphRenderer], *, mode: str = "mouse"
+) -> None:
+    """Show the values under the pointer.
+
+    Parameters
+    ----------
+    drawn : figure
+        The chart.
+    tips : sequence of (str, str)
+        Name and Bokeh format of each value, such as ``("drift", "@y{0.00} µm")``.
+    renderers : sequence of GlyphRenderer
+        What answers.
+    mode : {"mouse", "vline"}
+        Whether the pointer must be on a mark, or only at its place along x.
+    """
+    drawn.add_tools(HoverTool(tooltips=list(tips), renderers=list(renderers), mode=mode))
+
+
+def add_zero_line(drawn: figure) -> None:
+    """Draw the line of zero.
+
+    Parameters
+    ----------
+    drawn : figure
+        The chart.
+    """
+    drawn.hspan(0.0, line_color=MUTED, line_width=1, level="underlay")
+
+
+def add_band(drawn: figure, x: np.ndarray, low: np.ndarray, high: np.ndarray, colour: str, **options: Any) -> None:
+    """Shade what lies between two lines; a gap in either is a gap.
+
+    Parameters
+    ----------
+    drawn : figure
+        The chart.
+    x, low, high : (n,) ndarray
+        Units of the axes.
+    colour : str
+        CSS colour.
+    **options
+        Further properties of the shade, such as ``legend_label``.
+    """
+    x, low, high = (np.asarray(values, float) for values in (x, low, high))
+    valid = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
+    for piece in np.split(np.arange(x.size), np.flatnonzero(np.diff(valid.astype(int))) + 1):
+        if piece.size and valid[piece[0]]:
+            drawn.varea(
+                x=x[piece],
+                y1=low[piece],
+                y2=high[piece],
+                fill_color=colour,
+                fill_alpha=0.18,
+                level="underlay",
+                **options,
+            )
+
+
+def add_colour_bar(
+    drawn: figure, mapper: ColorMapper, label: str, *, ticks: Sequence[float] | None = None, place: str = "below"
+) -> None:
+    """Put the scale of the colours beside a map or ordered lines.
+
+    Parameters
+    ----------
+    drawn : figure
+        The chart.
+    mapper : ColorMapper
+        Its colours.
+    label : str
+        "quantity / unit".
+    ticks : sequence of float, optional
+        Where it is labelled; None: Bokeh chooses.
+    place : {"below", "right"}
+    """
+    bar = ColorBar(
+        color_mapper=mapper, title=label, width="auto" if place == "below" else 10, height=10 if place == "below" else "auto",
+        title_text_font=_FONT, title_text_font_size="11px", title_text_font_style="normal", title_text_color=INK,
+        major_label_text_font=_FONT, major_label_text_font_size="11px", major_label_text_color=INK, bar_line_color=None,
+        major_tick_line_color=MUTED, background_fill_color=None, padding=4,
+        **({} if ticks is None else {"ticker": FixedTicker(ticks=list(ticks))}),
+    )  # fmt: skip
+    drawn.add_layout(bar, place)
+
+
+def palette(name: str = SEQUENTIAL, steps: int = 256) -> list[str]:
+    """Return the colours of a scale from low to high.
+
+    Parameters
+    ----------
+    name : str
+        Name of a matplotlib colour map.
+    steps : int
+        Number of colours.
+    """
+    import matplotlib as mpl
+
+    return [mpl.colors.to_hex(colour) for colour in mpl.colormaps[name](np.linspace(0.0, 1.0, steps))]
+
+
+def ordered_colours(count: int) -> list[str]:
+    """Return the colours of lines that have an order, such as cycles or positions, from dark to lighter.
+
+    Parameters
+    ----------
+    count : int
+        Number of lines.
+
+    Notes
+    -----
+    The first 60 % of viridis: the rest is too pale for a line on white (contrast below 3 : 1, WCAG 2.2, 1.4.11).
+    """
+    import matplotlib as mpl
+
+    shades = mpl.colormaps["viridis"](np.linspace(0.0, _DARK_SHARE, count))
+    return [mpl.colors.to_hex(shade) for shade in shades]
+
+
+def shared_range(*values: np.ndarray, symmetrical: bool = False) -> tuple[float, float]:
+    """Return one range for charts that are compared: all values with a margin of 4 %.
+
+    Parameters
+    ----------
+    *values : ndarray
+        What the charts show; NaN are left out.
+    symmetrical : bool
+        Whether zero is in the middle.
+    """
+    every = np.concatenate([np.ravel(part) for part in values])
+    every = every[np.isfinite(every)]
+    low, high = (float(every.min()), float(every.max())) if every.size else (0.0, 1.0)
+    if symmetrical:
+        high = max(abs(low), abs(high))
+        low = -high
+    margin = 0.04 * (high - low) or 0.5
+    return low - margin, high + margin
+
+
+def fix_range(drawn: figure, low: float, high: float) -> None:
+    """Set the y range of a chart.
+
+    Parameters
+    ----------
+    drawn : figure
+        The chart.
+    low, high : float
+        Ends, in the unit of the axis.
+    """
+    drawn.y_range = Range1d(low, high)
+
+
+def span_words(values: np.ndarray | xr.DataArray, unit: str) -> str:
+    """Return the smallest and the largest value in words, for text alternatives.
+
+    Parameters
+    ----------
+    values : array_like
+        NaN are left out.
+    unit : str
+        As it is printed.
+
+    Examples
+    --------
+    >>> span_words(np.array([-1.25, 3.0]), "µm")
+    '−1.25 to 3.00 µm'
+    """
+    every = np.asarray(values, float)
+    if not np.isfinite(every).any():
+        return "without values"
+    low, high = float(np.nanmin(every)), float(np.nanmax(every))
+    return f"{low:.2f} to {high:.2f} {unit}".replace("-", "−")

@@ -1,0 +1,78 @@
+"use strict";
+// Every chart is drawn when it comes near the window, the others while the browser is idle; on paper each is a drawing in SVG.
+(() => {
+  const figures = [...document.querySelectorAll("figure.chart")];
+  const started = new Map(), roots = new Map();  // figure -> promise of its view, and the view once it is there
+  function draw(figure) {
+    if (!started.has(figure)) {
+      const item = JSON.parse(figure.querySelector("script").textContent);
+      started.set(figure, Bokeh.embed.embed_item(item).then((views) => {
+        roots.set(figure, [...views.roots][0]);
+        return roots.get(figure);
+      }));
+    }
+    return started.get(figure);
+  }
+  const plots = (view) => view.model.type === "Figure" ? [view] : view.child_views.flatMap(plots);
+
+  const near = new IntersectionObserver((entries) => {
+    for (const entry of entries) if (entry.isIntersecting) { near.unobserve(entry.target); draw(entry.target); }
+  }, { rootMargin: "600px" });
+  figures.forEach((figure) => near.observe(figure));
+  const idle = window.requestIdleCallback || ((work) => setTimeout(work, 50));
+  function drawRest() {
+    const next = figures.find((figure) => !started.has(figure));
+    if (next) draw(next).then(() => idle(drawRest)); else document.documentElement.dataset.charts = "drawn";
+  }
+  window.addEventListener("load", () => idle(drawRest));
+
+  function save(content, type, name) {
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(new Blob([content], { type }));
+    link.download = name; link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+  }
+  function cell(value) {  // text that a spreadsheet would take for a formula gets an apostrophe
+    if (typeof value === "number") return Number.isFinite(value) ? String(Number(value.toPrecision(7))) : "";
+    const text = /^[=+\-@\t\r]/.test(value) ? `'${value}` : String(value);
+    return /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
+  }
+  function table(columns) {
+    const headings = [...columns.keys()], values = [...columns.values()];
+    const lines = [headings.map(cell).join(",")];
+    for (let row = 0; row < (values[0] ?? []).length; row++) lines.push(values.map((column) => cell(column[row])).join(","));
+    return `\ufeff${lines.join("\r\n")}\r\n`;
+  }
+  const actions = {
+    zoom(figure, view, button) {
+      const active = button.getAttribute("aria-pressed") !== "true";
+      button.setAttribute("aria-pressed", active);
+      for (const plot of plots(view)) for (const tool of plot.model.toolbar.tools) {
+        if (["PanTool", "WheelZoomTool"].includes(tool.type)) tool.active = active;
+      }
+    },
+    reset(figure, view) { plots(view).forEach((plot) => plot.reset()); },
+    async image(figure, view) { save(await view.export("png").to_blob(), "image/png", `${figure.id}.png`); },
+    data(figure, view) {
+      const columns = view.model.tags[0].data;
+      save(table(columns instanceof Map ? columns : new Map(Object.entries(columns))), "text/csv;charset=utf-8", `${figure.id}.csv`);
+    },
+  };
+  for (const figure of figures) figure.querySelector(".tools").addEventListener("click", async (event) => {
+    const button = event.target.closest("button");
+    if (button) actions[button.dataset.do](figure, await draw(figure), button);
+  });
+
+  window.addEventListener("beforeprint", () => {
+    for (const [figure, view] of roots) {
+      const drawing = view.export("svg", false).ctx.get_svg();
+      const [width, height] = [view.bbox.width, view.bbox.height];
+      if (!width) continue;
+      drawing.setAttribute("viewBox", `0 0 ${width} ${height}`);
+      drawing.removeAttribute("width"); drawing.removeAttribute("height");
+      drawing.classList.add("printed"); drawing.setAttribute("aria-hidden", "true");
+      figure.querySelector(".drawing").after(drawing);
+    }
+  });
+  window.addEventListener("afterprint", () => document.querySelectorAll("svg.printed").forEach((drawing) => drawing.remove()));
+})();

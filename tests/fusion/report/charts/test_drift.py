@@ -1,0 +1,59 @@
+"""Drift and profile: the lines are the numbers of the products, the text says what is seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from fusion.report.charts.drift import plot_drift, plot_profile
+
+
+@pytest.fixture
+def readings() -> tuple[xr.Dataset, xr.Dataset]:
+    """Group drift and deviations of 3 cycles and 2 targets (at 100 and 0 mm): the drift is the cycle at 100 mm and half of it at 0."""
+    cycle, target, direction = [1, 2, 3], [1, 2], ["positive", "negative"]
+    value = np.broadcast_to(np.array([0.0, 1.0, 2.0])[:, None, None] * np.array([1.0, 0.5]), (3, 2, 2))
+    dims = ("cycle", "direction", "target")
+    start = np.datetime64("2026-03-09T06:00", "ns")
+    time = start + (np.arange(3)[:, None, None] * np.timedelta64(60, "m")) + np.zeros((3, 2, 2), "timedelta64[ns]")
+    coords = {"cycle": cycle, "direction": direction, "target": target}
+    drift = xr.Dataset(
+        {
+            "drift": (dims, value),
+            "drift_u": (dims, np.full((3, 2, 2), 0.1)),
+            "profile": (("direction", "target"), [[4.0, 0.0], [3.0, -1.0]]),
+            "profile_u": (("direction", "target"), np.full((2, 2), 0.25)),
+        },
+        coords,
+    )
+    deviations = xr.Dataset({"time": (dims, time), "position": (("target",), [100.0, 0.0])}, coords)
+    return drift, deviations
+
+
+def test_drift_of_every_position(readings: tuple[xr.Dataset, xr.Dataset]) -> None:
+    chart = plot_drift(*readings)
+    (lines,) = [r for r in chart.figure.renderers if "position" in r.data_source.data]
+    assert lines.data_source.data["position"].tolist() == [0.0, 100.0]
+    assert [line.tolist() for line in lines.data_source.data["drift"]] == [[0.0, 0.5, 1.0], [0.0, 1.0, 2.0]]
+    assert lines.data_source.data["hours"][0].tolist() == [0.0, 1.0, 2.0]
+    assert chart.figure.yaxis.axis_label == "drift / µm"
+    assert chart.seen == (
+        "Drift of 2 positions over 2.0 h: 0.00 to 2.00 µm; from the first to the last cycle it changes by 1.5 µm on average, "
+        "and the largest drift is at 100 mm."
+    )
+    assert chart.columns["cycle"].tolist() == [1, 1, 2, 2, 3, 3]
+    np.testing.assert_allclose(chart.columns["95 % band ± / µm"], 0.2)
+
+
+def test_profile_with_its_band(readings: tuple[xr.Dataset, xr.Dataset]) -> None:
+    drift, deviations = readings
+    chart = plot_profile(drift, deviations["position"])
+    points = [r for r in chart.figure.renderers if "half" in r.data_source.data]
+    assert points[0].data_source.data["y"].tolist() == [0.0, 4.0]
+    assert points[0].data_source.data["half"].tolist() == [0.5, 0.5]
+    assert list(chart.columns)[1] == "profile, positive approach / µm"
+    assert chart.seen == (
+        "Drift-free deviation over 0.00 to 100.00 mm of the axis: positive approach 0.00 to 4.00 µm; "
+        "negative approach −1.00 to 3.00 µm."
+    )
