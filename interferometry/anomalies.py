@@ -4,9 +4,10 @@ Everything is tested on the random part of the joint estimate, which belongs to 
 positions would belong to two. Null distributions come from permutations of the readings themselves, so that heavy tails do not raise
 false alarms, and every p-value is family-wise: corrected for all positions, directions and kinds of anomaly.
 
-Two questions about scatter are kept apart: "do the positions scatter unequally?" (permutation test, robust against tails) and "does one
-stand out from the natural spread of the others?" (generalised extreme Studentized deviate test). A position with excess scatter is an
-anomaly of the machine only if both say so.
+Two questions are kept apart: "do the positions behave unequally?" (scatter: permutation test, robust against tails; motion: permutation of
+the cycles) and "does one stand out from the natural spread of the others?" (generalised extreme Studentized deviate test). A position is an
+anomaly of the machine only if both say so: scatter differs from position to position, and a drift whose shape the model does not hold moves
+all positions a little.
 
 In this order: the public test; excess scatter; motions over the cycles; the generalised extreme Studentized deviate test.
 """
@@ -38,9 +39,9 @@ BLOCK_CYCLES = 5
 #: Shortest test and shortest series that are examined for motion over the cycles.
 SHORTEST_TEST_CYCLES = 15
 MOST_ANOMALIES = 4
-#: Levels of the tests whether a target's scatter stands out, both directions together and either alone. An
-#: anomaly must also be significant by permutation, so that their sum is not the probability of a false one.
-ESD_LEVELS = {"together": 0.05, "single": 0.015}
+#: Levels of the tests whether a target stands out from the others: by its scatter, both directions together and either alone, and by its
+#: motion over the cycles. Scatter that differs naturally is significant by permutation, so that the first two must share 0.05.
+ESD_LEVELS = {"together": 0.035, "single": 0.01, "motion": 0.02}
 #: Level at which the remainder of a step is still called slow.
 SLOW_REMAINDER_LEVEL = 0.01
 
@@ -64,8 +65,8 @@ class Anomaly:
     extra_um : float
         Standard deviation beyond that of the other positions, um; the height of a step, the amplitude of a period.
     stands_out : bool
-        Whether scatter exceeds its natural spread between positions (generalised extreme Studentized deviate test, 5 %). Always true
-        of the other kinds, which no spread of scatter can produce.
+        Whether the scatter, or the strength of the motion, exceeds its natural spread between positions (generalised extreme Studentized
+        deviate test at `ESD_LEVELS`).
     at_cycle : int or None
         Number of the first cycle after a step; None for other kinds.
     period_s : float or None
@@ -306,11 +307,22 @@ def _series_anomalies(
             if p[row] <= level * WEIGHTS[kind] and target not in best:
                 best[target] = (float(p[row]) / WEIGHTS[kind], int(row))
         significant[kind] = best
+    apart = {kind: _moving_apart(labels, strength) for kind, (strength, _) in tests.items()}
     anomalies = []
     for kind, target in _one_kind_per_target(significant, values):
         p_value, row = significant[kind][target]
-        anomalies.append(_describe_series(estimated, kind, labels[row], values[row], min(p_value, 1.0), periodogram))
+        significance = (min(p_value, 1.0), target in apart[kind])
+        anomalies.append(_describe_series(estimated, kind, labels[row], values[row], significance, periodogram))
     return anomalies
+
+
+def _moving_apart(labels: list[_Series], strength: Array) -> set[int]:
+    """Targets (indices) whose strongest series exceeds the natural spread of the other targets' strongest."""
+    target = np.array([label.target for label in labels])
+    targets = np.unique(target)
+    strongest = np.array([strength[target == one].max() for one in targets])
+    marked = generalised_esd(strongest, most=MOST_ANOMALIES, level=ESD_LEVELS["motion"], high_only=True)
+    return set(targets[marked].tolist())
 
 
 def _permutation_test(
@@ -426,8 +438,15 @@ def _one_kind_per_target(significant: dict[str, dict[int, tuple[float, int]]], v
 
 
 def _describe_series(
-    estimated: xr.Dataset, kind: str, label: _Series, row: Array, p_value: float, periodogram: _Periodogram
+    estimated: xr.Dataset,
+    kind: str,
+    label: _Series,
+    row: Array,
+    significance: tuple[float, bool],
+    periodogram: _Periodogram,
 ) -> Anomaly:
+    """Return the anomaly of a series (cycle,); `significance` is its p-value and whether it stands out."""
+    p_value, stands_out = significance
     scatter = _scatter_of(estimated, label.target, label.direction)
     scale = scatter / (np.sqrt(2) if label.direction == "both" else 1.0)
     at_cycle, period_s = None, None
@@ -450,7 +469,7 @@ def _describe_series(
         p_value=p_value,
         scatter_um=scatter,
         extra_um=extra,
-        stands_out=True,
+        stands_out=stands_out,
         at_cycle=at_cycle,
         period_s=period_s,
     )

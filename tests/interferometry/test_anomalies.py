@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from interferometry.anomalies import Anomaly, _scatter_direction, detect_anomalies, generalised_esd
+from interferometry.anomalies import (
+    Anomaly,
+    _moving_apart,
+    _scatter_direction,
+    _Series,
+    detect_anomalies,
+    generalised_esd,
+)
 from interferometry.drift.estimate import estimate_drift
 from interferometry.errors import InterferometryError
 from tests.interferometry.simulated_campaigns import SIGMA_UM, simulate
@@ -139,6 +146,15 @@ def test_noise_with_memory_that_all_positions_have_makes_no_anomaly() -> None:
         flagged += any(anomaly.stands_out for anomaly in detect_anomalies(estimate_drift(deviations), deviations))
     # At 5 % two of six have a probability of 0.03; with cycles permuted as they are, five of six were flagged.
     assert flagged <= 1
+
+
+def test_a_motion_stands_out_only_where_it_exceeds_those_of_the_other_positions(rng: np.random.Generator) -> None:
+    rows = rng.standard_normal(16)
+    labels = [_Series(target, direction) for target in range(16) for direction in ("positive", "negative")]
+    alone, common = np.repeat(rows, 2), np.repeat(rows + 6.0, 2)
+    alone[2 * 4] += 6.0
+    assert _moving_apart(labels, alone) == {4}
+    assert _moving_apart(labels, common) == set()
 
 
 def test_a_direction_without_any_scatter_leaves_the_excess_to_the_other() -> None:
