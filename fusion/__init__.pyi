@@ -7,7 +7,7 @@ from .errors import FusionError
 from .loop.axis import close_loop
 from .pipeline.run import run_campaign
 from .products.results import results_schema
-from .report.exports import export_results
+from .report.exports.export import export_results
 from .report.html import render_report
 from .twin.instruments import simulate_campaign
 

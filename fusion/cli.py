@@ -32,8 +32,10 @@ class ExportFormat(StrEnum):
     """What `export` can write."""
 
     csv = "csv"
+    xlsx = "xlsx"
     linuxcnc = "linuxcnc"
     siemens840d = "siemens840d"
+    siemens840d_temperature = "siemens840d-temperature"
     heidenhain = "heidenhain"
     renishaw = "renishaw"
 
@@ -193,15 +195,44 @@ def export(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Results folder of a run.")],
     format: Annotated[ExportFormat, typer.Option("--format", help="What to write.")],
     out: Annotated[Path | None, typer.Option(help="Folder for the files; left out: RESULTS/export.")] = None,
+    axis: Annotated[
+        str | None, typer.Option(help="Name of the axis in the control; left out: the campaign's axis.")
+    ] = None,
+    spacing: Annotated[
+        str | None, typer.Option(help='Distance of the points of the table, "25 mm"; left out: the targets.')
+    ] = None,
+    reference: Annotated[
+        str | None, typer.Option(help='Position at which the correction is zero, "0 mm"; left out: the first target.')
+    ] = None,
+    fields: Annotated[bool, typer.Option("--fields", help="With csv: the fields too, a large file.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Write a compensation table although something speaks against it.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
-    """Export tables, or a control's compensation.
+    """Export tables, a workbook, or a control's compensation.
 
-    Drift, profile and fields as CSV, or the drift-free profile as the compensation table of a control.
+    A compensation table is written where the drift is explained and the inputs are sound, with a header that says in which thermal
+    state it holds and how to try it.
     """
-    from fusion.report.exports import export_results
+    from fusion.campaign.quantities import read_quantity
+    from fusion.report.exports.export import export_results
 
     with _answering():
-        for path in export_results(results, format.value, out or results / "export"):
+        exported = export_results(
+            results,
+            format.value,
+            out or results / "export",
+            axis=axis,
+            spacing_mm=None if spacing is None else read_quantity(spacing, "mm"),
+            reference_mm=None if reference is None else read_quantity(reference, "mm"),
+            fields=fields,
+            force=force,
+            overwrite=overwrite,
+        )
+        for remark in exported.remarks:
+            errors.print(f"thermofuse: {remark}", highlight=False, markup=False)
+        for path in exported.files:
             console.print(str(path), soft_wrap=True, highlight=False)
 
 
