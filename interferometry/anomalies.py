@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -71,6 +71,8 @@ class Anomaly:
         Number of the first cycle after a step; None for other kinds.
     period_s : float or None
         Period of a periodic motion, s; None for other kinds.
+    least_p_value : float
+        Smallest p-value that the number of permutations can show; 0 of a periodic motion, whose p-value is calculated.
     """
 
     target: int
@@ -82,6 +84,7 @@ class Anomaly:
     stands_out: bool
     at_cycle: int | None = None
     period_s: float | None = None
+    least_p_value: float = 0.0
 
 
 def detect_anomalies(
@@ -180,6 +183,7 @@ def _scatter_anomalies(
                 scatter_um=scatter_um,
                 extra_um=float(np.sqrt(max(scatter_um**2 - typical**2, 0.0))),
                 stands_out=bool(stands_out[target] and scatter[target] > typical),
+                least_p_value=_least_p_value("scatter", permutations),
             )
         )
         pool = others
@@ -312,8 +316,14 @@ def _series_anomalies(
     for kind, target in _one_kind_per_target(significant, values):
         p_value, row = significant[kind][target]
         significance = (min(p_value, 1.0), target in apart[kind])
-        anomalies.append(_describe_series(estimated, kind, labels[row], values[row], significance, periodogram))
+        described = _describe_series(estimated, kind, labels[row], values[row], significance, periodogram)
+        anomalies.append(replace(described, least_p_value=_least_p_value(kind, permutations)))
     return anomalies
+
+
+def _least_p_value(kind: str, permutations: int) -> float:
+    """Return the smallest p-value that permutations can show with this kind's share of the error probability."""
+    return 0.0 if kind == "periodic" else 1.0 / (permutations + 1) / WEIGHTS[kind]
 
 
 def _moving_apart(labels: list[_Series], strength: Array) -> set[int]:

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from fusion._typing import Array
+from fusion.attribution.areas import IN_MODE, Area, area_of
 from fusion.attribution.family_wise import LEVEL
 
 #: A place explains the drift as well as the leading one if its likelihood ratio is lower by no more than this (chi-square, 1
 #: degree of freedom, 0.95).
 _EQUAL_RATIO = 3.84
-#: Cells that reach at least this share of the peak of a mode belong to its place.
-_IN_MODE = 0.5
 #: Separate pieces of a mode that reach this share of its peak are places of their own.
 _PEAK = 0.7
 _QUANTITIES = ("p_value", "statistic", "sensitivity", "sensitivity_u", "lag", "detectable_sensitivity", "threshold")
@@ -54,6 +53,9 @@ class LeadingSource:
         Detection limit here, with 80 % power.
     width_mm : float, mm
         Largest distance of a cell of the leading place from (x, y).
+    area : Area or None
+        The leading place: cells of a mode with at least half of its strength, cells that explain the drift as well as the strongest one;
+        None for a region, which has an outline of its own.
     others_mm : tuple of (float, float), mm
         Other places (x, y) that explain the drift as well: these data cannot tell them from the leading one.
     """
@@ -70,6 +72,7 @@ class LeadingSource:
     lag_s: float
     detectable_um_per_K: float
     width_mm: float
+    area: Area | None
     others_mm: tuple[tuple[float, float], ...]
 
 
@@ -110,6 +113,7 @@ def find_source(maps: xr.DataTree) -> LeadingSource:
         lag_s=float(best["lag"]),
         detectable_um_per_K=float(best["detectable_sensitivity"]),
         width_mm=float(np.hypot(x[inside] - x_mm, y[inside] - y_mm).max(initial=0.0)),
+        area=area_of(inside, plan),
         others_mm=tuple(others),
     )
 
@@ -149,7 +153,7 @@ def _surroundings(
     modes = maps.children["modes"].to_dataset()
     pattern = np.abs(np.nan_to_num(modes["pattern"].sel(mode=int(best["mode"])).values))
     _, elsewhere = _split(pattern, pattern >= _PEAK, plan)
-    inside, _ = _split(pattern, pattern >= _IN_MODE, plan)
+    inside, _ = _split(pattern, pattern >= IN_MODE, plan)
     return inside, [*elsewhere, *others]
 
 

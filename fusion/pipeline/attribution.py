@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from fusion.attribution.areas import Area, area_of, mode_cells
 from fusion.attribution.attribute import correlate
 from fusion.attribution.contact_sensors import SensorChoice, choose_sensors
 from fusion.attribution.family_wise import LEVEL
@@ -55,10 +57,11 @@ def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, re
     field = fields["frame_temperature"].coarsen(x=block, y=block, boundary="trim").mean()
     spots = detect_hotspots(fields["temperature_rise"].isel(cycle=-1))
     report("correlation", 0, 100)
+    regions = [*source.regions, *_hotspot_regions(spots, field)]
     maps = correlate(
         fused,
         field,
-        regions=[*source.regions, *_hotspot_regions(spots, field)],
+        regions=regions,
         per_target=True,
         progress=lambda part: report("correlation", round(100 * part), 100),
     )
@@ -70,9 +73,11 @@ def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, re
     if source.duty is not None:
         schedule, law = source.duty
         maps["duty"] = xr.DataTree(randomisation_test(fused, schedule, law))
+    areas = _region_areas(regions, field)
+    named = {f"hotspot {k}": spot for k, spot in enumerate(spots, start=1)}
     parts = {
-        "hotspots": [_hotspot_part(f"hotspot {k}", spot, maps, fused, fields) for k, spot in enumerate(spots, start=1)],
-        "correlation": _correlation_part(maps, find_source(maps), fields),
+        "hotspots": [_hotspot_part(name, spot, maps, fused, fields) for name, spot in named.items()],
+        "correlation": _correlation_part(maps, find_source(maps), fields, areas),
     }
     return Outcome(maps, parts)
 
@@ -88,6 +93,12 @@ def _hotspot_regions(spots: Sequence[Hotspot], field: xr.DataArray) -> list[Regi
         if (region.cells(field) & seen).any():
             regions.append(region)
     return regions
+
+
+def _region_areas(regions: Sequence[Region], field: xr.DataArray) -> dict[str, Area | None]:
+    """The part of the plan that every region covers, by its name."""
+    plan, shape = field.to_dataset(name="field"), (field.sizes["y"], field.sizes["x"])
+    return {region.name: area_of(region.cells(field).reshape(shape), plan) for region in regions}
 
 
 def _describe_sensors(choice: SensorChoice) -> xr.Dataset:
@@ -111,11 +122,15 @@ def _describe_sensors(choice: SensorChoice) -> xr.Dataset:
     return dataset.assign_coords(sensor=np.arange(1, len(losses) + 1))
 
 
-def _correlation_part(maps: xr.DataTree, source: LeadingSource, fields: xr.Dataset) -> dict[str, Any]:
+def _correlation_part(
+    maps: xr.DataTree, source: LeadingSource, fields: xr.Dataset, regions: Mapping[str, Area | None]
+) -> dict[str, Any]:
     """The part ``correlation`` of results.json."""
     session = maps.to_dataset()
+    area = regions[source.name] if source.kind == "region" else source.area
     drift = session["unexplained_drift"]
     return {
+        "least_p": 1.0 / (int(maps.attrs["draws"]) + 1),
         "verdict": source.verdict,
         "excitation": str(maps.attrs["excitation"]),
         "false_alarm_rate": float(session["false_alarm_rate"]),
@@ -125,6 +140,7 @@ def _correlation_part(maps: xr.DataTree, source: LeadingSource, fields: xr.Datas
             "part": source.channel,
             "x_mm": source.x_mm,
             "y_mm": source.y_mm,
+            "area": area_json(area),
             "p_value": source.p_value,
             "sensitivity_um_per_K": scaled(
                 {"value": source.sensitivity_um_per_K, "u": source.sensitivity_u_um_per_K},
@@ -138,8 +154,8 @@ def _correlation_part(maps: xr.DataTree, source: LeadingSource, fields: xr.Datas
         "unexplained_drift_um_per_h": {
             str(name): float(drift.sel(channel=name)) for name in drift["channel"].values if name != "joint"
         },
-        "modes": _candidate_parts(maps, "modes", "mode", fields),
-        "regions": _candidate_parts(maps, "regions", "region", fields),
+        "modes": _candidate_parts(maps, "modes", "mode", fields, _mode_areas(maps)),
+        "regions": _candidate_parts(maps, "regions", "region", fields, regions),
         "sensors": _sensor_part(maps.children["sensors"].to_dataset()),
         "randomised_duty": _duty_part(maps.children["duty"].to_dataset()) if "duty" in maps.children else None,
     }
@@ -160,8 +176,33 @@ def _duty_part(duty: xr.Dataset) -> list[dict[str, Any]]:
     ]
 
 
-def _candidate_parts(maps: xr.DataTree, name: str, kind: str, fields: xr.Dataset) -> list[dict[str, Any]]:
-    """Modes or regions with their results for every part of the drift."""
+def area_json(area: Area | None) -> dict[str, float] | None:
+    """An area of the plan for results.json.
+
+    Parameters
+    ----------
+    area : Area or None
+        None of a place without cells.
+    """
+    return None if area is None else asdict(area)
+
+
+def _mode_areas(maps: xr.DataTree) -> dict[str, Area | None]:
+    """The area of every thermal mode, by its name."""
+    if "modes" not in maps.children:
+        return {}
+    modes = maps.children["modes"].to_dataset()
+    patterns = modes["pattern"].transpose("mode", "y", "x").values
+    return {
+        f"mode {number}": area_of(mode_cells(one), modes)
+        for number, one in zip(modes["mode"].values, patterns, strict=True)
+    }
+
+
+def _candidate_parts(
+    maps: xr.DataTree, name: str, kind: str, fields: xr.Dataset, areas: Mapping[str, Area | None]
+) -> list[dict[str, Any]]:
+    """Modes or regions with their areas and their results for every part of the drift."""
     if name not in maps.children:
         return []
     group = maps.children[name].to_dataset()
@@ -183,9 +224,8 @@ def _candidate_parts(maps: xr.DataTree, name: str, kind: str, fields: xr.Dataset
             if kind == "mode":
                 parts[channel]["p_beside_leader"] = float(found["p_beside"])
         label = f"mode {candidate[kind].item()}" if kind == "mode" else str(candidate[kind].item())
-        listed.append(
-            {"name": label, "x_mm": float(candidate["at_x"]), "y_mm": float(candidate["at_y"]), "parts": parts}
-        )
+        place = {"x_mm": float(candidate["at_x"]), "y_mm": float(candidate["at_y"]), "area": area_json(areas[label])}
+        listed.append({"name": label, **place, "parts": parts})
     return listed
 
 
@@ -223,8 +263,17 @@ def _hotspot_part(name: str, spot: Hotspot, maps: xr.DataTree, fused: xr.Dataset
             "lag_s": float(best["lag"]),
         }
     u = fields["temperature_rise_u"].isel(cycle=-1).sel(x=spot.x_mm, y=spot.y_mm, method="nearest")
-    peak = {"peak_rise_K": spot.peak_rise_K, "peak_rise_u_K": float(u)}
-    return {"x_mm": spot.x_mm, "y_mm": spot.y_mm, **peak, **tested}
+    return {
+        "name": name,
+        "x_mm": spot.x_mm,
+        "y_mm": spot.y_mm,
+        "centroid_x_mm": spot.centroid_x_mm,
+        "centroid_y_mm": spot.centroid_y_mm,
+        "area": area_json(Area(*spot.extent_mm)),
+        "peak_rise_K": spot.peak_rise_K,
+        "peak_rise_u_K": float(u),
+        **tested,
+    }
 
 
 def _driven_targets(maps: xr.DataTree, fused: xr.Dataset, region: str, best: xr.Dataset) -> list[int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -21,6 +22,7 @@ from fusion.loop.axis import close_loop, on_corrected_fields, set_aside_sites
 from fusion.loop.camera_correction import FieldFault, correct_fields, corrected_variables, find_field_errors
 from fusion.loop.result import LoopResult
 from fusion.model.fit import ModelFit, fit_model
+from fusion.pipeline.interferometry import utc
 from fusion.pipeline.positions import judge_positions, sites_of
 from fusion.pipeline.rise_scale import axis_scale_u, plan_scale_u, scale_coefficients, scale_evidence
 from fusion.products import store
@@ -88,17 +90,23 @@ def model_drift(
     result = set_aside_sites(result, sites_of(positions, deviations.sizes["target"]))
     report("anomalies", 1, 1)
     line = compare_lines(result.after, len(result.declared), correct_fields(fields, errors), source.axis)
+    loop = scale_coefficients(
+        result.as_json(),
+        effects,
+        axis_u=axis_scale_u(fields, source.axis, deviations["position"].values),
+        plan_u=plan_scale_u(fields),
+    )
     parts = {
         "anomalies": [
-            scale_evidence(position.as_json(), source.axis, fields, deviations["position"]) for position in positions
+            {
+                **scale_evidence(position.as_json(), source.axis, fields, deviations["position"]),
+                "position_mm": float(deviations["position"].sel(target=position.anomaly.target)),
+            }
+            for position in positions
         ],
         "loop": {
-            **scale_coefficients(
-                result.as_json(),
-                effects,
-                axis_u=axis_scale_u(fields, source.axis, deviations["position"].values),
-                plan_u=plan_scale_u(fields),
-            ),
+            **loop,
+            "steps": with_event_times(loop["steps"], result, fused),
             "field_corrections": [error.as_json() for error in errors],
             "residual_tests": {name: examined.as_json() for name, examined in tests.items()},
             "axis_line": None if line is None else line.as_json(),
@@ -292,6 +300,23 @@ def loop_variables(fused: xr.Dataset, models: Mapping[str, ModelFit], tests: Map
             "period": ("period", tests["final"].periods_min, {"units": "min", "long_name": "period"}),
         },
     )
+
+
+def with_event_times(steps: Sequence[Mapping[str, Any]], result: LoopResult, fused: xr.Dataset) -> list[dict[str, Any]]:
+    """Entries of ``loop.steps`` with the time of day of every event.
+
+    Parameters
+    ----------
+    steps : as in results.json
+    result : of the loop, with the same steps
+    fused : both recordings on one clock; the times of the loop count from its first reading
+    """
+    start = fused["time"].values[fused["deviation"].notnull().values].min()
+    events_s = [term.candidate.event_s for term in result.state.added]
+    return [
+        {**step, "event_time": None if at is None else utc(start + np.timedelta64(round(1000.0 * at), "ms"))}
+        for step, at in zip(steps, events_s, strict=True)
+    ]
 
 
 def prediction_variables(fused: xr.Dataset, result: LoopResult) -> dict[str, xr.Variable]:

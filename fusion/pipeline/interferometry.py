@@ -13,10 +13,13 @@ from fusion.consistency.place import find_gaps, gap_words, in_gaps
 from fusion.consistency.readings import find_gross_readings
 from fusion.products.grouped import group, joined
 from fusion.products.results import Notice, Outcome
+from fusion.report.wording import moment
 from interferometry import iso230, neighbours
 from interferometry.deviations import OUTLIER
 from interferometry.drift.estimate import estimate_drift, flag_outliers
 
+#: Share of the readings that may lie outside the frames' time before the next test should be filmed otherwise.
+_OUTSIDE_SHARE = 0.05
 #: What each stage is called in progress and provenance.
 LABELS = {
     "fields": "thermal fields",
@@ -54,7 +57,10 @@ def evaluate_interferometry(source: Source) -> Outcome:
         iso=windows,
         drift=drift,
     )
+    time = deviations["time"].values[np.isfinite(deviations["deviation"].values)]
+    zone = source.campaign.zone_of("interferometry")
     parts = {
+        "time": {"first": utc(time.min()), "last": utc(time.max()), "zone": zone},
         "iso230": _iso_part(windows),
         "neighbours": {
             "conventional_s_um": by_direction(comparison["conventional"]),
@@ -65,12 +71,33 @@ def evaluate_interferometry(source: Source) -> Outcome:
             "profile_um": by_direction(drift["profile"]),
             "profile_u_um": by_direction(drift["profile_u"]),
             "scatter_um": by_direction(drift["scatter"]),
+            "position_mm": deviations["position"].values.tolist(),
+            **_drift_ranges(drift),
         },
     }
-    return Outcome(dataset, parts, tuple(_reading_notices(deviations, drift)))
+    return Outcome(dataset, parts, tuple(_reading_notices(deviations, drift, zone)))
 
 
-def _reading_notices(deviations: xr.Dataset, drift: xr.Dataset) -> list[Notice]:
+def utc(time: np.datetime64) -> str:
+    """Return a time as results.json writes it, ISO 8601 in UTC to the second.
+
+    Parameters
+    ----------
+    time : datetime64
+        UTC.
+    """
+    return f"{np.datetime_as_string(time, unit='s')}Z"
+
+
+def _drift_ranges(drift: xr.Dataset) -> dict[str, list[float]]:
+    """Return the range of every target's drift, mean of both approaches, with its standard uncertainty, um."""
+    course = drift["drift"].mean("direction")
+    u = drift["drift_u"].mean("direction").max("cycle") * np.sqrt(2.0)
+    ranges = course.max("cycle") - course.min("cycle")
+    return {"range_um": ranges.values.tolist(), "range_u_um": u.values.tolist()}
+
+
+def _reading_notices(deviations: xr.Dataset, drift: xr.Dataset, zone: str | None) -> list[Notice]:
     """Return notices for missing readings, with what they cost the profile, and for readings that were given little weight."""
     notices = []
     gaps = np.isnan(deviations["deviation"].values)
@@ -90,12 +117,13 @@ def _reading_notices(deviations: xr.Dataset, drift: xr.Dataset) -> list[Notice]:
         )
     outliers = (deviations["quality_flag"] & OUTLIER.mask) > 0
     if outliers.any():
-        named = _names(outliers)
+        named = _names(outliers, deviations, zone)
         notices.append(
             Notice(
                 "outliers",
-                f"{counted(len(named), 'reading')} far from the joint estimate down-weighted: {listed(named)}.",
-                "Check what happened at the down-weighted readings (flagged in deviations.nc); conventional values contain them.",
+                f"{counted(len(named), 'outlier')} down-weighted in the joint estimate: {listed(named)}. Conventional values "
+                "contain them.",
+                f"Compare {_file(deviations)} with the logs of machine and laser: {listed(named)}.",
             )
         )
     return notices
@@ -143,31 +171,41 @@ def align_recordings(source: Source, fields: xr.Dataset, deviations: xr.Dataset)
     used = deviations.assign(deviation=deviations["deviation"].where(~gross))
     fused = align(used, fields, source.axis, environment=source.environment, drivers=source.drivers)
     return fused, [
-        *_gross_notices(deviations["deviation"], gross),
+        *_gross_notices(deviations, gross, source.campaign.zone_of("interferometry")),
         *_outside_notices(fused),
         *_gap_notices(fields, deviations),
     ]
 
 
-def _gross_notices(deviation: xr.DataArray, gross: xr.DataArray) -> list[Notice]:
+def _gross_notices(deviations: xr.Dataset, gross: xr.DataArray, zone: str | None) -> list[Notice]:
     """Return a notice for the readings that are errors of reading."""
     if not gross.any():
         return []
+    deviation, named = deviations["deviation"], _names(gross, deviations, zone)
     largest = float(np.abs(deviation.where(gross) - deviation.median("cycle")).max())
     return [
         Notice(
             "gross_readings",
             f"{counted(int(gross.sum()), 'reading')} more than ten standard deviations of their position off, by up to {largest:.3g} µm: "
-            f"{listed(_names(gross))}; left out where drift and field are compared and modelled.",
-            "Check what happened at these readings (beam, unit, typing error), and correct or remove them in the file.",
+            f"{listed(named)}; left out where drift and field are compared and modelled.",
+            f"Check {listed(named)} (beam, unit, typing error), and correct or remove these readings in {_file(deviations)}.",
         )
     ]
 
 
-def _names(marked: xr.DataArray) -> list[str]:
-    """Return cycle, approach and target of every reading that is marked (cycle, direction, target)."""
+def _names(marked: xr.DataArray, deviations: xr.Dataset, zone: str | None) -> list[str]:
+    """Return cycle, position, approach and time of every reading that is marked (cycle, direction, target)."""
     cycle, direction, target = (marked[name].values for name in marked.dims)
-    return [f"cycle {cycle[c]} {direction[d]} target {target[t]}" for c, d, t in np.argwhere(marked.values)]
+    time, position = deviations["time"].values, deviations["position"].values
+    return [
+        f"cycle {cycle[c]}, position {target[t]} ({position[t]:g} mm), {direction[d]} approach, {moment(time[c, d, t], zone)}"
+        for c, d, t in np.argwhere(marked.values)
+    ]
+
+
+def _file(deviations: xr.Dataset) -> str:
+    """Return the name of the file of the readings."""
+    return str(deviations.attrs.get("source", "the file of the readings"))
 
 
 def _gap_notices(fields: xr.Dataset, deviations: xr.Dataset) -> list[Notice]:
@@ -194,11 +232,12 @@ def _outside_notices(fused: xr.Dataset) -> list[Notice]:
     if not outside.any():
         return []
     cycles = [str(cycle) for cycle in fused["cycle"].values[outside.any(axis=(1, 2))]]
+    many = outside.sum() > _OUTSIDE_SHARE * fused["deviation"].notnull().values.sum()
     return [
         Notice(
             "readings_outside_frames",
             f"{counted(int(outside.sum()), 'reading')} outside the frames' time, in {counted(len(cycles), 'cycle')} ({listed(cycles)}); "
             "evaluated, but not used where drift and field are compared.",
-            "Start the camera before the first cycle and stop it after the last one.",
+            "Start the camera before the first cycle and stop it after the last one." if many else "",
         )
     ]

@@ -31,6 +31,7 @@ class JudgedPosition:
             "target": anomaly.target,
             "direction": anomaly.direction,
             "p_value": anomaly.p_value,
+            "least_p": anomaly.least_p_value,
             "scatter_um": anomaly.scatter_um,
             "cause": diagnosis.cause,
             "evidence": {

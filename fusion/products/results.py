@@ -38,7 +38,7 @@ from fusion.products.results_loop import (
     Unexplained,
     Verdict,
 )
-from fusion.products.results_part import ByDirection, Number, Quantity, ResultPart
+from fusion.products.results_part import ByDirection, Number, Quantity, ResultPart, TimePart
 from fusion.products.results_radiometry import RadiometryPart
 from fusion.products.store import Product, plain
 
@@ -107,6 +107,8 @@ class Results(ResultPart):
     """Everything that was left out, is doubtful, or was not possible."""
     inputs: InputsPart | None = None
     """Consistency of the inputs."""
+    time: TimePart | None = None
+    """When the readings were taken; absent where the campaign states no time of day."""
     registration: RegistrationPart | None = None
     """Registration of the thermograms to the plan."""
     camera: CameraPart | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
-from fusion.products.results_part import Number, Quantity, ResultPart, Sensitivity
+from fusion.products.results_part import AreaPart, Number, Quantity, ResultPart, Sensitivity
 
 Attribution = Literal["attributable", "not attributable", "not separable"]
 
@@ -23,6 +23,8 @@ class SourcePart(ResultPart):
     """Place on the plan, x, mm."""
     y_mm: Number
     """Place on the plan, y, mm."""
+    area: AreaPart | None = None
+    """The area that is the place; (x_mm, y_mm) is its strongest cell, of a region its middle."""
     p_value: Number
     """p-value, family-wise over everything that was tested."""
     sensitivity_um_per_K: Sensitivity
@@ -61,6 +63,8 @@ class PlacePart(ResultPart):
     """Place on the plan, x, mm."""
     y_mm: Number
     """Place on the plan, y, mm."""
+    area: AreaPart | None = None
+    """The area that is the place; (x_mm, y_mm) is the strongest cell of a mode, the middle of a region."""
     parts: Mapping[str, TestedPart]
     """Test results by part of the drift."""
 
@@ -110,6 +114,9 @@ class DutyPart(ResultPart):
 
 class CorrelationPart(ResultPart):
     """Attribution of the drift to parts of the temperature field."""
+
+    least_p: Number = None
+    """Smallest p-value that the number of simulations can show: a p-value equal to it is an upper limit."""
 
     verdict: Attribution
     """Whether a part of the field is shown to go with the drift."""

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from pydantic import Field
 
-from fusion.products.results_part import ByDirection, Number, Quantity, ResultPart
+from fusion.products.results_part import AreaPart, ByDirection, Number, Quantity, ResultPart
 
 Cause = Literal["structural", "local_temperature", "stick_slip", "step", "undetermined"]
 Direction = Literal["positive", "negative", "both"]
@@ -126,6 +126,12 @@ class DriftPart(ResultPart):
     """Standard uncertainty of the profile, um."""
     scatter_um: ByDirection
     """Standard deviation of a reading after profile and drift were subtracted, um."""
+    position_mm: tuple[Number, ...] = ()
+    """Positions of the targets, mm."""
+    range_um: tuple[Number, ...] = ()
+    """Largest minus smallest drift of every target during the test, mean of both approaches, um."""
+    range_u_um: tuple[Number, ...] = ()
+    """Standard uncertainty of that, um."""
 
 
 class Evidence(ResultPart):
@@ -199,6 +205,10 @@ class AnomalyPart(ResultPart):
 
     target: int = Field(ge=1)
     """Target number, from 1."""
+    position_mm: Number = None
+    """Its position, mm."""
+    least_p: Number = None
+    """Smallest p-value that the number of simulations can show: a p-value equal to it is an upper limit."""
     direction: Direction
     """Direction of approach that stands out."""
     p_value: Number
@@ -214,6 +224,14 @@ class AnomalyPart(ResultPart):
 class HotspotPart(ResultPart):
     """A place that warms more than its surroundings."""
 
+    name: str = ""
+    """Its name, the same as among the regions of the correlation."""
+    centroid_x_mm: Number = None
+    """Middle of its area, x, mm."""
+    centroid_y_mm: Number = None
+    """Middle of its area, y, mm."""
+    area: AreaPart | None = None
+    """Its area: the connected cells around the peak whose rise exceeds that at half of the peak's prominence."""
     x_mm: Number
     """Place of the peak on the plan, x, mm."""
     y_mm: Number

@@ -97,6 +97,8 @@ class StepPart(ResultPart):
 
     effect: str
     """Name of the effect."""
+    event_time: str | None = None
+    """Time of an event, UTC; null for an effect that lasts, and where no time of day is known."""
     parameters: Mapping[str, Parameter]
     """Parameters; a name ends with its unit."""
     parameter_ranges: Mapping[str, Range]

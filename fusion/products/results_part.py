@@ -47,3 +47,27 @@ class ByDirection(ResultPart):
     def values(self) -> list[float]:
         """Return the values of both directions that are determined."""
         return [value for value in (*self.positive, *self.negative) if value is not None]
+
+
+class AreaPart(ResultPart):
+    """A place on the plan as the rectangle around its cells."""
+
+    x_low_mm: float
+    """Smallest x, mm."""
+    x_high_mm: float
+    """Largest x, mm."""
+    y_low_mm: float
+    """Smallest y, mm."""
+    y_high_mm: float
+    """Largest y, mm."""
+
+
+class TimePart(ResultPart):
+    """When the readings were taken."""
+
+    first: str
+    """Time of the first reading, UTC."""
+    last: str
+    """Time of the last reading, UTC."""
+    zone: str | None
+    """Zone that the campaign states, by its name in the IANA data base; null where it states none."""

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from functools import cache
 from typing import NamedTuple
+from zoneinfo import ZoneInfo
 
 import numpy as np
 
@@ -156,15 +158,27 @@ def duration(seconds: float | None) -> str:
     return f"{seconds / 3600:.1f} h"
 
 
-def moment(time: np.datetime64) -> str:
-    """Return a time to the minute.
+def moment(time: np.datetime64 | str, zone: str | None = None) -> str:
+    """Return a time to the minute with its zone.
 
     Parameters
     ----------
-    time : datetime64
-        UTC; NaT is shown as a dash.
+    time : datetime64 or str
+        UTC, or a time as results.json writes it; NaT is shown as a dash.
+    zone : str, optional
+        Name of a zone in the IANA data base, for local time; None: UTC.
+
+    Examples
+    --------
+    >>> moment("2026-03-09T06:30:00Z"), moment("2026-03-09T06:30:00Z", "Europe/Vienna")
+    ('2026-03-09 06:30 UTC', '2026-03-09 07:30 CET')
     """
-    return "–" if np.isnat(time) else f"{np.datetime_as_string(time, unit='m').replace('T', ' ')} UTC"
+    stamp = np.datetime64(time.removesuffix("Z")) if isinstance(time, str) else time
+    if np.isnat(stamp):
+        return "–"
+    at = datetime.fromisoformat(np.datetime_as_string(stamp, unit="s")).replace(tzinfo=UTC)
+    local = at if zone is None else at.astimezone(ZoneInfo(zone))
+    return f"{local:%Y-%m-%d %H:%M} {local.tzname()}"
 
 
 def place(x_mm: float | None, y_mm: float | None) -> str:

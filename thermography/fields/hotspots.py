@@ -35,6 +35,8 @@ class Hotspot:
         Height of the peak above the highest level at which it is connected to a higher peak, or above the lowest rise on the plan.
     area_mm2, centroid_x_mm, centroid_y_mm, mean_rise_K : float, mm2, mm, mm and K
         Of the connected zone above half the prominence.
+    extent_mm : (float, float, float, float), mm
+        Smallest and largest x, smallest and largest y of that zone: edges of its outermost cells.
     at_edge : bool
         The zone reaches the edge of the seen plan: the true peak may lie outside.
     """
@@ -47,6 +49,7 @@ class Hotspot:
     centroid_x_mm: float
     centroid_y_mm: float
     mean_rise_K: float
+    extent_mm: tuple[float, float, float, float]
     at_edge: bool
 
 
@@ -149,6 +152,12 @@ def _hotspot(
         centroid_x_mm=float(x[columns].mean()),
         centroid_y_mm=float(y[rows].mean()),
         mean_rise_K=float(values[zone].mean()),
+        extent_mm=(
+            float(x[columns].min() - cell / 2),
+            float(x[columns].max() + cell / 2),
+            float(y[rows].min() - cell / 2),
+            float(y[rows].max() + cell / 2),
+        ),
         at_edge=bool((zone & outside).any()),
     )
 

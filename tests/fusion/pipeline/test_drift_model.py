@@ -26,6 +26,7 @@ from fusion.pipeline.drift_model import (
     library_for,
     loop_variables,
     prediction_variables,
+    with_event_times,
 )
 from tests.fusion.small_campaign import campaign, logged, model_of, term
 
@@ -177,6 +178,23 @@ def test_residuals_hold_the_drift_and_have_mean_zero(laid):
         expected = model.readings.response - model.fit.design @ model.fit.coefficients
         np.testing.assert_allclose(residual[0, 0], (expected - expected.mean())[:4])
         assert dataset[f"residual_{name}"].attrs == {"units": "um"}
+
+
+def test_an_event_has_the_time_of_day_of_its_instant():
+    start = np.datetime64("2026-03-09T06:30:02", "ns")
+    time = start + (np.arange(24).reshape(3, 2, 4) * 60).astype("timedelta64[s]")
+    fused = xr.Dataset(
+        {
+            "deviation": (("cycle", "direction", "target"), np.zeros((3, 2, 4))),
+            "time": (("cycle", "direction", "target"), time),
+        }
+    )
+    # The first reading has no value: the loop counts from the second.
+    fused["deviation"][0, 0, 0] = np.nan
+    added = [SimpleNamespace(candidate=SimpleNamespace(event_s=at)) for at in (600.4, None)]
+    result = SimpleNamespace(state=SimpleNamespace(added=added))
+    steps = with_event_times([{"effect": "step_event"}, {"effect": "thermal_lag"}], result, fused)
+    assert [step["event_time"] for step in steps] == ["2026-03-09T06:41:02Z", None]
 
 
 def test_the_errors_that_the_loop_reports_are_kept_reading_by_reading():

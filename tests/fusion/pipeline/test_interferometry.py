@@ -21,7 +21,7 @@ def test_gaps_and_outliers_are_noted_with_what_they_cost(copied: Path) -> None:
     (copied / "laser.csv").write_text("\n".join(lines) + "\n")
     outcome = evaluate_interferometry(read_source(load_campaign(copied / "campaign.toml")))
     notices = {notice.code: notice for notice in outcome.notices}
-    assert notices["outliers"].message.startswith("1 reading far from the joint estimate down-weighted: cycle ")
+    assert notices["outliers"].message.startswith("1 outlier down-weighted in the joint estimate: cycle ")
     assert notices["readings_missing"].message.startswith("1 reading of 288 missing, in 1 cycle: ")
     # Nothing has to be done about a gap.
     assert notices["readings_missing"].remedy == ""
@@ -34,6 +34,17 @@ def test_parts_agree_with_the_product(campaign_folder: Path) -> None:
     assert outcome.parts["iso230"]["A_um"]["value"] == pytest.approx(float(outcome.dataset["iso_A"][0]))
     profile = outcome.dataset["drift_profile"]
     assert by_direction(profile)["negative"] == profile.sel(direction="negative").values.tolist()
+    time = outcome.dataset["time"].values
+    told = outcome.parts["time"]
+    assert [np.datetime64(told[name][:-1]) for name in ("first", "last")] == [
+        one.astype("datetime64[s]") for one in (time.min(), time.max())
+    ]
+    assert told["zone"] is None
+    course = outcome.dataset["drift_drift"].mean("direction")
+    drift = outcome.parts["drift"]
+    np.testing.assert_allclose(drift["range_um"], course.max("cycle") - course.min("cycle"))
+    assert all(0.0 < u < one for u, one in zip(drift["range_u_um"], drift["range_um"], strict=True))
+    assert drift["position_mm"] == outcome.dataset["position"].values.tolist()
 
 
 def test_readings_outside_the_frames_are_counted(campaign_folder: Path, results_folder: Path) -> None:
@@ -42,6 +53,11 @@ def test_readings_outside_the_frames_are_counted(campaign_folder: Path, results_
     fused, (notice,) = align_recordings(source, fields, read_dataset(results_folder / "deviations.nc"))
     outside = int(np.count_nonzero(~fused["inside_frames"].values))
     assert notice.message.startswith(f"{outside} readings outside the frames' time, in 1 cycle (1)")
+    # A cycle out of 24 is no reason to film otherwise.
+    assert notice.remedy == ""
+    fewer = fields.isel(time=slice(3, None))
+    _, (many,) = align_recordings(source, fewer, read_dataset(results_folder / "deviations.nc"))
+    assert many.remedy.startswith("Start the camera before the first cycle")
 
 
 def test_an_error_of_reading_is_left_out_of_the_comparison_with_the_field_and_named(
@@ -56,7 +72,8 @@ def test_an_error_of_reading_is_left_out_of_the_comparison_with_the_field_and_na
     fused, notices = align_recordings(source, fields, spoilt)
     message = next(notice.message for notice in notices if notice.code == "gross_readings")
     assert message.startswith(
-        "1 reading more than ten standard deviations of their position off, by up to 1e+06 µm: cycle 11 negative target 4;"
+        "1 reading more than ten standard deviations of their position off, by up to 1e+06 µm: cycle 11, position 4 (150 mm), negative "
+        "approach, 2026-03-09 07:01 UTC;"
     )
     # Everything else is what it was: what follows cannot change by the size of the error.
     assert np.isnan(fused["deviation"].values[10, 1, 3])

@@ -79,6 +79,7 @@ def test_a_position_is_written_with_its_evidence():
         "target": 3,
         "direction": "positive",
         "p_value": 0.01,
+        "least_p": 0.0,
         "scatter_um": 0.8,
         "cause": "structural",
         "evidence": {
