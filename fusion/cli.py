@@ -128,6 +128,29 @@ def _folders(campaigns: list[Path], out: Path | None) -> list[tuple[Path, Path]]
 
 
 @app.command()
+def check(
+    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN.toml", help="The campaign file.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print faults and doubts only.")] = False,
+) -> None:
+    """Check a campaign without running it.
+
+    The file, the files that it names, clocks and overlap, the axis on the plan, a few frames; exit code 2 where run would refuse it.
+    """
+    from fusion.starting.check import check_campaign
+
+    with _answering():
+        checked = check_campaign(campaign)
+        if as_json:
+            sys.stdout.write(json.dumps(checked.as_json(), indent=1, ensure_ascii=False) + "\n")
+        else:
+            for line in checked.lines(quiet=quiet):
+                console.print(line, soft_wrap=True, highlight=False, markup=False)
+        if checked.faults:
+            raise typer.Exit(BAD_INPUT)
+
+
+@app.command()
 def simulate(
     recipe: Annotated[Path, typer.Argument(metavar="RECIPE.toml", help="What the machine of the twin does.")],
     out: Annotated[Path, typer.Option(help="Folder of the campaign; must be empty or absent.")],

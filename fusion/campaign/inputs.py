@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
-from fusion.alignment.align import AlignmentError, AxisGeometry, camera_on_laser_clock, cycle_bounds
+from fusion.alignment.align import AlignmentError, AxisGeometry, MeasuredLine, camera_on_laser_clock, cycle_bounds
 from fusion.alignment.zone_shift import covered_share, likely_zone_shift
 from fusion.attribution.randomised_duty import DutyLaw, read_duty
 from fusion.attribution.thermal_modes import Region, read_regions
@@ -232,6 +232,7 @@ def _notices(source: Source) -> list[Notice]:
     _raise_if_too_small(source)
     _raise_if_patch_outside(source)
     _raise_if_regions_unusable(source)
+    _raise_if_line_leaves_plan(source)
     _raise_if_clocks_disagree(
         source.deviations,
         source.frame_times,
@@ -306,6 +307,15 @@ def _raise_if_regions_unusable(source: Source) -> None:
                     f"{where}: the states of region {region.name} name cycle {state.cycle}, but {source.interferometry.deviations} holds "
                     f"the cycles {cycles[0]} to {cycles[-1]}; name a measured one"
                 )
+
+
+def _raise_if_line_leaves_plan(source: Source) -> None:
+    """Raise if axis position 0 or a target lies beside the plan, where the long work would end."""
+    plan = xr.Dataset(coords={"x": source.grid.x_mm, "y": source.grid.y_mm})
+    try:
+        MeasuredLine(plan, source.axis, source.deviations["position"].values)
+    except AlignmentError as error:
+        raise AlignmentError(f"{source.campaign.path}: plan.axis: {error}") from error
 
 
 class SourceError(FusionError):

@@ -105,6 +105,15 @@ def test_inspect_tells_what_files_hold(campaign_folder: Path, tmp_path: Path) ->
     )
 
 
+def test_check_ends_with_0_where_a_run_would_start_and_with_2_where_not(campaign_folder: Path, tmp_path: Path) -> None:
+    ready = invoke("check", campaign_folder / "campaign.toml")
+    assert (ready.exit_code, ready.output.splitlines()[-1].partition(":")[0]) == (0, "ready to run")
+    assert json.loads(invoke("check", campaign_folder / "campaign.toml", "--json").output)["faults"] == []
+    refused = invoke("check", tmp_path / "campaign.toml", "--quiet")
+    assert (refused.exit_code, refused.output.count("\n")) == (2, 1)
+    assert "no such campaign file" in refused.output
+
+
 def test_iso230_evaluates_a_window(campaign_folder: Path) -> None:
     result = invoke("iso230", campaign_folder / "laser.csv", "--cycles", "1-5")
     assert result.exit_code == 0, result.output
