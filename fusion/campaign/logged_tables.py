@@ -18,17 +18,9 @@ from fusion.campaign.config import Campaign, CampaignError, RecordTable
 from fusion.campaign.quantities import QuantityError, conversion, unit_name
 from fusion.campaign.time_zones import bring_to_utc
 from fusion.errors import FusionError
-from interferometry.io.delimited import (
-    BadReading,
-    RejectedLine,
-    delimiter_of,
-    describe_time_zone,
-    find_header,
-    parse_time,
-    raise_if_mostly_invalid,
-    read_table,
-    read_timed_rows,
-)
+from interferometry.io.dates import describe_time_zone, parse_time
+from interferometry.io.delimited import delimiter_of, find_header, read_table, read_timed_rows
+from interferometry.io.faults import BadReading, RejectedLine, raise_if_mostly_invalid
 
 #: Warning of pandas about a line with more fields than the header.
 _SKIPPED = re.compile(r"Skipping line (\d+): expected (\d+) fields, saw (\d+)")

@@ -10,7 +10,7 @@ import pandas as pd
 import xarray as xr
 
 from fusion.campaign.config import CampaignError
-from interferometry.io.delimited import NO_ZONE
+from interferometry.io.dates import NO_ZONE
 
 
 def bring_to_utc(table: xr.Dataset, zone: str | None, *, file: str) -> xr.Dataset:

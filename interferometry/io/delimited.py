@@ -1,73 +1,61 @@
-"""Delimited text files with a header line: columns by name, unusable lines listed by number."""
+"""Delimited text and sheets as rows of fields, and tables whose columns are found by their names."""
 
 from __future__ import annotations
 
 import csv
-import io
 import json
-import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
-from interferometry.errors import InterferometryError
+from interferometry.io.dates import DateOrder, describe_time_zone, parse_time
+from interferometry.io.encodings import decode_text
+from interferometry.io.faults import BadReading, LaserFormatError, RejectedLine, raise_if_mostly_invalid
+from interferometry.io.headings import CHINESE_WORDS
+from interferometry.io.numerals import Numerals
+from interferometry.io.workbook import is_workbook, read_sheets
 
-#: Values that instruments write for "no reading"; Renishaw's is -1e20.
-SENTINEL_MAGNITUDE = 1e19
-#: Attribute ``reference`` of times from a file that gives no zone.
-NO_ZONE = "no zone in the file: taken as UTC"
-
-
-class LaserFormatError(InterferometryError):
-    """A laser or environment file that cannot be used as a whole; the message names file, place, value and remedy."""
+_DELIMITERS = ";\t,|"
+_LINE_ENDS = re.compile(r"\r\n|\n|\r")
+#: Longest part of a line of the file that a message repeats, characters.
+_SHOWN = 160
 
 
 @dataclass(frozen=True)
-class RejectedLine:
-    """One line of a file that was left out.
+class Grid:
+    """Rows of fields, before anything in them is understood.
 
     Attributes
     ----------
-    path : str
-        Name of the file.
-    line : int
-        Its number, from 1.
-    value : str
-        The text that could not be used.
-    reason : str
-        Why, as the predicate of a sentence about the value ("is not a number").
+    path : pathlib.Path
+    sheet : str
+        Name of the sheet of a spreadsheet; "" for a text file.
+    rows : list of (int, list of str)
+        Number of each row or line in the file, from 1, and its fields; rows without any text and lines that start with ``#`` are left out.
     """
 
-    path: str
-    line: int
-    value: str
-    reason: str
+    path: Path
+    sheet: str
+    rows: list[tuple[int, list[str]]]
 
+    @property
+    def place(self) -> str:
+        """File and sheet, as messages name them."""
+        return f"{self.path}, sheet {self.sheet!r}" if self.sheet else str(self.path)
 
-class BadReading(InterferometryError):
-    """A line that cannot be used; it is caught by the reader, which lists the line as a `RejectedLine`.
-
-    Parameters
-    ----------
-    value : str
-        The text that could not be used.
-    reason : str
-        Why, as the predicate of a sentence about the value.
-    """
-
-    def __init__(self, value: str, reason: str) -> None:
-        super().__init__(f"{value!r}: {reason}")
-        self.value = value
-        self.reason = reason
+    @property
+    def numerals(self) -> Numerals:
+        """How the numbers of the grid are written."""
+        return Numerals.of(text for _, fields in self.rows for text in fields)
 
 
 @dataclass(frozen=True)
 class DelimitedTable:
-    """A delimited file: its column names and its rows with their line numbers.
+    """A table: its column names and its rows with their line numbers.
 
     Attributes
     ----------
@@ -76,14 +64,14 @@ class DelimitedTable:
         Names of the header line, stripped.
     rows : list of (int, list of str)
         Number of each line in the file, from 1, and its fields.
-    decimal_comma : bool
-        Whether numbers may be written "0,64", as spreadsheets do where semicolons separate the fields.
+    numerals : Numerals
+        How the numbers of the file are written.
     """
 
     path: Path
     columns: tuple[str, ...]
     rows: list[tuple[int, list[str]]]
-    decimal_comma: bool
+    numerals: Numerals = field(default_factory=Numerals)
 
     def records(self) -> Iterator[tuple[int, dict[str, str] | None]]:
         """Yield line number and fields by column name; None where the number of fields is wrong."""
@@ -92,28 +80,77 @@ class DelimitedTable:
 
     def number(self, text: str) -> float:
         """Return a finite number; raises `BadReading` where the text is none."""
-        cleaned = text.strip().replace(",", ".") if self.decimal_comma else text.strip()
-        try:
-            value = float(cleaned)
-        except ValueError:
-            raise BadReading(text, "is not a number") from None
-        if not math.isfinite(value) or abs(value) >= SENTINEL_MAGNITUDE:
-            raise BadReading(text, "is not a finite number")
-        return value
+        return self.numerals.number(text)
 
-    def count(self, text: str) -> int:
-        """Return a whole number from 1; raises `BadReading` where the text is none."""
-        value = self.number(text)
-        if value != int(value) or value < 1:
-            raise BadReading(text, "is not a whole number from 1")
-        return int(value)
+
+def read_grids(path: Path, *, sheet: str | None = None) -> list[Grid]:
+    """Read a file of text or a spreadsheet as rows of fields.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        Delimited text in UTF-8, UTF-16 or a code page, or a spreadsheet (.xlsx, .xls, .ods); the content decides.
+    sheet : str, optional
+        Name of the only sheet of a spreadsheet to read; None reads all visible ones.
+
+    Returns
+    -------
+    list of Grid
+        Of a spreadsheet one per visible sheet; of a text one per delimiter that occurs in it, the most frequent one first.
+
+    Raises
+    ------
+    LaserFormatError
+        The file is empty, no text and no spreadsheet, or has no such sheet.
+    OSError
+        The file cannot be opened.
+    """
+    content = path.read_bytes()
+    if is_workbook(content):
+        sheets = read_sheets(path, content)
+        if sheet is not None and sheet not in sheets:
+            raise LaserFormatError(
+                f"{path}: there is no sheet {sheet!r}; the sheets are {', '.join(map(repr, sheets))}"
+            )
+        return [Grid(path, name, rows) for name, rows in sheets.items() if sheet in (None, name)]
+    text = decode_text(path, content, chinese_words=CHINESE_WORDS)
+    lines = ["" if line.startswith("#") else line for line in _LINE_ENDS.split(text)]
+    present = sorted(
+        (mark for mark in _DELIMITERS if any(mark in line for line in lines)), key=text.count, reverse=True
+    )
+    grids = [Grid(path, "", _split(path, lines, mark)) for mark in present or [","]]
+    if not grids[0].rows:
+        raise LaserFormatError(f"{path}: the file is empty; expected a header line and the measured values below it")
+    return grids
+
+
+def _split(path: Path, lines: list[str], delimiter: str) -> list[tuple[int, list[str]]]:
+    reader = csv.reader((f"{line}\n" for line in lines), delimiter=delimiter, skipinitialspace=True)
+    try:
+        rows = [(reader.line_num, [text.strip() for text in fields]) for fields in reader]
+    except csv.Error as fault:
+        raise LaserFormatError(
+            f"{path}, line {reader.line_num}: {fault}; the file is damaged or no table, export it again"
+        ) from None
+    return [(line, fields) for line, fields in rows if any(fields)]
+
+
+def shown(fields: Iterable[str]) -> str:
+    """Return a row for a message, shortened.
+
+    Parameters
+    ----------
+    fields : iterable of str
+    """
+    text = ",".join(fields)
+    return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
 
 
 def read_table(path: Path, required: tuple[str, ...]) -> DelimitedTable:
-    """Read a delimited text file and check that it has the required columns.
+    """Read a table from a text file or a spreadsheet and check that it has the required columns.
 
-    Byte-order marks, CR LF line ends, empty lines, lines that start with ``#``, and commas, semicolons or tabs between the
-    fields are all accepted.
+    Lines above the header, byte-order marks, any line ends, empty lines, lines that start with ``#``, and commas, semicolons, tabs or
+    bars between the fields are all accepted.
 
     Parameters
     ----------
@@ -128,35 +165,45 @@ def read_table(path: Path, required: tuple[str, ...]) -> DelimitedTable:
     Raises
     ------
     LaserFormatError
-        The file is empty or not UTF-8 text, or a column is missing or repeated.
+        The file is empty or neither text nor a spreadsheet, or a column is missing or repeated.
     """
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as fault:
-        raise LaserFormatError(f"{path}: byte {fault.start} is not UTF-8 text; save the file as CSV in UTF-8") from None
-    _, header = find_header(text.splitlines())
-    if not header:
-        raise LaserFormatError(f"{path}: the file is empty; expected a header line {','.join(required)}")
-    delimiter = delimiter_of(header)
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
-    lines = [
-        (reader.line_num, fields)
-        for fields in reader
-        if any(f.strip() for f in fields) and not fields[0].startswith("#")
-    ]
-    head_line, names = lines[0][0], tuple(name.strip() for name in lines[0][1])
-    missing = [name for name in required if name not in names]
-    if missing:
-        raise LaserFormatError(
-            f"{path}, line {head_line}: no column {', '.join(missing)}; the header is {','.join(names)!r}, "
-            f"expected {','.join(required)!r} (names carry the unit: convert the values and rename the column)"
-        )
+    grids = read_grids(path)
+    for grid in grids:
+        for at, (_, fields) in enumerate(grid.rows):
+            if all(name in fields for name in required):
+                return table_below(grid, at)
+    line, fields = grids[0].rows[0]
+    missing = [name for name in required if name not in fields]
+    raise LaserFormatError(
+        f"{grids[0].place}, line {line}: no column {', '.join(missing)}; the header is {shown(fields)}, "
+        f"expected {','.join(required)!r} (names carry the unit: convert the values and rename the column)"
+    )
+
+
+def table_below(grid: Grid, at: int) -> DelimitedTable:
+    """Return the table whose header is a row of a grid.
+
+    Parameters
+    ----------
+    grid : Grid
+    at : int
+        Index of the row.
+
+    Raises
+    ------
+    LaserFormatError
+        Two columns have one name.
+    """
+    line, fields = grid.rows[at]
+    names = tuple(fields[: max(i for i, name in enumerate(fields) if name) + 1])
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         raise LaserFormatError(
-            f"{path}, line {head_line}: column {', '.join(repeated)} occurs more than once; keep one"
+            f"{grid.place}, line {line}: column {', '.join(map(repr, repeated))} occurs more than once; keep one"
         )
-    return DelimitedTable(path, names, lines[1:], delimiter == ";")
+    # Spreadsheets give every row the width of the widest one.
+    rows = [(number, row[: len(names)] if not any(row[len(names) :]) else row) for number, row in grid.rows[at + 1 :]]
+    return DelimitedTable(grid.path, names, rows, grid.numerals)
 
 
 def find_header(lines: Iterable[str]) -> tuple[int, str]:
@@ -193,9 +240,13 @@ def delimiter_of(header: str) -> str:
 
 
 def read_timed_rows(
-    table: DelimitedTable, variables: Mapping[str, Mapping[str, str]], parse: Callable[[dict[str, str]], list[float]]
+    table: DelimitedTable,
+    variables: Mapping[str, Mapping[str, str]],
+    parse: Callable[[dict[str, str]], list[float]],
+    *,
+    time: str = "time",
 ) -> xr.Dataset:
-    """Read the rows of a table that has a column ``time`` into a Dataset.
+    """Read the rows of a table that has a column of times into a Dataset.
 
     Parameters
     ----------
@@ -204,6 +255,8 @@ def read_timed_rows(
         Attributes (units and others) of the variables by name, in the order in which `parse` returns their values.
     parse : callable
         Takes the fields of a line by column, returns its values; raises `BadReading` where one cannot be used.
+    time : str, optional
+        Name of the column of times.
 
     Returns
     -------
@@ -213,26 +266,27 @@ def read_timed_rows(
     Raises
     ------
     LaserFormatError
-        Fewer than half of the lines can be used, or only some times have a zone.
+        Fewer than half of the lines can be used, only some times have a zone, or the order of day and month is not settled.
     """
     rows: dict[np.datetime64, list[float]] = {}
     left_out: list[RejectedLine] = []
     zones: dict[str, int] = {}
+    order = DateOrder.of(table.path, [(line, fields[time]) for line, fields in table.records() if fields is not None])
     for line, fields in table.records():
         try:
             if fields is None:
                 raise BadReading("", f"does not have {len(table.columns)} fields")
-            time, zone = parse_time(fields["time"])
-            if time in rows:
-                raise BadReading(fields["time"], "occurs on an earlier line too, which is kept")
-            rows[time] = parse(fields)
+            instant, zone = parse_time(fields[time], order)
+            if instant in rows:
+                raise BadReading(fields[time], "occurs on an earlier line too, which is kept")
+            rows[instant] = parse(fields)
         except BadReading as fault:
             left_out.append(RejectedLine(table.path.name, line, fault.value, fault.reason))
             continue
         zones.setdefault(zone, line)
     raise_if_mostly_invalid(table.path, len(rows), left_out)
     times = sorted(rows)
-    values = np.array([rows[time] for time in times])
+    values = np.array([rows[instant] for instant in times])
     dataset = xr.Dataset(
         {name: (("time",), values[:, column], dict(attrs)) for column, (name, attrs) in enumerate(variables.items())},
         coords={"time": np.array(times, dtype="datetime64[ns]")},
@@ -240,91 +294,3 @@ def read_timed_rows(
     )
     dataset["time"].attrs["reference"] = describe_time_zone(table.path, zones)
     return dataset
-
-
-def parse_time(text: str) -> tuple[np.datetime64, str]:
-    """Parse an ISO 8601 time.
-
-    Parameters
-    ----------
-    text : str
-        Such as 2026-03-09T06:30:05+00:00; a time without a zone is taken as UTC.
-
-    Returns
-    -------
-    time : numpy.datetime64
-        UTC, in ns.
-    zone : str
-        Its zone as +hhmm; "" where the text has none.
-
-    Raises
-    ------
-    BadReading
-        The text is not a time.
-    """
-    try:
-        stamp = datetime.fromisoformat(text.strip())
-    except ValueError:
-        raise BadReading(text, "is not an ISO 8601 time such as 2026-03-09T06:30:05+00:00") from None
-    zone = "" if stamp.tzinfo is None else stamp.strftime("%z")
-    utc = stamp if stamp.tzinfo is None else stamp.astimezone(UTC).replace(tzinfo=None)
-    return np.datetime64(utc, "ns"), zone
-
-
-def raise_if_mostly_invalid(path: Path, kept: int, left_out: list[RejectedLine]) -> None:
-    """Raise where fewer than half of the lines can be used: that is a fault of the file, not of single readings.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        For the message.
-    kept : int
-        Number of lines that can be used.
-    left_out : list of RejectedLine
-        Those that cannot.
-
-    Raises
-    ------
-    LaserFormatError
-        There are no lines, or more lines were left out than kept.
-    """
-    if kept == 0 and not left_out:
-        raise LaserFormatError(f"{path}: no reading below the header; export the measured values again")
-    if kept < len(left_out):
-        first = left_out[0]
-        raise LaserFormatError(
-            f"{path}: {len(left_out)} of {kept + len(left_out)} lines cannot be used, the first is line {first.line}: "
-            f"{first.value!r} {first.reason}; correct that column"
-        )
-
-
-def describe_time_zone(path: Path, zones: dict[str, int]) -> str:
-    """Return how the times of a file were converted to UTC, in words.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        For the message.
-    zones : dict of str to int
-        Number of the first line with each zone (+hhmm; "" for none).
-
-    Returns
-    -------
-    str
-        For the attribute ``reference`` of the times.
-
-    Raises
-    ------
-    LaserFormatError
-        Some times have a zone and some have none: the meaning of the latter is unknown.
-    """
-    if "" in zones and len(zones) > 1:
-        other = next(zone for zone in zones if zone)
-        raise LaserFormatError(
-            f"{path}: the time on line {zones['']} has no zone, that on line {zones[other]} has {other}; write all of them with a zone"
-        )
-    if "" in zones:
-        return NO_ZONE
-    if set(zones) == {"+0000"}:
-        return "UTC in the file"
-    return "converted to UTC from " + ", ".join(sorted(zones))

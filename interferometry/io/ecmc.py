@@ -11,10 +11,14 @@ import numpy as np
 import xarray as xr
 
 from interferometry.deviations import build_deviations
-from interferometry.io.delimited import LaserFormatError, RejectedLine
+from interferometry.io.encodings import decode_text
+from interferometry.io.faults import BadReading, LaserFormatError, RejectedLine
+from interferometry.io.numerals import parse_number
 
 _ASSIGNMENT = re.compile(r"^(TGT_DATA|REF_DATA_FWD|REF_DATA_BWD|UNIT|CYCLES|POSITIONS)(?:\[(\d+)(?:,(\d+))?\])?=(.*)$")
 _UM_PER_UNIT = {"mm": 1e3, "um": 1.0, "m": 1e6}
+#: Digits of the number of a target or cycle; a damaged file may name the billionth.
+_MOST_DIGITS = 5
 _DIRECTION = {"REF_DATA_FWD": 0, "REF_DATA_BWD": 1}
 
 
@@ -55,7 +59,7 @@ def read_ecmc_log(path: Path) -> xr.Dataset:
     target_at: dict[int, float] = {}
     readings: dict[tuple[int, int, int], float] = {}
     left_out: list[RejectedLine] = []
-    for line, text in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for line, text in enumerate(decode_text(path, path.read_bytes()).splitlines(), start=1):
         match = _ASSIGNMENT.match(text.strip())
         if match is None:
             continue
@@ -64,9 +68,13 @@ def read_ecmc_log(path: Path) -> xr.Dataset:
             stated[name] = value.strip()
             continue
         try:
-            number = float(value)
-        except ValueError:
-            left_out.append(RejectedLine(path.name, line, value, "is not a number"))
+            number = parse_number(value)
+        except BadReading as fault:
+            left_out.append(RejectedLine(path.name, line, value, fault.reason))
+            continue
+        needed = [target] if name == "TGT_DATA" else [target, cycle]
+        if not all(index and len(index) <= _MOST_DIGITS and int(index) > 0 for index in needed):
+            left_out.append(RejectedLine(path.name, line, text, "names no target or cycle from 1"))
             continue
         if name == "TGT_DATA":
             target_at[int(target)] = number
@@ -100,8 +108,13 @@ def _counts(
         raise LaserFormatError(
             f"{path}: TGT_DATA gives targets {sorted(target_at)}, but readings refer to others; give each its position"
         )
+    empty = sorted(set(range(cycles)) - {index[0] for index in readings})
+    if empty:
+        raise LaserFormatError(
+            f"{path}: there is a cycle {cycles}, but no reading of cycle {empty[0] + 1}; the file is damaged"
+        )
     for name, count in (("CYCLES", cycles), ("POSITIONS", targets)):
-        if name in stated and int(stated[name]) != count:
+        if name in stated and stated[name] != str(count):
             raise LaserFormatError(
                 f"{path}: {name}={stated[name]}, but {count} were found; the file is cut short or joined from two"
             )

@@ -2,91 +2,70 @@
 
 from __future__ import annotations
 
-import itertools
-import json
-from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
 import xarray as xr
 
-from interferometry.deviations import (
-    DIRECTIONS,
-    DUPLICATE,
-    OUT_OF_ORDER,
-    UNREADABLE,
-    Flag,
-    build_deviations,
-    detect_out_of_order,
-    set_flag,
-)
-from interferometry.io.delimited import (
-    BadReading,
-    DelimitedTable,
-    LaserFormatError,
-    RejectedLine,
-    describe_time_zone,
-    parse_time,
-    raise_if_mostly_invalid,
-    read_table,
-    read_timed_rows,
-)
+from interferometry.io.delimited import DelimitedTable, read_grids, read_timed_rows, table_below
 from interferometry.io.ecmc import is_ecmc_log, read_ecmc_log
+from interferometry.io.faults import BadReading, LaserFormatError
+from interferometry.io.headings import UNITS, read_heading
+from interferometry.io.long_table import find_long_table, read_long_table, what_is_missing
+from interferometry.io.readings import Readings, check_and_assemble
 from interferometry.io.renishaw import read_rtl
+from interferometry.io.wide_table import find_wide_table, read_wide_table
 
 DEVIATION_COLUMNS = ("cycle", "direction", "target", "position_mm", "time", "deviation_um")
-POSITION_TOLERANCE_MM = 1e-4
 
-#: Column of the environment file, variable, unit, smallest and largest plausible value.
+#: Column of the environment file, variable, unit, kind of quantity, smallest and largest plausible value.
 ENVIRONMENT_COLUMNS = (
-    ("air_temperature_degC", "air_temperature", "degC", -9.0, 60.0),
-    ("air_pressure_hPa", "air_pressure", "hPa", 500.0, 1200.0),
-    ("relative_humidity_percent", "relative_humidity", "percent", 0.0, 100.0),
-    ("material_temperature_degC", "material_temperature", "degC", -9.0, 80.0),
+    ("air_temperature_degC", "air_temperature", "degC", "temperature", -9.0, 60.0),
+    ("air_pressure_hPa", "air_pressure", "hPa", "pressure", 500.0, 1200.0),
+    ("relative_humidity_percent", "relative_humidity", "percent", "humidity", 0.0, 100.0),
+    ("material_temperature_degC", "material_temperature", "degC", "temperature", -9.0, 80.0),
 )
-
-
-@dataclass(frozen=True)
-class _Reading:
-    line: int
-    cycle: int
-    direction: str
-    target: int
-    position: float
-    time: np.datetime64
-    deviation: float
 
 
 def read_deviations(
-    path: str | Path, *, feed_mm_per_min: float | None = None, dwell_s: float | None = None
+    path: str | Path,
+    *,
+    feed_mm_per_min: float | None = None,
+    dwell_s: float | None = None,
+    sheet: str | None = None,
+    rotary: bool = False,
 ) -> xr.Dataset:
     r"""Read positioning deviations from a file.
 
     Parameters
     ----------
     path : str or pathlib.Path
-        A CSV file with the columns cycle, direction, target, position_mm, time, deviation_um; a Renishaw linear test (.rtl); or a
-        log of the ecmc test tools (.dat). The kind of file is recognised from its content.
+        Delimited text or a spreadsheet (.xlsx, .xls, .ods) with one reading per line (columns cycle, direction, target, position_mm,
+        time, deviation_um) or with one column or row per run; a Renishaw linear test (.rtl); or a log of the ecmc test tools (.dat).
+        The kind of file is recognised from its content; headings may be English, German, French, Spanish or Chinese and carry their
+        unit (docs/formats.md).
     feed_mm_per_min : float, optional
         Feed between targets, mm/min.
     dwell_s : float, optional
         Time at rest at each target, s. With both, the times of readings, which a .rtl does not hold, are reconstructed more closely.
         Ignored where every reading has its own time.
+    sheet : str, optional
+        Name of the sheet of a spreadsheet; None: the only one that holds a table of deviations.
+    rotary : bool, optional
+        Whether a rotary axis is accepted: its positions are in deg and its deviations in arcsec, as the units of the variables say.
 
     Returns
     -------
     xarray.Dataset
         Keeps ``contract.DEVIATIONS``: ``deviation`` (um), ``time`` (UTC) and ``quality_flag`` (cycle, direction, target), ``position``
-        (mm; target). ``attrs["left_out"]`` is a JSON list of the lines left out (path, line, value, reason);
+        (mm; target). ``attrs["left_out"]`` is a JSON list of the lines left out (path, line, value, reason), ``attrs["notes"]`` one of
+        what the reader assumed;
         ``time.attrs["origin"]`` is "recorded", "reconstructed" or "none"; ``time_u`` is the standard uncertainty of reconstructed
         times, s.
 
     Raises
     ------
     LaserFormatError
-        The file cannot be used as a whole.
+        The file cannot be used as a whole, or it is of a rotary axis and `rotary` is False.
     OSError
         The file cannot be opened (FileNotFoundError where there is none); its ``filename`` names it.
 
@@ -107,7 +86,8 @@ def read_deviations(
     [[0.12, 1.48]]
     """
     path = Path(path)
-    start = path.read_bytes()[:4096]
+    with path.open("rb") as stream:
+        start = stream.read(4096)
     if b"HEADER::" in start and b"\nData:" in start:
         raise LaserFormatError(
             f"{path}: a dynamic capture has no targets; read it with interferometry.io.renishaw.read_rtx"
@@ -116,179 +96,37 @@ def read_deviations(
         return read_rtl(path, feed_mm_per_min=feed_mm_per_min, dwell_s=dwell_s)
     if is_ecmc_log(start):
         return read_ecmc_log(path)
-    return _read_deviations_csv(path)
-
-
-def _read_deviations_csv(path: Path) -> xr.Dataset:
-    table = read_table(path, DEVIATION_COLUMNS)
-    readings, left_out, zones, unreadable = _parse_readings(table)
-    raise_if_mostly_invalid(path, len(readings), left_out)
-    readings, duplicates = _drop_duplicates(path, readings, left_out)
-    readings = _drop_misplaced(path, readings, left_out)
-    readings = _drop_wrong_times(path, readings, left_out)
-    _check_cycles(path, readings)
-    time_reference = describe_time_zone(path, zones)
-    deviations = _assemble(readings)
-    deviations = _flag_cells(deviations, UNREADABLE, unreadable)
-    deviations = _flag_cells(deviations, DUPLICATE, duplicates)
-    deviations = set_flag(deviations, OUT_OF_ORDER, detect_out_of_order(deviations))
-    deviations["time"].attrs.update(origin="recorded", reference=time_reference)
-    ignored = [name for name in table.columns if name not in DEVIATION_COLUMNS]
-    deviations.attrs.update(
-        source=path.name,
-        left_out=json.dumps([asdict(line) for line in left_out]),
-        missing=int(np.isnan(deviations["deviation"].values).sum()),
-        columns_ignored=json.dumps(ignored),
-    )
+    deviations = _read_table_of_deviations(path, sheet)
+    if deviations["deviation"].attrs["units"] != "um" and not rotary:
+        raise LaserFormatError(
+            f"{path}: the positions are angles; of a rotary axis only the evaluation by ISO 230-2 is done (thermofuse iso230): heat and "
+            "expansion are explained along a linear axis"
+        )
     return deviations
 
 
-def _parse_readings(
-    table: DelimitedTable,
-) -> tuple[list[_Reading], list[RejectedLine], dict[str, int], set[tuple[int, str, int]]]:
-    readings: list[_Reading] = []
-    left_out: list[RejectedLine] = []
-    zones: dict[str, int] = {}
-    unreadable: set[tuple[int, str, int]] = set()
-    for line, fields in table.records():
-        cell: tuple[int, str, int] | None = None
-        try:
-            if fields is None:
-                raise BadReading("", f"does not have {len(table.columns)} fields")
-            direction = fields["direction"].strip().lower()
-            if direction not in DIRECTIONS:
-                raise BadReading(fields["direction"], "is neither 'positive' nor 'negative'")
-            cell = (table.count(fields["cycle"]), direction, table.count(fields["target"]))
-            time, zone = parse_time(fields["time"])
-            reading = _Reading(
-                line, *cell, table.number(fields["position_mm"]), time, table.number(fields["deviation_um"])
-            )
-        except BadReading as fault:
-            left_out.append(RejectedLine(table.path.name, line, fault.value, fault.reason))
-            if cell is not None:
-                unreadable.add(cell)
-            continue
-        zones.setdefault(zone, line)
-        readings.append(reading)
-    return readings, left_out, zones, unreadable
-
-
-def _drop_duplicates(
-    path: Path, readings: list[_Reading], left_out: list[RejectedLine]
-) -> tuple[list[_Reading], set[tuple[int, str, int]]]:
-    first: dict[tuple[int, str, int], _Reading] = {}
-    repeated: set[tuple[int, str, int]] = set()
-    for reading in readings:
-        cell = (reading.cycle, reading.direction, reading.target)
-        if cell in first:
-            repeated.add(cell)
-            reason = (
-                f"cycle {reading.cycle} {reading.direction} target {reading.target} already stands on line {first[cell].line}, "
-                "which is kept"
-            )
-            left_out.append(RejectedLine(path.name, reading.line, str(reading.deviation), reason))
-        else:
-            first[cell] = reading
-    return list(first.values()), repeated
-
-
-def _drop_misplaced(path: Path, readings: list[_Reading], left_out: list[RejectedLine]) -> list[_Reading]:
-    """Leave out readings whose position is not the one that 90 % of their target's readings have."""
-    by_target: dict[int, list[_Reading]] = defaultdict(list)
-    for reading in readings:
-        by_target[reading.target].append(reading)
-    kept: list[_Reading] = []
-    for target, group in sorted(by_target.items()):
-        typical = float(np.median([reading.position for reading in group]))
-        off = [reading for reading in group if abs(reading.position - typical) > POSITION_TOLERANCE_MM]
-        if len(off) > max(1, 0.1 * len(group)):
-            raise LaserFormatError(
-                f"{path}: target {target} stands at {off[0].position} mm on line {off[0].line} but at {typical} mm elsewhere "
-                f"({len(off)} of {len(group)} readings disagree); position_mm is the programmed position, the same in every cycle"
-            )
-        for reading in off:
-            reason = f"target {target} stands at {typical} mm elsewhere"
-            left_out.append(RejectedLine(path.name, reading.line, str(reading.position), reason))
-        kept += [reading for reading in group if reading not in off]
-    positions = {target: group[0].position for target, group in by_target.items()}
-    for first, second in itertools.pairwise(sorted(positions, key=positions.__getitem__)):
-        if abs(positions[first] - positions[second]) <= POSITION_TOLERANCE_MM:
-            raise LaserFormatError(
-                f"{path}: targets {first} and {second} both stand at {positions[first]} mm; number each position once"
-            )
-    return kept
-
-
-def _drop_wrong_times(path: Path, readings: list[_Reading], left_out: list[RejectedLine]) -> list[_Reading]:
-    """Leave out single readings whose time lies beyond the middle of the neighbouring cycles."""
-    centres = _cycle_centres(readings)
-    numbers = sorted(centres)
-    if len(numbers) < 2:
-        return readings
-    steps = np.diff([centres[number] for number in numbers])
-    if np.any(steps <= 0):
-        return readings
-    typical = float(np.median(steps))
-    bounds: dict[int, tuple[float, float]] = {}
-    for i, number in enumerate(numbers):
-        early = centres[numbers[i - 1]] if i else centres[number] - typical
-        late = centres[numbers[i + 1]] if i + 1 < len(numbers) else centres[number] + typical
-        bounds[number] = (early, late)
-    kept = []
-    for reading in readings:
-        early, late = bounds[reading.cycle]
-        if early <= reading.time.astype("i8") <= late:
-            kept.append(reading)
-        else:
-            reason = f"is not a time within cycle {reading.cycle}"
-            left_out.append(RejectedLine(path.name, reading.line, str(reading.time), reason))
-    return kept
-
-
-def _cycle_centres(readings: Sequence[_Reading]) -> dict[int, float]:
-    times: dict[int, list[int]] = defaultdict(list)
-    for reading in readings:
-        times[reading.cycle].append(int(reading.time.astype("i8")))
-    return {cycle: float(np.median(values)) for cycle, values in times.items()}
-
-
-def _check_cycles(path: Path, readings: list[_Reading]) -> None:
-    """Raise where cycles run backwards or overlap in time."""
-    ends: dict[int, tuple[_Reading, _Reading]] = {}
-    for reading in readings:
-        low, high = ends.get(reading.cycle, (reading, reading))
-        ends[reading.cycle] = (min(low, reading, key=lambda r: r.time), max(high, reading, key=lambda r: r.time))
-    numbers = sorted(ends)
-    for number, following in itertools.pairwise(numbers):
-        last, first = ends[number][1], ends[following][0]
-        if first.time <= last.time:
-            raise LaserFormatError(
-                f"{path}: cycle {following} begins at {first.time} (line {first.line}) before cycle {number} ends at {last.time} "
-                f"(line {last.line}); cycles must follow each other in time: correct the cycle numbers or the clock"
-            )
-
-
-def _assemble(readings: Sequence[_Reading]) -> xr.Dataset:
-    cycles = sorted({reading.cycle for reading in readings})
-    position = {reading.target: reading.position for reading in readings}
-    targets = sorted(position)
-    row = {cycle: i for i, cycle in enumerate(cycles)}
-    column = {target: i for i, target in enumerate(targets)}
-    deviation = np.full((len(cycles), 2, len(targets)), np.nan)
-    time = np.full(deviation.shape, np.datetime64("NaT", "ns"))
-    for reading in readings:
-        index = row[reading.cycle], DIRECTIONS.index(reading.direction), column[reading.target]
-        deviation[index], time[index] = reading.deviation, reading.time
-    return build_deviations(cycles, targets, np.array([position[target] for target in targets]), deviation, time)
-
-
-def _flag_cells(deviations: xr.Dataset, flag: Flag, cells: set[tuple[int, str, int]]) -> xr.Dataset:
-    where = np.zeros(deviations["deviation"].shape, dtype=bool)
-    cycles, targets = deviations["cycle"].values.tolist(), deviations["target"].values.tolist()
-    for cycle, direction, target in cells:
-        if cycle in cycles and target in targets:
-            where[cycles.index(cycle), DIRECTIONS.index(direction), targets.index(target)] = True
-    return set_flag(deviations, flag, where)
+def _read_table_of_deviations(path: Path, sheet: str | None) -> xr.Dataset:
+    """Read delimited text or a spreadsheet: one reading per line, or position by run."""
+    grids = read_grids(path, sheet=sheet)
+    found: dict[str, Readings] = {}
+    for grid in grids:
+        long = find_long_table(grid)
+        wide = find_wide_table(grid) if long is None else None
+        if long is not None:
+            found.setdefault(grid.sheet, read_long_table(long))
+        elif wide is not None:
+            found.setdefault(grid.sheet, read_wide_table(wide))
+    if len(found) > 1:
+        raise LaserFormatError(
+            f"{path}: the sheets {', '.join(map(repr, found))} each hold a table of deviations; name one of them (sheet = ...), or save it "
+            "as a file of its own"
+        )
+    if not found:
+        raise LaserFormatError(
+            f"{grids[0].place}: no table of deviations; {what_is_missing(grids[0])}; expected one reading per line with the "
+            f"columns {','.join(DEVIATION_COLUMNS)}, or a table of position by run such as 'Position [mm],1+ [um],1- [um],2+ [um]'"
+        )
+    return check_and_assemble(next(iter(found.values())))
 
 
 def read_environment(path: str | Path) -> xr.Dataset:
@@ -328,20 +166,52 @@ def read_environment(path: str | Path) -> xr.Dataset:
     1000.2
     """
     path = Path(path)
-    table = read_table(path, ("time", *(column for column, *_ in ENVIRONMENT_COLUMNS)))
+    table, time, columns = _environment_table(path)
     on_scale = {"units_metadata": "temperature: on_scale"}
     variables = {
-        name: {"units": unit, **(on_scale if unit == "degC" else {})} for _, name, unit, _, _ in ENVIRONMENT_COLUMNS
+        name: {"units": unit, **(on_scale if unit == "degC" else {})} for _, name, unit, *_ in ENVIRONMENT_COLUMNS
     }
 
     def parse(fields: dict[str, str]) -> list[float]:
-        return [_plausible(table, column, fields[column], low, high) for column, _, _, low, high in ENVIRONMENT_COLUMNS]
+        values = []
+        for (column, _, _, _, low, high), (text, unit) in zip(ENVIRONMENT_COLUMNS, columns.values(), strict=True):
+            value = table.numerals.reading(fields[text]) * UNITS[unit].factor + UNITS[unit].offset
+            if not low <= value <= high:
+                raise BadReading(fields[text], f"lies outside {low:g} .. {high:g}, the range of {column} in its unit")
+            values.append(value)
+        return values
 
-    return read_timed_rows(table, variables, parse)
+    return read_timed_rows(table, variables, parse, time=time)
 
 
-def _plausible(table: DelimitedTable, column: str, text: str, low: float, high: float) -> float:
-    value = table.number(text)
-    if not low <= value <= high:
-        raise BadReading(text, f"lies outside {low:g} .. {high:g}, the range of {column} in its unit")
-    return value
+def _environment_table(path: Path) -> tuple[DelimitedTable, str, dict[str, tuple[str, str]]]:
+    """Return the table of a log, the column of times, and heading and unit of each variable."""
+    needed = {name: kind for _, name, _, kind, *_ in ENVIRONMENT_COLUMNS}
+    grids = read_grids(path)
+    best: tuple[int, str] = (-99, "")
+    for grid in grids:
+        for at, (line, fields) in enumerate(grid.rows):
+            headings = {heading.role: heading for heading in map(read_heading, fields) if heading.role is not None}
+            units = {name: headings[name].unit for name in needed if name in headings}
+            lacking = [column for column, name, *_ in ENVIRONMENT_COLUMNS if units.get(name) is None]
+            lacking += [] if "time" in headings else ["time"]
+            if not lacking:
+                _check_units(path, line, {name: headings[name].text for name in needed}, units, needed)
+                table = table_below(grid, at)
+                named = {name: (headings[name].text, units[name] or "") for name in needed}
+                return table, headings["time"].text, named
+            best = max(best, (-len(lacking), f"line {line} lacks {', '.join(lacking)}"), key=lambda each: each[0])
+    expected = ",".join(("time", *(column for column, *_ in ENVIRONMENT_COLUMNS)))
+    raise LaserFormatError(
+        f"{path}: no table of air and material: {best[1]}; expected {expected!r} (the heading names the unit, which may be another)"
+    )
+
+
+def _check_units(
+    path: Path, line: int, texts: dict[str, str], units: dict[str, str | None], needed: dict[str, str]
+) -> None:
+    for name, kind in needed.items():
+        if UNITS[units[name] or ""].kind != kind:
+            raise LaserFormatError(
+                f"{path}, line {line}: the unit of {texts[name]!r} is none of a {kind}; correct the heading"
+            )

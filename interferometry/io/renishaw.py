@@ -12,12 +12,18 @@ import numpy as np
 import xarray as xr
 
 from interferometry.deviations import DIRECTIONS, build_deviations
-from interferometry.io.delimited import NO_ZONE, SENTINEL_MAGNITUDE, LaserFormatError, RejectedLine
+from interferometry.io.dates import NO_ZONE
+from interferometry.io.faults import BadReading, LaserFormatError, RejectedLine
+from interferometry.io.numerals import SENTINEL_MAGNITUDE, parse_number
 
 #: A temperature sensor that is not connected reads -10 degC.
 UNCONNECTED_DEGC = -10.0
 USER_TEXT = ("machine", "serial_number", "date", "by", "axis", "location", "title")
+#: "2014-10-08 10:53:49"; the last digit of the seconds may be lost to a control byte.
 _TIME = re.compile(r"(\d{4})[-/.](\d\d)[-/.](\d\d)[ T]+(\d\d):(\d\d):(\d)(\d?)")
+#: "10:46 Dec 12 2016", without seconds.
+_TIME_WITHOUT_SECONDS = re.compile(r"(\d\d):(\d\d) ([A-Z][a-z]{2}) (\d\d?) (\d{4})")
+_MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
 
 
 @dataclass
@@ -74,6 +80,7 @@ def read_rtl(
         )
     targets = _parse_targets(path, sections)
     runs, left_out = _parse_runs(path, sections, len(targets))
+    notes = _clear_filled_runs(runs, _is_unidirectional(sections))
     start, end, start_u = _parse_test_times(sections)
     schedule, schedule_u = _rebuild_schedule(runs, targets, start, end, feed_mm_per_min, dwell_s)
     deviation, seconds = _lay_out(runs, targets, schedule)
@@ -95,6 +102,7 @@ def read_rtl(
         left_out=json.dumps([asdict(line) for line in left_out]),
         missing=int(np.isnan(deviation).sum()),
         runs_empty=json.dumps([run.number for run in runs if run.is_empty]),
+        notes=json.dumps(notes),
         user_text=json.dumps(_parse_user_text(sections)),
     )
     return dataset
@@ -129,6 +137,26 @@ def _split_sections(path: Path, text: str) -> dict[str, list[tuple[int, str]]]:
     return sections
 
 
+def _is_unidirectional(sections: dict[str, list[tuple[int, str]]]) -> bool:
+    """Return whether the second of the flags says that the test was measured in one direction."""
+    return _keyed(sections["TARGET DATA"]).get("flags", "").split()[1:2] == ["1"]
+
+
+def _clear_filled_runs(runs: list[_Run], unidirectional: bool) -> list[str]:
+    """Take the zeros with which some programs fill the reverse runs of a unidirectional test as missing; return what to tell."""
+    zero = [run for run in runs if run.deviations and all(value == 0 for value in run.deviations)]
+    if not zero or len(zero) == len(runs):
+        return []
+    named = ", ".join(str(run.number) for run in zero)
+    if not unidirectional:
+        return [f"warning: every reading of run {named} is 0: a run that was filled in and not measured?"]
+    for run in zero:
+        run.deviations = [math.nan] * len(run.deviations)
+    return [
+        f"run {named} holds nothing but zeros and the flags say that one direction was measured: taken as not measured"
+    ]
+
+
 def _keyed(section: list[tuple[int, str]]) -> dict[str, str]:
     """Return values by key, letter case and spaces of the key ignored ("Date Time" and "DateTime" both occur)."""
     pairs = (content.split(":", 1) for _, content in section if ":" in content)
@@ -137,15 +165,15 @@ def _keyed(section: list[tuple[int, str]]) -> dict[str, str]:
 
 def _parse_targets(path: Path, sections: dict[str, list[tuple[int, str]]]) -> np.ndarray:
     section = sections["TARGET DATA"]
-    count = int(_keyed(section).get("targetcount", "0") or 0)
+    count = _whole(path, section, "Target-count", 0)
     begin = next((i for i, (_, content) in enumerate(section) if re.match(r"Targets\s*:", content)), None)
     numbers: list[float] = []
     for line, content in section[begin + 1 :] if begin is not None else []:
         if ":" in content:
             break
         try:
-            numbers += [float(word) for word in content.replace(",", ".").split()]
-        except ValueError:
+            numbers += [parse_number(word) for word in content.replace(",", ".").split()]
+        except BadReading:
             raise LaserFormatError(
                 f"{path}, line {line}: {content.strip()!r} is not a row of target positions in mm"
             ) from None
@@ -154,6 +182,27 @@ def _parse_targets(path: Path, sections: dict[str, list[tuple[int, str]]]) -> np
             f"{path}: Target-count is {count}, but {len(numbers)} target positions follow; the file is damaged"
         )
     return np.array(numbers)
+
+
+def _whole(path: Path, section: list[tuple[int, str]], name: str, default: int) -> int:
+    """Return the whole number that a line of a section gives, `default` where there is no such line."""
+    text = _keyed(section).get(re.sub(r"[^a-z]", "", name.lower()), "")
+    if not text:
+        return default
+    if not re.fullmatch(r"\d{1,9}", text):
+        line = next(line for line, content in section if content.lower().startswith(name.lower()))
+        raise LaserFormatError(
+            f"{path}, line {line}: {name} is {text!r} and no whole number; copy the file again from the measuring computer"
+        )
+    return int(text)
+
+
+def _decimal(word: str) -> float:
+    """Return a number of any size; ValueError where the word is none, as "1_2.5", which Python would read as 12.5."""
+    value = float("" if "_" in word else word.replace("\u2212", "-"))
+    if math.isnan(value):
+        raise ValueError(word)
+    return value
 
 
 def _parse_runs(
@@ -166,8 +215,9 @@ def _parse_runs(
         if words[0] == "Run":
             continue
         try:
-            run, target, value = int(words[0]), int(words[1]), float(words[2])
-        except (ValueError, IndexError):
+            run, target, value = (_decimal(word) for word in words[:3])
+            run, target = int(words[0]), int(words[1])
+        except ValueError:
             left_out.append(RejectedLine(path.name, line, content.strip(), "is not 'run target deviation'"))
             continue
         if not 1 <= target <= targets or run < 1:
@@ -183,7 +233,7 @@ def _parse_runs(
             continue
         rows.targets.append(target)
         rows.deviations.append(value if abs(value) < SENTINEL_MAGNITUDE else math.nan)
-    stated = int(_keyed(sections.get("RUNS", [])).get("runcount", max(runs, default=0)))
+    stated = _whole(path, sections.get("RUNS", []), "Run-count", max(runs, default=0))
     if not runs or max(runs) > stated:
         raise LaserFormatError(
             f"{path}: Run-count is {stated}, but DEVIATIONS holds runs {sorted(runs)}; the file is damaged"
@@ -202,14 +252,21 @@ def _direction(run: _Run, targets: np.ndarray) -> str:
 def _parse_test_times(
     sections: dict[str, list[tuple[int, str]]],
 ) -> tuple[np.datetime64 | None, np.datetime64 | None, float]:
-    """Return start, end and the standard uncertainty of the start in s; a digit lost to a control byte costs 10/sqrt(12) s."""
-    stamps = _TIME.findall(_keyed(sections.get("ENVIRONMENT", [])).get("datetime", ""))
-    if len(stamps) != 2:
-        return None, None, 0.0
+    """Return start, end and the standard uncertainty of the start in s: 10 or 60 s / sqrt(12) where a digit or the seconds are lost."""
+    text = _keyed(sections.get("ENVIRONMENT", [])).get("datetime", "")
     times, lost = [], 0.0
-    for year, month, day, hour, minute, tens, ones in stamps:
-        lost = math.hypot(lost, 0.0 if ones else 10 / math.sqrt(12))
-        times.append(np.datetime64(f"{year}-{month}-{day}T{hour}:{minute}:{tens}{ones or 5}", "ns"))
+    try:
+        for year, month, day, hour, minute, tens, ones in _TIME.findall(text):
+            lost = math.hypot(lost, 0.0 if ones else 10 / math.sqrt(12))
+            times.append(np.datetime64(f"{year}-{month}-{day}T{hour}:{minute}:{tens}{ones or 5}", "ns"))
+        for hour, minute, month, day, year in _TIME_WITHOUT_SECONDS.findall(text):
+            lost = math.hypot(lost, 60 / math.sqrt(12))
+            number = _MONTHS.index(month) + 1
+            times.append(np.datetime64(f"{year}-{number:02d}-{int(day):02d}T{hour}:{minute}:30", "ns"))
+    except ValueError:
+        return None, None, 0.0
+    if len(times) != 2 or not times[0] <= times[1]:
+        return None, None, 0.0
     return times[0], times[1], lost
 
 
@@ -231,7 +288,7 @@ def _rebuild_schedule(
     step = duration / max(count, 1)
     turn = step
     travel: dict[int, np.ndarray] = {run.number: np.full(len(run.targets) - 1, step) for run in measured}
-    if feed_mm_per_min and dwell_s is not None:
+    if feed_mm_per_min and dwell_s is not None and measured:
         for run in measured:
             travel[run.number] = np.abs(np.diff(targets[np.array(run.targets) - 1])) / feed_mm_per_min * 60 + dwell_s
         moving = sum(float(times.sum()) for times in travel.values())
@@ -273,9 +330,14 @@ def _parse_environment(
 
 
 def _pair(text: str) -> np.ndarray:
-    """Return the start and end values of one line of the ENVIRONMENT block (a status may follow them)."""
-    words = text.replace(",", ".").split()
-    return np.array([float(word) for word in words[:2]])
+    """Return the start and end values of one line of the ENVIRONMENT block (a status may follow them); NaN for what is no number."""
+    values = []
+    for word in text.replace(",", ".").split()[:2]:
+        try:
+            values.append(parse_number(word))
+        except BadReading:
+            values.append(math.nan)
+    return np.array([*values, math.nan, math.nan][:2])
 
 
 def _parse_user_text(sections: dict[str, list[tuple[int, str]]]) -> dict[str, str]:
@@ -299,7 +361,7 @@ def read_rtx(path: str | Path) -> xr.Dataset:
     Raises
     ------
     LaserFormatError
-        A marker is missing, no sample rate is given, or the number of samples is not the one stated.
+        A marker is missing, no sample rate is given, the number of samples is not the one stated, or a sample is no number.
     """
     path = Path(path)
     content = path.read_bytes()
@@ -309,20 +371,28 @@ def read_rtx(path: str | Path) -> xr.Dataset:
             f"{path}: HEADER::, Data: or EOF:: is missing; the file is not a complete .rtx, copy it again"
         )
     lines = [
-        (0, line) for line in content[:begin].decode("latin-1").split("\r\n") if ":" in line and not line.endswith("::")
+        (number, line)
+        for number, line in enumerate(content[:begin].decode("latin-1").split("\r\n"), start=1)
+        if ":" in line and not line.endswith("::")
     ]
     header = {line.split(":", 1)[0].strip(): line.split(":", 1)[1].strip() for _, line in lines}
     keyed = _keyed(lines)
     data = content[begin + len(b"Data:\r\n") : end]
-    rate = float(keyed.get("actualsamplerate") or keyed.get("samplerate") or 0)
+    rate = _header_number(path, lines, "Actual sample rate") or _header_number(path, lines, "Sample rate") or 0.0
     if rate <= 0:
         raise LaserFormatError(f"{path}: no 'Actual sample rate' or 'Sample rate' above 0 in the header")
     usable = len(data) // 8 * 8
     displacement = np.frombuffer(data[:usable], dtype="<f8")
-    stated = int(float(keyed.get("sampleno", displacement.size)))
+    stated = displacement.size if "sampleno" not in keyed else _header_number(path, lines, "Sample no")
     if stated != displacement.size:
         raise LaserFormatError(
-            f"{path}: 'Sample no' is {stated}, but {displacement.size} samples follow; the file is cut short"
+            f"{path}: 'Sample no' is {keyed['sampleno']}, but {displacement.size} samples follow; the file is cut short"
+        )
+    damaged = np.flatnonzero(~np.isfinite(displacement) | (np.abs(displacement) >= SENTINEL_MAGNITUDE))
+    if damaged.size:
+        raise LaserFormatError(
+            f"{path}: {damaged.size} of {displacement.size} samples are no numbers, the first is sample {damaged[0] + 1}; "
+            "the file is damaged, copy it again from the measuring computer"
         )
     return xr.Dataset(
         {
@@ -331,3 +401,17 @@ def read_rtx(path: str | Path) -> xr.Dataset:
         },
         attrs={"source": path.name, "header": json.dumps(header)},
     )
+
+
+def _header_number(path: Path, lines: list[tuple[int, str]], name: str) -> float | None:
+    """Return the number that a line of the header gives, None without such a line."""
+    for line, content in lines:
+        key, _, text = content.partition(":")
+        if key.strip().lower() == name.lower() and text.strip():
+            try:
+                return parse_number(text.strip().replace(",", "."))
+            except BadReading as fault:
+                raise LaserFormatError(
+                    f"{path}, line {line}: {name} is {fault.value!r}, which {fault.reason}; copy the file again"
+                ) from None
+    return None

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from interferometry.io.delimited import LaserFormatError
 from interferometry.io.ecmc import is_ecmc_log, read_ecmc_log
+from interferometry.io.faults import LaserFormatError
 from interferometry.io.readers import read_deviations
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from interferometry.deviations import DUPLICATE, MISSING, OUT_OF_ORDER, UNREADABLE, sort_readings
-from interferometry.io.delimited import LaserFormatError
+from interferometry.io.faults import LaserFormatError
 from interferometry.io.readers import read_deviations, read_environment
 
 HEADER = "cycle,direction,target,position_mm,time,deviation_um"
@@ -165,8 +165,10 @@ def test_two_targets_at_one_position_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("header", "message"),
     [
-        (HEADER.replace("deviation_um", "deviation_mm"), "no column deviation_um; .* convert the values and rename"),
-        (HEADER.replace("time,", ""), "no column time"),
+        (HEADER.replace("deviation_um", "deviation"), r"'deviation' has no unit; write it in the heading, .*\[um\]"),
+        (HEADER.replace("deviation_um", "deviation_deg"), "position in mm, deviation in deg; give both as lengths"),
+        (HEADER.replace("time,", ""), "18 of 18 lines cannot be used, the first is line 2: '' does not have 5 fields"),
+        (HEADER.replace("direction", "way"), "has columns of cycle, .* but no column of a direction"),
         (HEADER + ",time", "column time occurs more than once"),
     ],
 )
@@ -190,8 +192,8 @@ def test_files_without_readings_or_without_text_are_refused(tmp_path: Path) -> N
     empty.write_bytes(b"")
     with pytest.raises(LaserFormatError, match="the file is empty"):
         read_deviations(empty)
-    empty.write_bytes(b"cycle\xff\xfe")
-    with pytest.raises(LaserFormatError, match="byte 5 is not UTF-8 text"):
+    empty.write_bytes(b"cycle\x00\xff\xfe")
+    with pytest.raises(LaserFormatError, match="character 6 is a zero byte, so the file is not text"):
         read_deviations(empty)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from interferometry.io.delimited import LaserFormatError
+from interferometry.io.faults import LaserFormatError
 from interferometry.io.readers import read_deviations
 from interferometry.io.renishaw import read_rtx
 
