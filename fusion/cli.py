@@ -186,16 +186,21 @@ def inspect(
 @app.command()
 def iso230(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="Deviations: .rtl, CSV, or a log of a positioning test.")
+        Path,
+        typer.Argument(
+            metavar="FILE", help="Deviations: .rtl, a table (text, XLSX, ODS), or a log of a positioning test."
+        ),
     ],
     cycles: Annotated[str | None, typer.Option(help="Window, for example 1-5; left out: all cycles.")] = None,
 ) -> None:
     """Evaluate a file by ISO 230-2."""
-    from fusion.report.terminal import iso230_tables
+    from fusion.report.terminal import iso230_remarks, iso230_tables
 
     with _answering():
         for table in iso230_tables(file, cycles):
             console.print(table)
+        for line in iso230_remarks(file):
+            console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 @app.command()

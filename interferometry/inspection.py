@@ -26,7 +26,13 @@ def describe_test(deviations: xr.Dataset) -> list[str]:
     list of str
         One fact per line; lines that start with "warning" ask for action.
     """
-    return [*_missing(deviations), *_times(deviations), *_environment(deviations), *_wavelength(deviations)]
+    return [
+        *_missing(deviations),
+        *describe_notes(deviations),
+        *_times(deviations),
+        *_environment(deviations),
+        *_wavelength(deviations),
+    ]
 
 
 def _missing(deviations: xr.Dataset) -> list[str]:
@@ -42,6 +48,24 @@ def _missing(deviations: xr.Dataset) -> list[str]:
     if empty:
         lines.append(f"runs without a reading: {', '.join(str(run) for run in empty)}")
     return lines
+
+
+def describe_notes(deviations: xr.Dataset) -> list[str]:
+    """Return what the reader assumed, and which columns it did not read.
+
+    Parameters
+    ----------
+    deviations : xarray.Dataset
+        What `read_deviations` returns.
+
+    Returns
+    -------
+    list of str
+        Sentences; those that start with "warning" ask for action.
+    """
+    ignored = json.loads(deviations.attrs.get("columns_ignored", "[]"))
+    columns = [f"columns that were not read: {', '.join(ignored)}"] if ignored else []
+    return json.loads(deviations.attrs.get("notes", "[]")) + columns
 
 
 def _times(deviations: xr.Dataset) -> list[str]:

@@ -92,16 +92,17 @@ def evaluate_iso230(
     Parameters
     ----------
     deviations : xarray.Dataset
-        Positioning deviations (cycle, direction, target) in um, as `build_deviations` returns them; readings may be missing.
+        Positioning deviations (cycle, direction, target) in um, as `build_deviations` returns them; readings may be missing. Of a rotary
+        axis they are in arcsec, as the units of ``deviation`` say.
     cycles : sequence of int, optional
         Numbers of the cycles of the window; None: all.
     budget : Iso230Budget, optional
-        None: the calibration of the laser alone.
+        None: the calibration of the laser alone; of a rotary axis only the scatter, as the budget is one of lengths.
 
     Returns
     -------
     xarray.Dataset
-        In um, each with its standard uncertainty ``<name>_u``.
+        In um (arcsec), each with its standard uncertainty ``<name>_u``.
 
         - Per direction and target: ``mean_unidirectional``, ``standard_deviation`` (s_i), ``repeatability`` (4 s_i), ``count`` (1).
         - Per target: ``mean_bidirectional``, ``reversal`` (B_i), ``repeatability_bidirectional`` (R_i).
@@ -117,8 +118,8 @@ def evaluate_iso230(
     Raises
     ------
     InterferometryError
-        ``deviations`` lack a variable of ``contract.DEVIATIONS``, the window names a cycle that was not measured, or no target has two
-        readings in it.
+        ``deviations`` lack a variable of ``contract.DEVIATIONS``, the window names a cycle that was not measured, no target has two
+        readings in it, or a budget is given for a rotary axis.
 
     Notes
     -----
@@ -139,6 +140,10 @@ def evaluate_iso230(
     {'B': 2.0, 'R': 2.0, 'E': 6.0, 'M': 4.5, 'A': 6.0}
     """
     check_dataset(deviations, "deviations")
+    if budget is not None and deviations["deviation"].attrs.get("units") == "arcsec":
+        raise InterferometryError(
+            "budget: its contributions are parts per million of a length; leave it out for a rotary axis, where only the scatter enters"
+        )
     deviations = deviations.reindex(direction=list(DIRECTIONS))
     x, numbers = _select(deviations, cycles)
     count = np.isfinite(x).sum(axis=0)
@@ -147,12 +152,17 @@ def evaluate_iso230(
         _quantities(x, count),
         coords={"direction": deviations["direction"].values, "target": deviations["target"].values},
     )
-    uncertain = _UncertainTest(result, deviations["position"].values, budget or Iso230Budget())
+    unit = deviations["deviation"].attrs.get("units", "um")
+    uncertain = _UncertainTest(result, deviations["position"].values, budget or _default_budget(unit))
     result = result.assign(uncertain.uncertainties())
     for name in result.data_vars:
-        result[name].attrs["units"] = "1" if name == "count" else "um"
+        result[name].attrs["units"] = "1" if name == "count" else unit
     result.attrs["window"] = _name_window(numbers, left_out)
     return result
+
+
+def _default_budget(unit: str) -> Iso230Budget:
+    return Iso230Budget() if unit == "um" else Iso230Budget(device_ppm=0.0)
 
 
 def evaluate_windows(

@@ -318,6 +318,7 @@ class InterferometryTable(_Measured):
     """``[interferometry]``: the readings, and the parameters of the laser's compensation."""
 
     deviations: ExistingFile
+    sheet: str | None = None
     environment: ExistingFile | None = None
     time_zone: TimeZone | None = None
     dead_path_mm: Millimetres = Field(default=0.0, alias="dead_path")

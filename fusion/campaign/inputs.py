@@ -130,7 +130,12 @@ def read_source(campaign: Campaign) -> Source:
     thermography, plan, interferometry = campaign.thermography, campaign.plan, campaign.interferometry
     assert thermography is not None and plan is not None and interferometry is not None
     laser = campaign.resolve(interferometry.deviations)
-    deviations = read_deviations(laser, feed_mm_per_min=interferometry.feed_mm_per_min, dwell_s=interferometry.dwell_s)
+    deviations = read_deviations(
+        laser,
+        feed_mm_per_min=interferometry.feed_mm_per_min,
+        dwell_s=interferometry.dwell_s,
+        sheet=interferometry.sheet,
+    )
     zone = campaign.zone_of("interferometry")
     deviations = bring_to_utc(deviations, zone, file=interferometry.deviations)
     check(deviations, DEVIATIONS, name=laser.name)
@@ -240,6 +245,16 @@ def _notices(source: Source) -> list[Notice]:
         source=str(source.campaign.path),
     )
     notices += left_out_notices(source.deviations, "readings_left_out")
+    notes = json.loads(source.deviations.attrs.get("notes", "[]"))
+    if notes:
+        said = "; ".join(note.removeprefix("warning: ") for note in notes)
+        notices.append(
+            Notice(
+                "readings_as_read",
+                f"{source.interferometry.deviations} was read so: {said}.",
+                "Compare with the protocol of the test.",
+            )
+        )
     for table, code in ((source.environment, "environment_rows_left_out"), (source.drivers, "driver_rows_left_out")):
         if table is not None:
             notices += left_out_notices(table, code)

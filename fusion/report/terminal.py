@@ -47,8 +47,8 @@ from fusion.report.wording import (
     untouched,
 )
 from interferometry import iso230
-from interferometry.inspection import describe_test
-from interferometry.io.readers import read_deviations, read_environment
+from interferometry.inspection import describe_notes, describe_test
+from interferometry.io.readers import is_environment_log, read_deviations, read_environment
 from thermography.inspection import inspect_file, is_flir_file, thumbnail
 
 
@@ -173,7 +173,7 @@ def iso230_tables(path: Path, cycles: str | None) -> list[rich.table.Table]:
     Parameters
     ----------
     path : Path
-        Deviations: .rtl, CSV, or a log of a positioning test.
+        Deviations of a linear or rotary axis: .rtl, a table (text or spreadsheet), or a log of a positioning test.
     cycles : str or None
         Window such as ``"1-5"``; None for all cycles.
 
@@ -182,7 +182,8 @@ def iso230_tables(path: Path, cycles: str | None) -> list[rich.table.Table]:
     CampaignError, LaserFormatError
         If the window is not understood or the file cannot be used.
     """
-    deviations = read_deviations(path)
+    deviations = read_deviations(path, rotary=True)
+    unit = print_unit(deviations["deviation"].attrs["units"])
     window = None if cycles is None else read_window(cycles, deviations)
     try:
         result = iso230.evaluate_iso230(deviations, cycles=window)
@@ -196,8 +197,25 @@ def iso230_tables(path: Path, cycles: str | None) -> list[rich.table.Table]:
         [label, f"{float(result[name].sel(where)):.2f}", f"{2 * float(result[f'{name}_u'].sel(where)):.2f}"]
         for label, name, where in named
     ]
-    axis = table([Words("quantity"), "value / µm", "U (k = 2) / µm"], rows)
+    axis = table([Words("quantity"), f"value / {unit}", f"U (k = 2) / {unit}"], rows)
     return [print_table(axis, f"{path.name}, {result.attrs['window']}"), _position_table(deviations, result)]
+
+
+def iso230_remarks(path: Path) -> list[str]:
+    """Return what the reader of a file left out or assumed, as lines for the terminal.
+
+    Parameters
+    ----------
+    path : Path
+        Deviations.
+
+    Raises
+    ------
+    LaserFormatError
+        If the file cannot be used.
+    """
+    deviations = read_deviations(path, rotary=True)
+    return [*describe_notes(deviations), *(line.strip() for line in _warnings(deviations))]
 
 
 def _position_table(deviations: xr.Dataset, result: xr.Dataset) -> rich.table.Table:
@@ -214,7 +232,8 @@ def _position_table(deviations: xr.Dataset, result: xr.Dataset) -> rich.table.Ta
         position = float(deviations["position"].sel(target=target))
         rows.append([str(target), f"{position:g}", *(f"{float(value):.2f}" for value in values)])
     return print_table(
-        table(["i", "mm", "mean +", "mean -", "s +", "s -", "B_i", "R_i"], rows), "per target position / µm"
+        table(["i", deviations["position"].attrs["units"], "mean +", "mean -", "s +", "s -", "B_i", "R_i"], rows),
+        f"per target position / {print_unit(deviations['deviation'].attrs['units'])}",
     )
 
 
@@ -323,11 +342,9 @@ def describe_file(path: Path) -> list[str]:
     """
     if is_flir_file(path):
         return inspect_file(path).lines()
-    with path.open("rb") as stream:
-        start = stream.read(4096)
-    if b"air_temperature" in start and b"deviation_um" not in start:
+    if is_environment_log(path):
         return _describe_log(path, read_environment(path))
-    return _describe_deviations(path, read_deviations(path))
+    return _describe_deviations(path, read_deviations(path, rotary=True))
 
 
 def write_thumbnail(path: Path, folder: Path) -> Path | None:
@@ -355,8 +372,10 @@ def _describe_deviations(path: Path, deviations: xr.Dataset) -> list[str]:
     readings = int(np.isfinite(deviations["deviation"]).sum())
     lines = [
         f"{path}: deviations, {counted(deviations.sizes['cycle'], 'cycle')}, {counted(deviations.sizes['target'], 'target')} "
-        f"from {position.min():g} to {position.max():g} mm, {readings} of {deviations['deviation'].size} readings",
-        f"  deviation {float(deviations['deviation'].min()):.3f} to {float(deviations['deviation'].max()):.3f} µm",
+        f"from {position.min():g} to {position.max():g} {deviations['position'].attrs['units']}, "
+        f"{readings} of {deviations['deviation'].size} readings",
+        f"  deviation {float(deviations['deviation'].min()):.3f} to {float(deviations['deviation'].max()):.3f} "
+        f"{print_unit(deviations['deviation'].attrs['units'])}",
     ]
     if timed.size:
         lines.append(f"  {moment(timed.min())} to {moment(timed.max())}, times {deviations['time'].attrs['origin']}")

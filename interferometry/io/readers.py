@@ -17,6 +17,8 @@ from interferometry.io.wide_table import find_wide_table, read_wide_table
 
 DEVIATION_COLUMNS = ("cycle", "direction", "target", "position_mm", "time", "deviation_um")
 
+#: The header of a log stands within so many rows.
+_HEADER_WITHIN = 40
 #: Column of the environment file, variable, unit, kind of quantity, smallest and largest plausible value.
 ENVIRONMENT_COLUMNS = (
     ("air_temperature_degC", "air_temperature", "degC", "temperature", -9.0, 60.0),
@@ -127,6 +129,31 @@ def _read_table_of_deviations(path: Path, sheet: str | None) -> xr.Dataset:
             f"columns {','.join(DEVIATION_COLUMNS)}, or a table of position by run such as 'Position [mm],1+ [um],1- [um],2+ [um]'"
         )
     return check_and_assemble(next(iter(found.values())))
+
+
+def is_environment_log(path: Path) -> bool:
+    """Return whether a file is a table of air and material conditions, and not one of deviations.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+
+    Raises
+    ------
+    LaserFormatError
+        The file is neither text nor a spreadsheet.
+    OSError
+        The file cannot be opened.
+    """
+    with path.open("rb") as stream:
+        if b"HEADER::" in stream.read(4096):
+            return False
+    roles = [
+        {read_heading(text).role for text in fields}
+        for grid in read_grids(path)
+        for _, fields in grid.rows[:_HEADER_WITHIN]
+    ]
+    return any({"air_temperature", "air_pressure"} & found and not {"deviation", "measured"} & found for found in roles)
 
 
 def read_environment(path: str | Path) -> xr.Dataset:

@@ -11,7 +11,8 @@ import pytest
 
 from interferometry.deviations import DUPLICATE, MISSING, OUT_OF_ORDER, UNREADABLE, sort_readings
 from interferometry.io.faults import LaserFormatError
-from interferometry.io.readers import read_deviations, read_environment
+from interferometry.io.readers import is_environment_log, read_deviations, read_environment
+from tests.interferometry.laser_mutations import fuzz
 
 HEADER = "cycle,direction,target,position_mm,time,deviation_um"
 
@@ -240,3 +241,41 @@ def test_a_missing_file_is_named_by_the_error(read: Callable[[Path], object], tm
     with pytest.raises(FileNotFoundError) as caught:
         read(tmp_path / "laser.csv")
     assert Path(caught.value.filename) == tmp_path / "laser.csv"
+
+
+def test_five_hundred_damaged_files_raise_no_foreign_error(tmp_path: Path) -> None:
+    counts = fuzz(tmp_path, 500, seed=28)
+    assert sum(taken for taken, _ in counts.values()) > 50
+    assert sum(refused for _, refused in counts.values()) > 50
+
+
+HEADINGS = {
+    "english": "time,air temperature (°C),air pressure (hPa),humidity (%),material temperature (°C)",
+    "german": "Zeit,Lufttemperatur [°C],Luftdruck [hPa],Luftfeuchte [%],Materialtemperatur [°C]",
+    "french": "Heure,Température de l'air (°C),Pression (hPa),Humidité (%),Température matière (°C)",
+    "spanish": "Hora,Temperatura del aire (°C),Presión (hPa),Humedad (%),Temperatura del material (°C)",
+    "chinese": "时间,空气温度(°C),气压(hPa),湿度(%),材料温度(°C)",
+}
+
+
+@pytest.mark.parametrize("language", HEADINGS)
+def test_environment_headings_in_five_languages(tmp_path: Path, language: str) -> None:
+    path = tmp_path / "environment.csv"
+    path.write_text(HEADINGS[language] + "\n2026-03-09T06:30:00Z,23.5,1000.2,42,23.9\n", encoding="utf-8")
+    assert is_environment_log(path)
+    assert read_environment(path)["air_pressure"].values.tolist() == [1000.2]
+
+
+def test_environment_in_other_units_is_converted(tmp_path: Path) -> None:
+    path = tmp_path / "environment.csv"
+    head = "time,air_temperature_degF,pressure (kPa),humidity (%),sample temperature [K]"
+    path.write_text(head + "\n2026-03-09T06:32:00Z,68,101.3,42,293.15\n", encoding="utf-8")
+    environment = read_environment(path)
+    values = [float(environment[name][0]) for name in ("air_temperature", "air_pressure", "material_temperature")]
+    assert values == pytest.approx([20.0, 1013.0, 20.0], abs=1e-9)
+    path.write_text(head.replace("kPa", "mm") + "\n2026-03-09T06:32:00Z,68,101.3,42,293.15\n", encoding="utf-8")
+    with pytest.raises(LaserFormatError, match=r"line 1: the unit of 'pressure .mm.' is none of a pressure"):
+        read_environment(path)
+    path.write_text("time,air_temperature_degC\n2026-03-09T06:32:00Z,20\n", encoding="utf-8")
+    with pytest.raises(LaserFormatError, match="line 1 lacks air_pressure_hPa, relative_humidity_percent, material"):
+        read_environment(path)

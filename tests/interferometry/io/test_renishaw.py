@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from interferometry.inspection import describe_test
 from interferometry.io.faults import LaserFormatError
 from interferometry.io.readers import read_deviations
 from interferometry.io.renishaw import read_rtx
@@ -121,6 +123,9 @@ def test_feed_and_dwell_place_readings_within_their_run(tmp_path: Path) -> None:
         ("10.000000 \nFlags", "ten\nFlags", r"line 9: 'ten' is not a row of target positions"),
         ("Run-count:4", "Run-count:2", r"Run-count is 2, but DEVIATIONS holds runs \[1, 2, 3, 4\]"),
         (": rtl", ": rta", "File type is rta, not rtl; only linear tests"),
+        ("Run-count:4", "Run-count:ten", "line 13: Run-count is 'ten' and no whole number; copy the file again"),
+        ("Target-count: 3", "Target-count: five", "line 6: Target-count is 'five' and no whole number"),
+        ("10.000000 \nFlags", "1_0.0\nFlags", r"line 9: '1_0.0' is not a row of target positions"),
         ("EOF::", "", "no section EOF::; the file is cut short"),
         ("DEVIATIONS::", "DEVIATIONS", "no section DEVIATIONS::"),
     ],
@@ -134,6 +139,8 @@ def test_broken_promises_of_the_header_are_refused(tmp_path: Path, old: str, new
     ("new", "reason"),
     [
         ("1 2 abc", "is not 'run target deviation'"),
+        ("1 2 1_2.5", "is not 'run target deviation'"),
+        ("1 2 nan", "is not 'run target deviation'"),
         ("1 9 1.2", "names no run from 1 or no target of 1..3"),
         ("1 1 1.2", "repeats run 1 target 1, the first is kept"),
     ],
@@ -157,7 +164,56 @@ def test_a_file_without_times_says_so(tmp_path: Path) -> None:
     assert np.isnat(test["time"].values).all()
 
 
-def rtx(folder: Path, samples: int, stated: int, *, end: bytes = b"EOF::\r\n", rate: str = "100") -> Path:
+def test_the_second_spelling_of_times_has_no_seconds(tmp_path: Path) -> None:
+    old = '"2014-10-08 10:00:00" "2014-10-08 10:02:00"'
+    test = read_deviations(rtl(tmp_path, old, '"10:46 Dec 12 2016" "11:01 Dec 12 2016"'))
+    assert test["time"].attrs["origin"] == "reconstructed"
+    assert test["time"].values.max() == np.datetime64("2016-12-12T11:01:30")
+    # Start and end are known to the minute: each adds 60 s / sqrt(12).
+    assert float(test["time_u"]) >= 60 / np.sqrt(12)
+
+
+@pytest.mark.parametrize(
+    "times", ['"2014-13-08 10:00:00" "2014-10-08 10:02:00"', '"10:46 Foo 12 2016" "11:01 Dec 12 2016"']
+)
+def test_times_that_do_not_exist_are_no_times(tmp_path: Path, times: str) -> None:
+    test = read_deviations(rtl(tmp_path, '"2014-10-08 10:00:00" "2014-10-08 10:02:00"', times))
+    assert test["time"].attrs["origin"] == "none"
+
+
+def zero_filled(folder: Path, flags: str) -> Path:
+    """A test as a public writer of the format saves one direction: the reverse runs are filled with 0."""
+    path = rtl(folder, "Flags: 0 0 2 1", f"Flags: {flags}")
+    text = re.sub(r"^([24]) (\d) -.*$", r"\1 \2 0", path.read_text("latin-1"), flags=re.MULTILINE)
+    path.write_text(text, encoding="latin-1")
+    return path
+
+
+def test_zero_filled_reverse_runs_of_a_unidirectional_test_are_no_readings(tmp_path: Path) -> None:
+    test = read_deviations(zero_filled(tmp_path, "0 1 2 0"))
+    assert np.isnan(test["deviation"].sel(direction="negative")).all()
+    assert test["deviation"].sel(direction="positive").values.tolist() == [[1.1, 1.2, 1.3], [3.1, 3.2, 3.3]]
+    assert json.loads(test.attrs["notes"]) == [
+        "run 2, 4 holds nothing but zeros and the flags say that one direction was measured: taken as not measured"
+    ]
+
+
+def test_a_run_of_zeros_in_a_bidirectional_test_is_kept_and_told(tmp_path: Path) -> None:
+    test = read_deviations(zero_filled(tmp_path, "0 0 2 0"))
+    assert (test["deviation"].sel(direction="negative") == 0.0).all()
+    assert any("every reading of run 2, 4 is 0" in line for line in describe_test(test))
+
+
+def test_damaged_numbers_of_the_environment_are_missing(tmp_path: Path) -> None:
+    test = read_deviations(
+        rtl(tmp_path, "DateTime", "Air temp : -- --\nAir press : 101.1\nMat temp 1 : 1_2 20.5\nDateTime")
+    )
+    assert np.isnan(test["air_temperature"]).all()
+    assert test["air_pressure"].values[0] == pytest.approx(1011.0)
+    assert np.isnan(test["material_temperature"].values).tolist() == [[True, False]]
+
+
+def rtx(folder: Path, samples: int, stated: object, *, end: bytes = b"EOF::\r\n", rate: str = "100") -> Path:
     header = f"HEADER::\r\nFile Type: rtx\r\nSample no: {stated}\r\nActual sample rate: {rate}\r\nData:\r\n"
     path = folder / "t.rtx"
     path.write_bytes(header.encode() + struct.pack(f"<{samples}d", *range(samples)) + end)
@@ -182,3 +238,15 @@ def test_rtx_that_breaks_its_promises_is_refused(tmp_path: Path) -> None:
         read_rtx(rtx(tmp_path, 5, 5, end=b""))
     with pytest.raises(LaserFormatError, match="no 'Actual sample rate'"):
         read_rtx(rtx(tmp_path, 5, 5, rate="0"))
+    with pytest.raises(LaserFormatError, match="line 4: Actual sample rate is 'many', which is not a number"):
+        read_rtx(rtx(tmp_path, 5, 5, rate="many"))
+    with pytest.raises(LaserFormatError, match="line 3: Sample no is 'ten', which is not a number"):
+        read_rtx(rtx(tmp_path, 5, "ten"))
+    assert read_rtx(rtx(tmp_path, 5, 5, rate="50000,0"))["seconds"].values[1] == 2e-5
+
+
+def test_rtx_with_samples_that_are_no_numbers_is_refused(tmp_path: Path) -> None:
+    path = rtx(tmp_path, 5, 5)
+    path.write_bytes(path.read_bytes().replace(struct.pack("<d", 3.0), struct.pack("<d", float("nan"))))
+    with pytest.raises(LaserFormatError, match="1 of 5 samples are no numbers, the first is sample 4"):
+        read_rtx(path)

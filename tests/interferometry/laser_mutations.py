@@ -1,0 +1,132 @@
+"""Damaged laser files: mutations of one small file of each kind, through the readers that a user's file meets."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import openpyxl
+
+from interferometry.io.faults import LaserFormatError
+from interferometry.io.readers import is_environment_log, read_deviations, read_environment
+from interferometry.io.renishaw import read_rtx
+
+#: Pieces that damage or odd programs put into files.
+PIECES = (
+    b"", b"\0", b"-", b"1_2.5", b"9999", b"nan", b"-1e20", b"1e999", b"\xff", b"\n", b"\r", b",", b";", b'"', b"::", b"\xe2\x88\x92",
+    b"99999999999999999999", b"0", b"31/02/2026 25:61", b"[um]", b"position", b"::\n", b"\xff\xfe", b"A" * 140_000,
+)  # fmt: skip
+
+LONG = "cycle,direction,target,position_mm,time,deviation_um\n" + "".join(
+    f"{cycle},{sign},{target},{20 * target},2026-03-09T06:{10 * cycle + (target if sign == '+' else 9 - target):02d}:00Z,{target}.5\n"
+    for cycle in (1, 2)
+    for sign in "+-"
+    for target in (1, 2, 3)
+)
+WIDE = "Deviations [µm]\nPosition [mm];1+;1-;2+;2-\n0;1,25;0,75;2,25;1,75\n20;1,5;0,5;2,5;1,5\n40;1,75;0,25;2,75;1,25\n"
+LOG = "time,air_temperature_degC,air_pressure_hPa,relative_humidity_percent,material_temperature_degC\n" + "".join(
+    f"2026-03-09T06:{minute:02d}:00Z,23.5,1000.2,42,23.9\n" for minute in range(5)
+)
+RTL = (
+    "HEADER::\nFile type  : rtl\n\nTARGET DATA::\nTarget-count: 2\nTargets :\n-10.0  10.0 \nFlags: 0 0 2 1\n\nRUNS::\nRun-count:2\n\n"
+    "DEVIATIONS::\nRun Target Data:\n1 1 0.5\n1 2 0.6\n2 2 0.1\n2 1 0.2\n\nENVIRONMENT::\nAir temp   : 26.2 26.3 0\n"
+    'Env factor : 0.31639452 0.31639449\nDate Time  : "2014-10-08 10:53:40" "2014-10-08 10:56:49"\n\nEOF::\n'
+)
+ECMC = "UNIT=mm\nCYCLES=2\nPOSITIONS=2\nTGT_DATA[1]=0\nTGT_DATA[2]=10\n" + "".join(
+    f"REF_DATA_{way}[{target},{cycle}]={10 * (target - 1)}.00{cycle}\n"
+    for cycle in (1, 2)
+    for way in ("FWD", "BWD")
+    for target in (1, 2)
+)
+
+
+def _rtx() -> bytes:
+    header = "HEADER::\r\nFile Type: rtx\r\nSample no: 20\r\nActual sample rate: 100\r\nData:\r\n"
+    return header.encode() + struct.pack("<20d", *range(20)) + b"EOF::\r\n"
+
+
+def _workbook(folder: Path) -> bytes:
+    book = openpyxl.Workbook()
+    for line in LONG.splitlines():
+        book.active.append(line.split(","))
+    path = folder / "original.xlsx"
+    book.save(path)
+    return path.read_bytes()
+
+
+def _read_any(path: Path) -> object:
+    return (
+        read_environment(path)
+        if is_environment_log(path)
+        else read_deviations(path, feed_mm_per_min=1000.0, dwell_s=2.0)
+    )
+
+
+def _mutated(content: bytes, rng: np.random.Generator) -> bytes:
+    """Return the content after one to three changes: bits, pieces put in, parts cut out, exchanged or repeated, or the end cut off."""
+    changed = bytearray(content)
+    for _ in range(int(rng.integers(1, 4))):
+        at = int(rng.integers(0, max(len(changed), 1)))
+        length = int(rng.integers(1, 30))
+        match int(rng.integers(0, 6)):
+            case 0 if changed:
+                changed[at] ^= 1 << int(rng.integers(0, 8))
+            case 1:
+                changed[at:at] = PIECES[int(rng.integers(0, len(PIECES)))]
+            case 2:
+                changed[at : at + length] = PIECES[int(rng.integers(0, len(PIECES)))]
+            case 3:
+                del changed[at : at + length]
+            case 4:
+                changed[at:at] = changed[int(rng.integers(0, max(len(changed), 1))) :][:length]
+            case _ if rng.random() < 0.3:
+                del changed[at:]
+    return bytes(changed)
+
+
+def fuzz(folder: Path, number: int, *, seed: int) -> dict[str, tuple[int, int]]:
+    """Send mutated files of every kind through the readers.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the files go.
+    number : int
+        Mutations of all kinds together.
+    seed : int
+        Of the mutations.
+
+    Returns
+    -------
+    dict of str to tuple of (int, int)
+        Per kind, files that were read and files that were refused; any error other than LaserFormatError passes through.
+    """
+    readers: dict[str, tuple[bytes, Callable[[Path], object]]] = {
+        "long.csv": (LONG.encode(), _read_any),
+        "wide.csv": (WIDE.encode(), _read_any),
+        "utf16.csv": (WIDE.encode("utf-16"), _read_any),
+        "environment.csv": (LOG.encode(), _read_any),
+        "test.rtl": (RTL.encode(), _read_any),
+        "log.dat": (ECMC.encode(), _read_any),
+        "long.xlsx": (_workbook(folder), _read_any),
+        "capture.rtx": (_rtx(), read_rtx),
+    }
+    rng = np.random.default_rng(seed)
+    counts = dict.fromkeys(readers, (0, 0))
+    for i in range(number):
+        name, (content, read) = list(readers.items())[i % len(readers)]
+        path = folder / name
+        path.write_bytes(_mutated(content, rng))
+        taken, refused = counts[name]
+        try:
+            read(path)
+            counts[name] = taken + 1, refused
+        except LaserFormatError as error:
+            assert str(path) in str(error), f"{name}: {error} does not name the file"
+            counts[name] = taken, refused + 1
+        except Exception as error:
+            path.with_name(f"{seed}_{i}_{name}").write_bytes(path.read_bytes())
+            raise AssertionError(f"mutation {i} of seed {seed}, {name}: {type(error).__name__}: {error}") from error
+    return counts
