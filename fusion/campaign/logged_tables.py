@@ -188,7 +188,7 @@ def _read_frame(path: Path, record: RecordTable) -> tuple[pd.DataFrame, list[Rej
     left_out: list[RejectedLine] = []
     try:
         if path.suffix.lower() in {".xlsx", ".xlsm"}:
-            frame = pd.read_excel(path, sheet_name=record.sheet or 0)
+            frame = pd.read_excel(path, sheet_name=record.sheet or 0, engine="openpyxl")
         else:
             frame, left_out = _read_text(path)
     except (ValueError, OSError, pd.errors.ParserError) as error:
