@@ -39,7 +39,7 @@ def test_a_repeated_reading_is_named_and_the_first_kept() -> None:
 
 
 def test_targets_that_move_are_refused() -> None:
-    with pytest.raises(LaserFormatError, match=r"target 1 stands at 0.0 mm on line 2 but at 5.0 mm elsewhere \(2 of 4"):
+    with pytest.raises(LaserFormatError, match=r"target 1 stands at 0.0 mm on line 2 but at 5.0 mm elsewhere \(4 of 4"):
         check_and_assemble(given(*((cycle, "positive", 1, 10.0 * (cycle > 2)) for cycle in (1, 2, 3, 4))))
 
 
