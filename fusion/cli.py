@@ -1,11 +1,11 @@
-"""The command line: run, simulate, inspect, iso230, schema, export, plan. Bad input ends with one paragraph and exit code 2."""
+"""The command line: run, simulate, inspect, iso230, schema, export, plan. How it ends is in `fusion.endings`."""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -13,9 +13,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from fusion.errors import FusionError
-from interferometry.errors import InterferometryError
-from thermography.errors import ThermographyError
+from fusion.endings import ExitCode, answering
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -25,7 +23,6 @@ app = typer.Typer(
 )
 console = Console()
 errors = Console(stderr=True, soft_wrap=True)
-BAD_INPUT, STOPPED = 2, 130
 
 
 class ExportFormat(StrEnum):
@@ -40,22 +37,19 @@ class ExportFormat(StrEnum):
     renishaw = "renishaw"
 
 
-@contextmanager
-def _answering() -> Iterator[None]:
-    """Turn bad input into one paragraph and exit code 2; a fault of the program itself keeps its traceback."""
-    try:
-        yield
-    except (FusionError, ThermographyError, InterferometryError) as error:
-        errors.print(f"thermofuse: {error}", style="bold", highlight=False, markup=False)
-        raise typer.Exit(BAD_INPUT) from None
-    except OSError as error:
-        if error.filename is None:
-            raise
-        errors.print(f"thermofuse: {error.filename}: {error.strerror}", style="bold", highlight=False, markup=False)
-        raise typer.Exit(BAD_INPUT) from None
-    except KeyboardInterrupt:
-        errors.print("thermofuse: stopped; finished stages are kept, add --resume to continue", highlight=False)
-        raise typer.Exit(STOPPED) from None
+def _answering(folders: Sequence[Path] = ()) -> AbstractContextManager[None]:
+    """End a command as `fusion.endings` says; `folders` are those of its results."""
+    return answering(errors, kept=lambda: _kept(folders))
+
+
+def _kept(folders: Sequence[Path]) -> str:
+    """Say what a stopped run leaves in its folders, and how to go on."""
+    if not folders:
+        return ""
+    from fusion.products.store import finished_stages
+
+    kept = [f"{folder} keeps {', '.join(finished_stages(folder)) or 'no finished stage'}" for folder in folders]
+    return f"{'; '.join(kept)}; start the same command with --resume to go on"
 
 
 def _print_version(asked: bool) -> None:
@@ -101,10 +95,10 @@ def run(
 
     if len(campaigns) > 2:
         errors.print("thermofuse: one campaign, or two of one machine, can be analysed at a time", highlight=False)
-        raise typer.Exit(BAD_INPUT)
+        raise typer.Exit(ExitCode.BAD_INPUT)
 
-    with _answering():
-        folders = _folders(campaigns, out)
+    folders = _folders(campaigns, out)
+    with _answering([folder for _, folder in folders]):
         records = len(folders) == 2 and of_one_kind(campaigns)
         for campaign, folder in folders:
             with Reporter(console) as report:
@@ -147,7 +141,7 @@ def check(
             for line in checked.lines(quiet=quiet):
                 console.print(line, soft_wrap=True, highlight=False, markup=False)
         if checked.faults:
-            raise typer.Exit(BAD_INPUT)
+            raise typer.Exit(ExitCode.BAD_INPUT)
 
 
 @app.command()
@@ -214,7 +208,7 @@ def schema(
     schemas = {"results": results_schema, "campaign": campaign_schema}
     if name not in schemas:
         errors.print(f'thermofuse: there is no schema "{name}"; write results or campaign', highlight=False)
-        raise typer.Exit(BAD_INPUT)
+        raise typer.Exit(ExitCode.BAD_INPUT)
     sys.stdout.write(json.dumps(schemas[name](), indent=1) + "\n")
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import platform
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 from fusion.campaign.config import Campaign
 from fusion.products.progress import Report, silent
+from fusion.products.results import Notice
 from fusion.products.store import file_sha256
 
 #: Packages whose version can change a number in the results.
@@ -53,6 +55,64 @@ def hash_inputs(files: Mapping[str, Path], *, report: Report = silent) -> dict[s
         hashed[name] = {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
     report("input files", len(files), len(files))
     return hashed
+
+
+@dataclass(frozen=True)
+class FileState:
+    """What tells without reading a file whether it was changed.
+
+    Attributes
+    ----------
+    size : int
+        Bytes.
+    changed_ns : int
+        Time of the last change, ns.
+    """
+
+    size: int
+    changed_ns: int
+
+
+def input_states(campaign: Campaign) -> dict[str, FileState]:
+    """Return size and time of change of every input that there is, keyed by its name relative to the campaign file.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        Its patterns are matched anew.
+    """
+    states = {}
+    for name, path in campaign.input_files().items():
+        try:
+            found = path.stat()
+        except FileNotFoundError:
+            continue
+        states[name] = FileState(found.st_size, found.st_mtime_ns)
+    return states
+
+
+def note_changes(before: Mapping[str, FileState], after: Mapping[str, FileState]) -> list[Notice]:
+    """Return a notice of the inputs that were added, removed or changed while a run read them, or none.
+
+    Parameters
+    ----------
+    before, after : mapping
+        Results of `input_states` at the start and at the end of the run.
+    """
+    parts = {
+        "changed": [name for name in before if name in after and before[name] != after[name]],
+        "removed": [name for name in before if name not in after],
+        "added": [name for name in after if name not in before],
+    }
+    words = [f"{len(names)} {what} ({_some(names)})" for what, names in parts.items() if names]
+    if not words:
+        return []
+    message = f"Input files were altered while the run read them: {'; '.join(words)}. Its products may mix two states of them."
+    return [Notice("inputs_changed", message, "Wait until the recording has ended and run again.")]
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
 
 
 def describe_run(

@@ -17,7 +17,8 @@ from fusion.pipeline import attribution, drift_model, interferometry, thermal
 from fusion.pipeline import record as record_stage
 from fusion.pipeline.camera import camera_corrected
 from fusion.pipeline.consistency import check_fields, check_loop, check_plan, check_source
-from fusion.pipeline.provenance import describe_run, hash_inputs, versions
+from fusion.pipeline.provenance import FileState, describe_run, hash_inputs, input_states, note_changes, versions
+from fusion.products.folder import claim, open_folder
 from fusion.products.progress import Report, silent
 from fusion.products.results import Notice, Outcome, Results, assemble
 from fusion.products.store import (
@@ -25,7 +26,6 @@ from fusion.products.store import (
     StageStamps,
     annotate,
     digest,
-    open_folder,
     read_dataset,
     read_tree,
     write_dataset,
@@ -42,7 +42,8 @@ FILES = {
     "model": ".stages/model.nc",
     "record": "fusion.nc",
 }
-
+#: What a run writes last.
+PAGES = ("results.json", "provenance.json", "report.html")
 
 #: Number of the products' layout: stages that were kept in another one are computed again.
 PRODUCT_LAYOUT = 4
@@ -64,6 +65,8 @@ class Run:
         Stages that are done.
     inputs : mapping
         Size and SHA-256 of each input.
+    seen : mapping
+        Size and time of change of each input before it was read.
     started : datetime
         Start of the run, UTC.
     parts, notices : dict, list
@@ -77,6 +80,7 @@ class Run:
     report: Report
     stamps: StageStamps
     inputs: Mapping[str, Mapping[str, Any]]
+    seen: Mapping[str, FileState]
     started: datetime
     parts: dict[str, Any] = field(default_factory=dict)
     notices: list[Notice] = field(default_factory=list)
@@ -188,22 +192,26 @@ def run_campaign(
     """
     campaign = load_campaign(path)
     folder = Path(out)
+    seen = input_states(campaign)
     if campaign.record is not None:
         record = record_stage.read_source(campaign)
-        return _run_record(_open_run(campaign, folder, resume=resume, report=report), record)
+        with open_folder(folder, resume=resume):
+            return _run_record(_start_run(campaign, folder, seen, report), record)
     source = read_source(campaign)
     checks = check_source(source)
     refuse_contradictions(checks)
-    run = _open_run(campaign, folder, resume=resume, report=report)
-    return _run_instruments(run, source, checks, scheduler=scheduler)
+    with open_folder(folder, resume=resume):
+        run = _start_run(campaign, folder, seen, report)
+        return _run_instruments(run, source, checks, scheduler=scheduler)
 
 
-def _open_run(campaign: Campaign, folder: Path, *, resume: bool, report: Report) -> Run:
-    """Open the results folder of a campaign whose input has been read, and note what it was made from."""
-    open_folder(folder, resume=resume)
+def _start_run(campaign: Campaign, folder: Path, seen: Mapping[str, FileState], report: Report) -> Run:
+    """Start a run in the folder that it holds: claim the products, and note what they are made from."""
+    products = [name for name in FILES.values() if not name.startswith(".")]
+    claim(folder, *products, *PAGES)
     started = datetime.now(UTC)
     inputs = hash_inputs(campaign.input_files(), report=report)
-    return Run(campaign, folder, report, StageStamps(folder), inputs, started)
+    return Run(campaign, folder, report, StageStamps(folder), inputs, seen, started)
 
 
 def _run_instruments(run: Run, source: Source, checks: Sequence[Check], *, scheduler: str | None) -> Results:
@@ -247,6 +255,7 @@ def _run_instruments(run: Run, source: Source, checks: Sequence[Check], *, sched
     )
     fusion = run.described(drift_model.join_fusion(fused, maps, model))
     write_dataset(folder / "fusion.nc", fusion)
+    claim(folder, *(f"maps/{thermal.map_name(cycle)}" for cycle in fields["cycle"].values))
     thermal.write_exr(folder / "maps", fields, report=report)
     accepted = run.campaign.accept.doubts
     checks = [
@@ -272,6 +281,7 @@ def _run_record(run: Run, source: record_stage.RecordSource) -> Results:
 
 def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
     """Write results, provenance and report from what the stages found."""
+    run.notices.extend(note_changes(run.seen, input_states(run.campaign)))
     results = assemble(run.campaign.campaign.title, run.parts, run.notices)
     provenance = describe_run(run.campaign, run.inputs, started=run.started, seconds=run.seconds)
     run.report("report", 0, 1)

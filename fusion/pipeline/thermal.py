@@ -364,6 +364,17 @@ def _target_places(source: Source) -> xr.Dataset:
     return xr.Dataset(places, coords={"target": targets})
 
 
+def map_name(cycle: int) -> str:
+    """Return the name of the file with the maps of one cycle.
+
+    Parameters
+    ----------
+    cycle : int
+        Number of the cycle, from 1.
+    """
+    return f"cycle_{cycle:04d}.exr"
+
+
 def write_exr(folder: Path, fields: xr.Dataset, *, report: Report) -> list[Path]:
     """Write the fields of every cycle as OpenEXR maps and return the files.
 
@@ -381,7 +392,7 @@ def write_exr(folder: Path, fields: xr.Dataset, *, report: Report) -> list[Path]
     for done, cycle in enumerate(fields["cycle"].values):
         report("OpenEXR maps", done, total)
         maps = _exr_maps(fields.sel(cycle=cycle))
-        path = folder / f"cycle_{cycle:04d}.exr"
+        path = folder / map_name(cycle)
         paths.append(write_atomically(path, lambda temporary, maps=maps: write_maps(temporary, maps)))  # type: ignore[misc]
     report("OpenEXR maps", total, total)
     return paths

@@ -13,9 +13,9 @@ import numpy as np
 import xarray as xr
 
 from fusion.errors import FusionError
+from thermography.io import atomic
 
 _STAMPS = ".stages/stamps.json"
-_PARTIAL = ".partial"
 #: A product is one Dataset, or a tree of them whose nodes become the groups of one NetCDF file.
 Product = TypeVar("Product", xr.Dataset, xr.DataTree)
 
@@ -24,43 +24,8 @@ class OutputError(FusionError):
     """A results folder that cannot be written to; the message says what to do."""
 
 
-def open_folder(folder: Path, *, resume: bool) -> Path:
-    """Create the results folder, or accept an existing one only if it is empty or the run is resumed.
-
-    Parameters
-    ----------
-    folder : Path
-        Results folder; what an interrupted write left in it is removed.
-    resume : bool
-        Whether a run that is in it is continued.
-
-    Returns
-    -------
-    Path
-        The folder.
-
-    Raises
-    ------
-    OutputError
-        If the folder holds something and `resume` is false, or if it is a file.
-    """
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder} is a file; name a folder for the results with --out")
-    if folder.is_dir() and any(folder.iterdir()) and not resume:
-        raise OutputError(
-            f"{folder} is not empty; add --resume to continue the run that is in it, name another folder with --out, "
-            "or remove it first"
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    for leftover in folder.rglob(f"*{_PARTIAL}*"):
-        leftover.unlink()
-    return folder
-
-
 def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
-    """Let `write` fill a temporary file beside `path`, then put it in place in one step.
-
-    A run that is killed leaves the old file or none, never half of the new one.
+    """Write a product whole or not at all, see `thermography.io.atomic.write_atomically`.
 
     Parameters
     ----------
@@ -73,15 +38,20 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
     -------
     Path
         The product.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be written to or the disk is full; the old product is untouched.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{path.stem}{_PARTIAL}{path.suffix}")
     try:
-        write(temporary)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path
+        return atomic.write_atomically(path, write)
+    except OSError as error:
+        reason = error.strerror or error
+        raise OutputError(
+            f"{path}: cannot be written ({reason}); what was written before is whole: make room or allow writing there and start again, "
+            "a run with --resume, or name another folder with --out"
+        ) from error
 
 
 def write_text(path: Path, text: str) -> Path:
@@ -255,6 +225,20 @@ class StageStamps:
         names = {path.relative_to(self._folder).as_posix(): file_sha256(path) for path in files}
         self._stamps[stage] = {"key": key, "files": names, "note": plain(note)}
         write_json(self._path, self._stamps)
+
+
+def finished_stages(folder: Path) -> list[str]:
+    """Return the stages of a run that a results folder holds, in the order in which they were finished.
+
+    Parameters
+    ----------
+    folder : Path
+        Results folder.
+    """
+    try:
+        return list(json.loads((folder / _STAMPS).read_text(encoding="utf-8")))
+    except (OSError, ValueError):
+        return []
 
 
 _CONVENTIONS = "CF-1.11"

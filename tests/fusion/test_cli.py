@@ -60,20 +60,28 @@ def test_a_fault_of_the_program_is_no_bad_input(monkeypatch: pytest.MonkeyPatch,
     def broken(*arguments: object, **options: object) -> None:
         raise ValueError("shapes do not match")
 
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("fusion.pipeline.run.run_campaign", broken)
     result = invoke("run", tmp_path / "campaign.toml")
-    assert result.exit_code == 1
-    assert isinstance(result.exception, ValueError)
+    assert result.exit_code == 70
+    assert result.stderr.startswith("thermofuse: fault of the program, not of the input: ValueError in ")
+    assert "Traceback" not in result.output and len(list(tmp_path.glob("thermofuse-fault-*.txt"))) == 1
 
 
-def test_stopping_tells_how_to_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_stopping_tells_what_is_kept_and_how_to_go_on(
+    monkeypatch: pytest.MonkeyPatch, results_folder: Path, tmp_path: Path
+) -> None:
     def stopped(*arguments: object, **options: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("fusion.pipeline.run.run_campaign", stopped)
-    result = invoke("run", tmp_path / "campaign.toml")
-    assert result.exit_code == 130
-    assert result.stderr == "thermofuse: stopped; finished stages are kept, add --resume to continue\n"
+    for out, kept in ((results_folder, "fields, deviations, correlation, model"), (tmp_path, "no finished stage")):
+        result = invoke("run", tmp_path / "campaign.toml", "--out", out)
+        assert result.exit_code == 130
+        assert (
+            result.stderr
+            == f"thermofuse: stopped by SIGINT; {out} keeps {kept}; start the same command with --resume to go on\n"
+        )
 
 
 def test_schemas_are_valid_and_accept_the_files(results_folder: Path, campaign_folder: Path) -> None:

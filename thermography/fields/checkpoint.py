@@ -19,6 +19,7 @@ from thermography.fields.cycle_fields import CyclePart, assemble_fields, positio
 from thermography.fields.inputs import FrameSeries
 from thermography.fields.resampling import plan_weights
 from thermography.fields.scheduling import THREADS
+from thermography.io.atomic import write_atomically
 from thermography.io.frame import CameraParameters
 from thermography.radiometry.averaging import CountStatistics, MeanTemperature, mean_temperature
 from thermography.registration.displacement import RegistrationSpan
@@ -120,7 +121,7 @@ class Checkpoint:
                 f"{self.folder}: holds cycles of another reduction (other {', '.join(differs) or 'content'}); "
                 "remove the folder to start anew"
             )
-        path.write_text(text, encoding="utf-8")
+        write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
     def save(self, cycle: StoredCycle) -> None:
         """Write a finished cycle, or replace the stored state of the open one."""
@@ -161,7 +162,8 @@ class Checkpoint:
         """Store that the table was registered again from frame `index` on: the span before, the displacement, and what showed it."""
         knocks, knock = self.knocks(), [index, span, displacement_px, by_image]
         if knock not in knocks:
-            (self.folder / _KNOCKS).write_text(json.dumps([*knocks, knock]), encoding="utf-8")
+            text = json.dumps([*knocks, knock])
+            write_atomically(self.folder / _KNOCKS, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
     def knocks(self) -> list[list[Any]]:
         """Knocks stored so far: frame, span before, displacement (column, row, growth, turn) px, whether the image showed it."""
@@ -276,12 +278,14 @@ def recalibrate(
 def _write(path: Path, header: dict[str, Any], arrays: dict[str, Array]) -> None:
     """Write a line of JSON, which gives names, types and shapes of the arrays, then the arrays themselves, one after the other."""
     layout = {name: [array.dtype.str, array.shape] for name, array in arrays.items()}
-    temporary = path.with_suffix(".part")
-    with temporary.open("wb") as file:
-        file.write(json.dumps({**header, "arrays": layout}).encode() + b"\n")
-        for array in arrays.values():
-            np.ascontiguousarray(array).tofile(file)
-    temporary.replace(path)
+
+    def write_arrays(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            file.write(json.dumps({**header, "arrays": layout}).encode() + b"\n")
+            for array in arrays.values():
+                np.ascontiguousarray(array).tofile(file)
+
+    write_atomically(path, write_arrays)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:

@@ -11,6 +11,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from thermography.errors import ThermographyError
+from thermography.io.atomic import write_atomically
 
 _Map = NDArray[np.float32]
 
@@ -46,8 +47,8 @@ def write_maps(path: str | os.PathLike[str], maps: Mapping[str, NDArray[np.float
     if len(set(shapes.values())) > 1:
         raise ExrError(f"{path}: the maps differ in shape: {shapes}; write one file per grid")
     parts.setdefault(_MASK, np.asarray(np.isfinite(np.stack(list(parts.values()))).all(axis=0), np.float32))
-    temporary = path.with_name(f".{path.name}.part")
-    try:
+
+    def write_parts(temporary: Path) -> None:
         # The library takes no Path, and silently writes wrong values for arrays that are not contiguous (openexr issue 1929).
         OpenEXR.File([_part(name, values) for name, values in parts.items()]).write(str(temporary))
         stored = read_maps(temporary)
@@ -56,9 +57,8 @@ def write_maps(path: str | os.PathLike[str], maps: Mapping[str, NDArray[np.float
                 raise ExrError(
                     f"{path}: {name} does not read back as it was written; the disk or the OpenEXR library is at fault"
                 )
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+
+    write_atomically(path, write_parts)
 
 
 def read_maps(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:

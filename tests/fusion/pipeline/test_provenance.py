@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fusion.campaign.config import load_campaign
-from fusion.pipeline.provenance import describe_run, hash_inputs, versions
+from fusion.pipeline.provenance import FileState, describe_run, hash_inputs, input_states, note_changes, versions
 
 
 def test_inputs_are_hashed_by_name(tmp_path: Path) -> None:
@@ -33,3 +33,27 @@ def test_a_run_is_described_without_a_folder(campaign_folder: Path, monkeypatch:
 def test_every_version_is_known() -> None:
     known = versions()
     assert known["python"].startswith("3.") and "not installed" not in {known["numpy"], known["xarray"]}
+
+
+def test_inputs_that_change_during_a_run_are_told() -> None:
+    before = {name: FileState(100, 1) for name in ("laser.csv", "a.jpg", "b.jpg", "c.jpg", "d.jpg")}
+    after = {"laser.csv": FileState(140, 2), "e.jpg": FileState(100, 1)}
+    assert note_changes(before, before) == []
+    (notice,) = note_changes(before, after)
+    assert (notice.code, notice.message) == (
+        "inputs_changed",
+        "Input files were altered while the run read them: 1 changed (laser.csv); 4 removed (a.jpg, b.jpg, c.jpg, ...); 1 added (e.jpg). "
+        "Its products may mix two states of them.",
+    )
+
+
+def test_the_state_of_inputs_is_seen_without_reading_them(copied: Path) -> None:
+    campaign = load_campaign(copied / "campaign.toml")
+    before = input_states(campaign)
+    assert set(before) == set(campaign.input_files())
+    with (copied / "laser.csv").open("a") as laser:
+        laser.write("\n")
+    removed = sorted((copied / "thermal").iterdir())[0]
+    removed.unlink()
+    (notice,) = note_changes(before, input_states(campaign))
+    assert f"1 changed (laser.csv); 1 removed (thermal/{removed.name})" in notice.message

@@ -13,6 +13,7 @@ import xarray as xr
 
 from fusion.pipeline.run import run_campaign
 from fusion.products.contracts import check
+from fusion.products.folder import MANIFEST, read_manifest
 from fusion.products.results import AxisLoop, read_results, results_schema
 from fusion.products.store import OutputError, file_sha256, read_dataset
 from thermography.contract import FIELDS
@@ -35,6 +36,12 @@ def test_all_products_are_written_and_keep_their_contracts(results_folder: Path)
     check(read_dataset(results_folder / "fields.nc"), FIELDS, name="fields.nc")
     assert len(list((results_folder / "maps").glob("cycle_*.exr"))) == 24
     assert not list(results_folder.rglob("*.partial*"))
+    written = set(read_manifest(results_folder))
+    assert written == {str(path.relative_to(results_folder)) for path in visible_files(results_folder)} - {MANIFEST}
+
+
+def visible_files(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if path.is_file() and ".stages" not in path.parts]
 
 
 def test_maps_hold_the_fields_bit_by_bit(results_folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
 
@@ -13,8 +14,8 @@ from fusion.products.store import (
     OutputError,
     StageStamps,
     digest,
+    finished_stages,
     name_in_words,
-    open_folder,
     plain,
     read_dataset,
     write_atomically,
@@ -46,19 +47,19 @@ def test_a_killed_write_leaves_the_old_product_and_no_rubbish(tmp_path: Path) ->
     assert [item.name for item in tmp_path.iterdir()] == ["results.json"]
 
 
-def test_a_full_folder_is_refused_unless_resumed(tmp_path: Path) -> None:
-    (tmp_path / "results.json").touch()
-    (tmp_path / "maps").mkdir()
-    (tmp_path / "maps" / "cycle_0001.partial.exr").touch()
+def test_a_full_disk_is_told_with_the_remedy(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "results.json", {"run": 1})
+
+    def fill(temporary: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
     with pytest.raises(OutputError) as error:
-        open_folder(tmp_path, resume=False)
+        write_atomically(path, fill)
     assert str(error.value) == (
-        f"{tmp_path} is not empty; add --resume to continue the run that is in it, name another folder with --out, or remove it first"
+        f"{path}: cannot be written (No space left on device); what was written before is whole: make room or allow writing there "
+        "and start again, a run with --resume, or name another folder with --out"
     )
-    open_folder(tmp_path, resume=True)
-    assert not list(tmp_path.rglob("*.partial*"))
-    with pytest.raises(OutputError, match=r"is a file; name a folder for the results with --out"):
-        open_folder(tmp_path / "results.json", resume=False)
+    assert json.loads(path.read_text()) == {"run": 1}
 
 
 def test_datasets_come_back_equal(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -85,6 +86,7 @@ def test_a_stage_is_done_only_for_the_same_input_and_untouched_files(tmp_path: P
     assert not stamps.done("loop", "key")
     product.write_bytes(b"touched")
     assert not stamps.done("fields", "key")
+    assert (finished_stages(tmp_path), finished_stages(tmp_path / "absent")) == (["fields"], [])
 
 
 def test_the_digest_depends_on_content_alone() -> None:

@@ -1,0 +1,192 @@
+"""The results folder: one run at a time holds it, and a run replaces only what a run wrote.
+
+``manifest.json`` in the folder lists the files that runs have written there, and by which version. A lock of the operating system, which
+ends with the process that holds it, keeps a second run out; who holds it stands beside the lock.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import filelock
+
+from fusion.products.store import OutputError, write_json
+from thermography.io.atomic import PARTIAL, partial_path
+
+MANIFEST = "manifest.json"
+_STAGES = ".stages"
+_LOCK, _HOLDER = f"{_STAGES}/lock", f"{_STAGES}/holder.json"
+
+
+@contextmanager
+def open_folder(folder: Path, *, resume: bool) -> Iterator[Path]:
+    """Hold a results folder for one run: a new or empty one, or one in which a run is to be continued.
+
+    Parameters
+    ----------
+    folder : Path
+        Results folder; what an interrupted write of an earlier run left in it is removed, and nothing else.
+    resume : bool
+        Whether a run that is in it is continued.
+
+    Yields
+    ------
+    Path
+        The folder.
+
+    Raises
+    ------
+    OutputError
+        If the folder is a file, cannot be written to, is held by another run, holds something and `resume` is false, or holds something
+        that no run has written.
+
+    Notes
+    -----
+    The operating system gives the lock free when its process ends, however it ends: a lock without a living holder is taken over. Only
+    that of another machine is not, because not every network file system passes locks on.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder} is a file; name a folder for the results with --out")
+    content = {item.name for item in folder.iterdir()} if folder.is_dir() else set()
+    if content and not (folder / _HOLDER).exists():
+        _refuse_strange(folder, content, resume=resume)
+    with _locked(folder):
+        if content:
+            _refuse_strange(folder, content, resume=resume)
+        _refuse_other_machine(folder)
+        write_json(folder / _HOLDER, {"host": platform.node(), "pid": os.getpid(), "since": _now()})
+        try:
+            _remove_leftovers(folder)
+            yield folder
+        finally:
+            (folder / _HOLDER).unlink(missing_ok=True)
+
+
+def claim(folder: Path, *names: str) -> None:
+    """Enter files in the manifest of a folder before they are written, or replaced by a newer version.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder that thermofuse writes to.
+    *names : str
+        Paths relative to it, with ``/`` between folders.
+
+    Raises
+    ------
+    OutputError
+        If one of them exists and no run has written it; nothing is entered then.
+    """
+    written = read_manifest(folder)
+    strange = [name for name in names if name not in written and (folder / name).exists()]
+    if strange:
+        raise OutputError(
+            f"{folder / strange[0]} was not written by thermofuse and is not replaced; move it away, or name another folder with --out"
+        )
+    version = metadata.version("thermofuse")
+    entries = {**written, **dict.fromkeys(names, version)}
+    if entries != written:
+        write_json(folder / MANIFEST, {"software": "thermofuse", "written": dict(sorted(entries.items()))})
+
+
+def read_manifest(folder: Path) -> dict[str, str]:
+    """Return the files that thermofuse wrote in a folder, each with the version that wrote it; none where there is no manifest.
+
+    Parameters
+    ----------
+    folder : Path
+        Results folder.
+
+    Raises
+    ------
+    OutputError
+        If ``manifest.json`` is not the one of a results folder.
+    """
+    content = _read_object(folder / MANIFEST)
+    if content is None:
+        return {}
+    written = content.get("written")
+    if content.get("software") != "thermofuse" or not isinstance(written, dict):
+        raise OutputError(
+            f"{folder / MANIFEST} is not the manifest of a results folder; name another folder with --out"
+        )
+    return {str(name): str(version) for name, version in written.items()}
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder, which is created where it is absent."""
+    try:
+        (folder / _STAGES).mkdir(parents=True, exist_ok=True)
+        lock = filelock.FileLock(folder / _LOCK)
+        lock.acquire(timeout=0)
+    except filelock.Timeout:
+        raise OutputError(
+            f"{folder} is in use by another run ({_holder_words(folder)}); wait until it ends, or name another folder with --out"
+        ) from None
+    except OSError as error:
+        reason = error.strerror or error
+        raise OutputError(f"{folder}: cannot be written to ({reason}); name another folder with --out") from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _refuse_strange(folder: Path, content: set[str], *, resume: bool) -> None:
+    """Refuse a folder that holds something, unless a run in it is to be continued and it was thermofuse that wrote there."""
+    if not resume:
+        raise OutputError(
+            f"{folder} is not empty; add --resume to continue the run that is in it, name another folder with --out, "
+            "or remove it first"
+        )
+    if content != {_STAGES} and MANIFEST not in content:
+        raise OutputError(
+            f"{folder} holds {min(content - {_STAGES})} but no {MANIFEST}: not the results of this version of thermofuse; "
+            "name another folder with --out"
+        )
+
+
+def _refuse_other_machine(folder: Path) -> None:
+    """Refuse a folder whose last holder was on another machine and did not say that it ended."""
+    holder = _read_object(folder / _HOLDER)
+    if holder is not None and holder.get("host") not in (None, platform.node()):
+        raise OutputError(
+            f"{folder} is held by a run on another machine ({_holder_words(folder)}), and whether it is still alive cannot be seen "
+            f"from here; if it has ended, remove {folder / _HOLDER}"
+        )
+
+
+def _holder_words(folder: Path) -> str:
+    """Return who holds a folder: machine, process, and since when."""
+    holder = _read_object(folder / _HOLDER) or {}
+    return f"host {holder.get('host', 'unknown')}, process {holder.get('pid', 'unknown')}, since {holder.get('since', 'unknown')}"
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Remove what an interrupted write left: under the temporary names of the manifest's files, and in the folder of the stages."""
+    for name in (MANIFEST, *read_manifest(folder)):
+        partial_path(folder / name).unlink(missing_ok=True)
+    for leftover in (folder / _STAGES).rglob(f"*{PARTIAL}*"):
+        leftover.unlink()
+
+
+def _read_object(path: Path) -> dict[str, Any] | None:
+    """Return a JSON object, or None where there is no file or a killed process left half of one."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

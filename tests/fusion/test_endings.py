@@ -1,0 +1,91 @@
+"""How a command ends: codes, messages, signals, and a report of faults that holds nothing of the user's."""
+
+from __future__ import annotations
+
+import errno
+import io
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import typer
+from rich.console import Console
+
+from fusion.endings import ExitCode, answering
+from fusion.errors import FusionError
+
+
+def ending(fault: BaseException) -> tuple[int, str]:
+    """Exit code and message of a command in which a fault happens."""
+    told = io.StringIO()
+    with pytest.raises(typer.Exit) as exit, answering(Console(file=told, soft_wrap=True)):
+        raise fault
+    return exit.value.exit_code, told.getvalue()
+
+
+def test_faults_of_input_end_with_their_message() -> None:
+    assert ending(FusionError("laser.csv, line 3: x")) == (ExitCode.BAD_INPUT, "thermofuse: laser.csv, line 3: x\n")
+    missing = FileNotFoundError(errno.ENOENT, "No such file or directory", "IR_0007.jpg")
+    assert ending(missing) == (ExitCode.BAD_INPUT, "thermofuse: IR_0007.jpg: No such file or directory\n")
+
+
+def test_a_fault_of_the_program_is_reported_without_data_of_the_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def stage() -> None:
+        try:
+            float("secret value of /home/jane/laser.csv")
+        except ValueError as error:
+            raise KeyError("secret too") from error
+
+    told = io.StringIO()
+    with pytest.raises(typer.Exit) as exit, answering(Console(file=told, soft_wrap=True)):
+        stage()
+    (report,) = tmp_path.iterdir()
+    assert exit.value.exit_code == ExitCode.FAULT == 70
+    assert told.getvalue().count("\n") == 1
+    assert re.match(
+        r"thermofuse: fault of the program, not of the input: KeyError in \S*test_endings\.py, line \d+; "
+        rf"{re.escape(report.name)} in .* describes it without data of yours",
+        told.getvalue(),
+    )
+    text = report.read_text()
+    assert re.search(r"^thermofuse: \d", text, re.M) and re.search(r"^numpy: \d", text, re.M)
+    assert "builtins.KeyError" in text and "builtins.ValueError" in text and "in stage:" in text
+    stack = [line for line in text.splitlines() if line.startswith("  ")]
+    for private in ("could not convert", str(tmp_path), str(Path.home()), str(Path(__file__).parents[2])):
+        assert private not in text
+    assert all(re.match(r"  [\w./-]+, line \d+, in ", line) and not line.startswith("  /") for line in stack)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM that a process can catch")
+@pytest.mark.parametrize(
+    ("number", "busy"),
+    [(signal.SIGINT, "time.sleep(60)"), (signal.SIGTERM, "hashlib.pbkdf2_hmac('sha256', b'', b'', 2**28)")],
+)
+def test_a_signal_ends_a_run_within_two_seconds(number: signal.Signals, busy: str, tmp_path: Path) -> None:
+    """Also while a library is at work that does not look at signals: one key derivation of about a minute."""
+    code = (
+        "import hashlib, time; from rich.console import Console; from fusion.endings import answering\n"
+        "with answering(Console(stderr=True, soft_wrap=True), kept=lambda: 'out keeps fields'):\n"
+        f"    print('ready', flush=True); {busy}"
+    )
+    # The command line's framework turns `typer.Exit` into the code of the process.
+    code = f"import typer\ntry:\n{_indented(code)}\nexcept typer.Exit as ended:\n    raise SystemExit(ended.exit_code)"
+    run = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert run.stdout is not None and run.stdout.readline() == "ready\n"
+    begun = time.monotonic()
+    run.send_signal(number)
+    _, told = run.communicate(timeout=30)
+    assert time.monotonic() - begun < 2.0
+    assert (run.returncode, told) == (128 + number, f"thermofuse: stopped by {number.name}; out keeps fields\n")
+
+
+def _indented(code: str) -> str:
+    return "\n".join(f"    {line}" for line in code.splitlines())
