@@ -177,6 +177,31 @@ def align(
     fused = deviations[["deviation", "time", "position", "quality_flag"]].copy()
     fused["inside_frames"] = (_DIMS, inside, {"long_name": "the reading lies between the first and the last frame"})
     fused = _add_series(fused.assign_coords(frame_time=frame_time), series)
+    return _add_logs(fused, environment, drivers)
+
+
+def align_logs(
+    deviations: xr.Dataset, *, environment: xr.Dataset | None = None, drivers: xr.Dataset | None = None
+) -> xr.Dataset:
+    """Give every reading what was logged at its own time, where no temperature of the table was measured.
+
+    Parameters
+    ----------
+    deviations : Dataset
+        As for `align`.
+    environment, drivers : Dataset, optional
+        As for `align`.
+
+    Returns
+    -------
+    Dataset
+        As from `align`, without the quantities of the field and without ``inside_frames``.
+    """
+    return _add_logs(deviations[["deviation", "time", "position", "quality_flag"]].copy(), environment, drivers)
+
+
+def _add_logs(fused: xr.Dataset, environment: xr.Dataset | None, drivers: xr.Dataset | None) -> xr.Dataset:
+    """Add every column of both logs: at the readings, and as a series on the log's own times."""
     for table, dim in ((environment, "environment_time"), (drivers, "driver_time")):
         if table is not None:
             fused = _add_table(fused, table, dim)

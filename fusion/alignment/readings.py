@@ -270,8 +270,9 @@ def read_fused(fused: xr.Dataset) -> Readings:
     used = present & inside
     cycle, direction, target = np.nonzero(used)
     if np.unique(cycle).size < 3 or np.unique(target).size < 3:
+        within = " within the frames' time" if "inside_frames" in fused else ""
         raise ReadingsError(
-            f"{np.unique(cycle).size} cycles and {np.unique(target).size} targets have readings within the frames' time; "
+            f"{np.unique(cycle).size} cycles and {np.unique(target).size} targets have readings{within}; "
             "the model of the drift needs at least 3 of each"
         )
     stamps = time[used]

@@ -20,7 +20,8 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from fusion.campaign.messages import Place, describe, find_line, key_lines, suggest
+from fusion.campaign.messages import describe, find_line, key_lines, suggest
+from fusion.campaign.needed_tables import check_tables
 from fusion.campaign.quantities import split_uncertainty
 from fusion.campaign.value_types import (
     Celsius,
@@ -56,11 +57,12 @@ class CampaignError(FusionError):
 
 @dataclass(frozen=True)
 class _Surroundings:
-    """What the values of a campaign file are checked against: its folder, the effects, and whether it holds a record."""
+    """What the values of a campaign file are checked against: its folder, the effects, whether it holds a record, and temperatures."""
 
     folder: Path
     effects: Mapping[str, Effect]
     record: bool
+    temperatures: bool
 
 
 def _existing(name: str, info: ValidationInfo) -> str:
@@ -97,12 +99,22 @@ def _declarable(name: str, info: ValidationInfo) -> str:
         allowed: tuple[str, ...] = RECORD_EFFECTS
         accepted = name in (*allowed, *_ALONG_AN_AXIS)
     else:
-        allowed = tuple(effect.name for effect in effects.values() if effect.declarable)
+        allowed = tuple(
+            effect.name
+            for effect in effects.values()
+            if effect.declarable and (info.context.temperatures or not effect.follows_field)
+        )
         accepted = name in allowed
     if accepted:
         return name
     choice = f"can be declared here: {', '.join(allowed)}"
-    if name in effects and not effects[name].declarable:
+    unmeasured = name in effects and effects[name].declarable and effects[name].follows_field
+    if unmeasured and not info.context.record:
+        text = (
+            "this effect follows the temperature of the table, which this campaign does not measure; add [thermography] with [plan], or "
+            f"[sensors], or remove the effect; {choice}"
+        )
+    elif name in effects and not effects[name].declarable:
         lacking = (
             "the columns of this effect need a fitted model"
             if effects[name].errs_camera
@@ -268,6 +280,7 @@ class ThermographyTable(_Measured):
     camera_drift_u_K: KelvinU | None = Field(default=None, alias="camera_drift_u")
     region: tuple[SurfaceTable, ...] = ()
     clock_offset_s: Seconds | None = Field(default=None, alias="clock_offset")
+    window_s: PositiveSeconds | None = Field(default=None, alias="window")
     table: Literal["still", "moving"] = "still"
     reference_patch_px: PixelPatch | None = Field(default=None, alias="reference_patch")
     lens: ExistingFile | None = None
@@ -290,13 +303,15 @@ class PlanTable(_Table):
     """``[plan]``: the table plan in millimetres and its fiducials."""
 
     size_mm: tuple[PositiveMillimetres, PositiveMillimetres] = Field(alias="size")
-    cell_size_mm: PositiveMillimetres = Field(alias="cell_size")
-    fiducials: ExistingFile
+    cell_size_mm: PositiveMillimetres | None = Field(default=None, alias="cell_size")
+    fiducials: ExistingFile | None = None
     regions: ExistingFile | None = None
-    axis: AxisTable
+    axis: AxisTable | None = None
 
     @model_validator(mode="after")
     def _cells_fit(self) -> PlanTable:
+        if self.cell_size_mm is None:
+            return self
         along = [length / self.cell_size_mm for length in self.size_mm]
         cells = along[0] * along[1]
         if any(abs(count - round(count)) > 1e-6 for count in along):
@@ -312,6 +327,15 @@ class PlanTable(_Table):
             )
             raise PydanticCustomError("cells", "{text}", {"text": text})
         return self
+
+
+class SensorsTable(_Table):
+    """``[sensors]``: temperatures of contact sensors over time, and the places of the sensors on the plan."""
+
+    file: ExistingFile
+    places: ExistingFile
+    time_zone: TimeZone | None = None
+    temperature_u_K: KelvinU = Field(default=0.2, alias="temperature_u")
 
 
 class InterferometryTable(_Measured):
@@ -410,6 +434,7 @@ class Campaign(_Table):
     thermography: ThermographyTable | None = None
     plan: PlanTable | None = None
     interferometry: InterferometryTable | None = None
+    sensors: SensorsTable | None = None
     drivers: DriversTable | None = None
     record: RecordTable | None = None
     model: ModelTable = ModelTable()
@@ -420,7 +445,13 @@ class Campaign(_Table):
         """Folder that the relative paths of the campaign start from."""
         return self.path.parent
 
-    def zone_of(self, table: Literal["interferometry", "drivers", "record"]) -> str | None:
+    @property
+    def declared(self) -> tuple[str, ...]:
+        """Declared effects; where the file names none, those that follow the table's temperature, if it was measured."""
+        measured = self.thermography is not None or self.sensors is not None
+        return self.model.declared if measured or "declared" in self.model.model_fields_set else ()
+
+    def zone_of(self, table: Literal["interferometry", "sensors", "drivers", "record"]) -> str | None:
         """Return the zone of times that the files of a table give without one; None where neither it nor ``[campaign]`` states it."""
         stated = getattr(self, table)
         return (stated.time_zone if stated is not None else None) or self.campaign.time_zone
@@ -452,7 +483,7 @@ class Campaign(_Table):
     def input_files(self) -> dict[str, Path]:
         """Return every file that the campaign reads, keyed by its path relative to the campaign file."""
         files = {relative_name(self.path, self.folder): self.path}
-        for table in ("thermography", "plan", "interferometry", "drivers", "record"):
+        for table in ("thermography", "plan", "interferometry", "sensors", "drivers", "record"):
             files |= self.files_of(table)
         return files
 
@@ -463,6 +494,8 @@ class Campaign(_Table):
             names = [self.plan.fiducials, self.plan.regions]
         elif table == "interferometry" and self.interferometry is not None:
             names = [self.interferometry.deviations, self.interferometry.environment]
+        elif table == "sensors" and self.sensors is not None:
+            names = [self.sensors.file, self.sensors.places]
         elif table == "drivers" and self.drivers is not None:
             names = [self.drivers.file]
         elif table == "thermography" and self.thermography is not None:
@@ -545,9 +578,10 @@ def load_campaign(path: str | Path, *, effects: Mapping[str, Effect] | None = No
     def place(key: tuple[str, ...]) -> str:
         return f"{path}, line {find_line(lines, key)}"
 
-    faults = _check_instruments(content, place)
+    faults = check_tables(content, place)
     content.pop("path", None)
-    surroundings = _Surroundings(path.parent, library() if effects is None else effects, "record" in content)
+    measured = "thermography" in content or "sensors" in content
+    surroundings = _Surroundings(path.parent, library() if effects is None else effects, "record" in content, measured)
     try:
         campaign = Campaign.model_validate({**content, "path": path}, context=surroundings)
     except ValidationError as error:
@@ -574,27 +608,6 @@ def _as_written(item: ErrorDetails, content: Mapping[str, Any]) -> ErrorDetails:
     if written is table:
         return item
     return {**item, "loc": (*outer, name.removesuffix("_u")), "input": written}
-
-
-def _check_instruments(content: dict[str, Any], place: Place) -> list[str]:
-    """Return the fault of a campaign that holds neither both instruments with the plan nor a record, or both."""
-    instruments = [name for name in ("thermography", "plan", "interferometry") if name in content]
-    if "path" in content:
-        return [f"{place(('path',))}: unknown key path; remove it"]
-    if "record" in content:
-        if instruments:
-            return [
-                f"{place(('record',))}: [record] stands instead of [{'], ['.join(instruments)}]; "
-                "remove one or the other, a record is analysed on its own"
-            ]
-        return []
-    missing = [name for name in ("thermography", "plan", "interferometry") if name not in content]
-    if missing:
-        return [
-            f"{place(())}: the table [{'], ['.join(missing)}] is missing; "
-            "a campaign needs [thermography], [plan] and [interferometry], or a [record] instead"
-        ]
-    return []
 
 
 def _matches(folder: Path, pattern: str) -> list[Path]:

@@ -1,11 +1,11 @@
-"""Inputs of a campaign with both instruments: read, checked for overlap in time and plausible clocks; omissions are noted."""
+"""Inputs of a campaign with one instrument or both: read, checked for overlap in time and plausible clocks; omissions are noted."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,121 +14,106 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
-from fusion.alignment.align import AlignmentError, AxisGeometry, MeasuredLine, camera_on_laser_clock, cycle_bounds
+from fusion.alignment.align import AlignmentError, AxisGeometry, MeasuredLine, camera_on_laser_clock
 from fusion.alignment.zone_shift import covered_share, likely_zone_shift
 from fusion.attribution.randomised_duty import DutyLaw, read_duty
-from fusion.attribution.thermal_modes import Region, read_regions
-from fusion.campaign.config import Campaign, InterferometryTable, PlanTable, ThermographyTable, relative_name
+from fusion.attribution.thermal_modes import read_regions
+from fusion.campaign.config import Campaign, relative_name
 from fusion.campaign.logged_tables import read_drivers, split_heading
-from fusion.campaign.recompensation import compensate_readings, see_material
+from fusion.campaign.recompensation import RecompensationError, compensate_readings, see_material
+from fusion.campaign.sources import (
+    CameraInputs,
+    Cycles,
+    Inputs,
+    LaserInputs,
+    Source,
+    cycles_of_frames,
+    cycles_of_readings,
+    usual_window_s,
+)
 from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones
 from fusion.errors import FusionError
 from fusion.products.contracts import check
 from fusion.products.results import Notice
 from interferometry.contract import DEVIATIONS
 from interferometry.io.readers import read_deviations, read_environment
-from interferometry.iso230 import Iso230Budget
 from thermography.io.flir import FrameReference, index_frames
-from thermography.registration.lens import Lens, read_lens
-from thermography.registration.plan import Fiducial, PlanGrid, read_fiducials
+from thermography.registration.lens import read_lens
+from thermography.registration.plan import PlanGrid, read_fiducials
 from thermography.registration.polygon import Polygon, PolygonError
 
 #: Maximum number of omitted items listed in a message; the products hold all of them.
 _NAMED = 5
-#: Smallest campaign that closed loop and attribution can use.
-_LEAST_CYCLES, _LEAST_TARGETS, _LEAST_FRAMES = 12, 3, 12
+#: Smallest test that has a scatter and a drift, and smallest recording that has a rise.
+_LEAST_CYCLES, _LEAST_TARGETS, _LEAST_FRAMES = 2, 2, 2
 
 
-@dataclass(frozen=True)
-class Source:
-    """Inputs of a campaign with both instruments, before anything is calculated.
-
-    Attributes
-    ----------
-    campaign, thermography, plan, interferometry
-        The campaign file and its tables.
-    deviations : Dataset
-        Readings that keep ``interferometry.contract.DEVIATIONS``.
-    environment, drivers : Dataset or None
-        Logs along ``time`` (UTC); None where nothing was logged.
-    fiducials : list of Fiducial
-        Fiducials of the plan.
-    frames, frames_rejected : list
-        Usable thermograms sorted by time, and file, index and reason of the others.
-    regions : list of Region
-        Named regions of the plan.
-    duty : tuple or None
-        Randomised loads over time and the law that they were drawn from.
-    notices : list of Notice
-        Everything that was left out.
-    iso_budget : Iso230Budget or None
-        Uncertainty contributions to ISO 230-2 values; None for those of the readings as recorded.
-    lens : Lens or None
-        Calibration of the camera's lens.
-    """
-
-    campaign: Campaign
-    thermography: ThermographyTable
-    plan: PlanTable
-    interferometry: InterferometryTable
-    deviations: xr.Dataset
-    environment: xr.Dataset | None
-    drivers: xr.Dataset | None
-    fiducials: list[Fiducial]
-    frames: list[FrameReference]
-    frames_rejected: list[dict[str, Any]]
-    regions: list[Region] = field(default_factory=list)
-    duty: tuple[xr.DataArray, DutyLaw] | None = None
-    notices: list[Notice] = field(default_factory=list)
-    iso_budget: Iso230Budget | None = None
-    lens: Lens | None = None
-
-    @property
-    def needs_camera(self) -> bool:
-        """Whether the readings are compensated again with the temperature from the camera."""
-        return self.interferometry.material_temperature == "camera"
-
-    @property
-    def is_recompensated(self) -> bool:
-        """Whether the environment log entered the readings: compensated again, or corrected for a dead path."""
-        return self.interferometry.compensation == "redo" or self.interferometry.dead_path_mm != 0.0
-
-    @property
-    def grid(self) -> PlanGrid:
-        """The plan's cells."""
-        return PlanGrid(*self.plan.size_mm, self.plan.cell_size_mm)
-
-    @property
-    def axis(self) -> AxisGeometry:
-        """Where the measured line lies on the plan."""
-        return AxisGeometry(self.plan.axis.origin_mm, self.plan.axis.direction)
-
-    @property
-    def frame_times(self) -> np.ndarray:
-        """Times of the usable frames on the camera's clock, (n,) datetime64[ns]."""
-        return np.array([frame.time for frame in self.frames], dtype="datetime64[ns]")
-
-
-def read_source(campaign: Campaign) -> Source:
+def read_source(campaign: Campaign) -> LaserInputs | CameraInputs | Source:
     """Read readings, logs, fiducials and the frames' headers of a campaign, with every check that needs no calculation.
 
     Parameters
     ----------
     campaign : Campaign
-        A checked campaign with both instruments.
+        A checked campaign with an instrument.
 
     Returns
     -------
-    Source
-        What was read, with a notice for everything that was left out.
+    LaserInputs, CameraInputs or Source
+        What was read, with a notice for everything that was left out: a `Source` where both instruments are there.
 
     Raises
     ------
     ValueError
         A subclass of the instruments' packages or of this one: a file that cannot be used, cycles that overlap, clocks that never meet.
     """
-    thermography, plan, interferometry = campaign.thermography, campaign.plan, campaign.interferometry
-    assert thermography is not None and plan is not None and interferometry is not None
+    common: dict[str, Any] = {"campaign": campaign, "drivers": _read_drivers(campaign)}
+    common["duty"] = _randomised(campaign, common["drivers"])
+    if campaign.interferometry is not None:
+        common |= _read_laser(campaign)
+    _refuse_mixed_zones(campaign, common)
+    if campaign.thermography is None:
+        laser = LaserInputs(**common)
+        laser.notices[:0] = _laser_notices(laser)
+        return laser
+    if campaign.interferometry is None:
+        camera = CameraInputs(**common, **_read_camera(campaign, None))
+        camera.notices[:0] = [*_camera_notices(camera), *_log_notices(camera), _window_notice(camera)]
+        return camera
+    source = _read_both(campaign, common)
+    source.notices[:0] = [*_camera_notices(source), *_laser_notices(source)]
+    return source
+
+
+def _read_both(campaign: Campaign, common: Mapping[str, Any]) -> Source:
+    """Read the frames of a campaign beside its readings, and refuse clocks that cannot both be right."""
+    plan = campaign.plan
+    assert plan is not None and plan.axis is not None
+    axis = AxisGeometry(plan.axis.origin_mm, plan.axis.direction)
+    cycles = cycles_of_readings(common["deviations"])
+    source = Source(**common, **_read_camera(campaign, cycles), axis=axis)
+    _raise_if_no_rise(campaign, source.frames, source.frames_rejected)
+    _raise_if_line_leaves_plan(source)
+    _raise_if_clocks_disagree(
+        source.deviations,
+        source.frame_times,
+        clock_offset_s=source.thermography.clock_offset_s,
+        source=str(campaign.path),
+    )
+    return source
+
+
+def _read_drivers(campaign: Campaign) -> xr.Dataset | None:
+    """Read the logged drivers; None where the campaign has none."""
+    if campaign.drivers is None:
+        return None
+    drivers = read_drivers(campaign.resolve(campaign.drivers.file))
+    return bring_to_utc(drivers, campaign.zone_of("drivers"), file=campaign.drivers.file)
+
+
+def _read_laser(campaign: Campaign) -> dict[str, Any]:
+    """Read what `LaserInputs` holds: readings, compensated where the campaign asks for it, and the environment log."""
+    interferometry = campaign.interferometry
+    assert interferometry is not None
     laser = campaign.resolve(interferometry.deviations)
     deviations = read_deviations(
         laser,
@@ -139,51 +124,80 @@ def read_source(campaign: Campaign) -> Source:
     zone = campaign.zone_of("interferometry")
     deviations = bring_to_utc(deviations, zone, file=interferometry.deviations)
     check(deviations, DEVIATIONS, name=laser.name)
-    cycle_bounds(deviations)
+    _raise_if_too_few_readings(deviations, file=interferometry.deviations)
+    cycles_of_readings(deviations)
     environment = None
     if interferometry.environment is not None:
         environment = read_environment(campaign.resolve(interferometry.environment))
         environment = bring_to_utc(environment, zone, file=interferometry.environment)
     compensated = compensate_readings(deviations, environment, interferometry)
-    by_camera = interferometry.material_temperature == "camera"
-    drivers = None
-    if campaign.drivers is not None:
-        drivers = read_drivers(campaign.resolve(campaign.drivers.file))
-        drivers = bring_to_utc(drivers, campaign.zone_of("drivers"), file=campaign.drivers.file)
-    files = (interferometry.deviations, interferometry.environment, campaign.drivers and campaign.drivers.file)
-    logs = {
-        str(file): log for file, log in zip(files, (deviations, environment, drivers), strict=True) if log is not None
-    }
-    refuse_mixed_zones(logs, source=str(campaign.path))
-    frames, rejected = index_frames(campaign.frame_paths())
-    rejected_frames = [
-        {
-            "file": relative_name(frame.path, campaign.folder),
-            "index": frame.index,
-            "reason": frame.reason.replace(f"{campaign.folder}/", ""),
+    read = {"interferometry": interferometry, "environment": environment}
+    if interferometry.material_temperature == "logged":
+        return {
+            **read,
+            "deviations": compensated.deviations,
+            "iso_budget": compensated.budget,
+            "notices": compensated.notices,
         }
-        for frame in rejected
-    ]
+    if campaign.thermography is None:
+        raise RecompensationError(
+            f'{campaign.path}: interferometry.material_temperature = "camera", but this campaign has no [thermography]; '
+            'write "logged", or add the frames'
+        )
+    return {**read, "deviations": deviations, "iso_budget": compensated.budget, "notices": []}
+
+
+def _refuse_mixed_zones(campaign: Campaign, read: Mapping[str, Any]) -> None:
+    """Refuse logs of which some give times with a zone and others without one."""
+    interferometry, drivers = campaign.interferometry, campaign.drivers
+    files = {
+        "deviations": interferometry and interferometry.deviations,
+        "environment": interferometry and interferometry.environment,
+        "drivers": drivers and drivers.file,
+    }
+    logs = {str(file): read[name] for name, file in files.items() if read.get(name) is not None}
+    refuse_mixed_zones(logs, source=str(campaign.path))
+
+
+def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
+    """Read what `CameraInputs` holds; without cycles of a laser, windows of the camera's time stand for them."""
+    thermography, plan = campaign.thermography, campaign.plan
+    assert (
+        thermography is not None and plan is not None and plan.fiducials is not None and plan.cell_size_mm is not None
+    )
+    frames, rejected = _read_frames(campaign)
+    camera: dict[str, Any] = {
+        "thermography": thermography,
+        "plan": plan,
+        "grid": PlanGrid(*plan.size_mm, plan.cell_size_mm),
+        "fiducials": read_fiducials(campaign.resolve(plan.fiducials)),
+        "fiducials_file": plan.fiducials,
+        "frames": frames,
+        "frames_rejected": rejected,
+        "cycles": cycles,
+        "regions": [] if plan.regions is None else read_regions(campaign.resolve(plan.regions)),
+        "lens": None if thermography.lens is None else read_lens(campaign.resolve(thermography.lens)),
+    }
+    if cycles is None:
+        _raise_if_no_rise(campaign, frames, rejected)
+        times = np.array([frame.time for frame in frames], dtype="datetime64[ns]")
+        times = camera_on_laser_clock(times, thermography.clock_offset_s or 0.0)
+        camera["cycles"] = cycles_of_frames(times, thermography.window_s or usual_window_s(times))
+    return camera
+
+
+def _read_frames(campaign: Campaign) -> tuple[list[FrameReference], list[dict[str, Any]]]:
+    """Return the usable frames sorted by time, and file, index and reason of the others."""
+    frames, rejected = index_frames(campaign.frame_paths())
     timed = [frame for frame in frames if not np.isnat(frame.time)]
-    rejected_frames += [
-        {"file": relative_name(frame.path, campaign.folder), "index": frame.index, "reason": "the frame has no time"}
-        for frame in frames
-        if np.isnat(frame.time)
-    ]
     timed, odd = _of_one_size(timed)
-    rejected_frames += [
+    left_out = [(frame, frame.reason.replace(f"{campaign.folder}/", "")) for frame in rejected]
+    left_out += [(frame, "the frame has no time") for frame in frames if np.isnat(frame.time)]  # type: ignore[misc]
+    left_out += odd  # type: ignore[arg-type]
+    return timed, [
         {"file": relative_name(frame.path, campaign.folder), "index": frame.index, "reason": reason}
-        for frame, reason in odd
+        for frame, reason in left_out
     ]
-    source = Source(
-        campaign, thermography, plan, interferometry, deviations if by_camera else compensated.deviations, environment, drivers,
-        read_fiducials(campaign.resolve(plan.fiducials)), timed, rejected_frames,
-        [] if plan.regions is None else read_regions(campaign.resolve(plan.regions)), _randomised(campaign, drivers),
-        [] if by_camera else compensated.notices, compensated.budget,
-        None if thermography.lens is None else read_lens(campaign.resolve(thermography.lens)),
-    )  # fmt: skip
-    source.notices[:0] = _notices(source)
-    return source
 
 
 def _of_one_size(frames: list[FrameReference]) -> tuple[list[FrameReference], list[tuple[FrameReference, str]]]:
@@ -231,33 +245,41 @@ def _randomised(campaign: Campaign, drivers: xr.Dataset | None) -> tuple[xr.Data
     return read_duty(drivers, names, law, source=table.file), law
 
 
-def _notices(source: Source) -> list[Notice]:
-    """Return a notice for everything that is left out of the input or missing from it."""
-    notices = [*frames_notices(source.frames_rejected), *_remark_notices(source.frames)]
-    _raise_if_too_small(source)
+def _camera_notices(source: CameraInputs) -> list[Notice]:
+    """Return a notice for every kind of frame that is left out, and refuse what cannot be used."""
     _raise_if_patch_outside(source)
     _raise_if_regions_unusable(source)
-    _raise_if_line_leaves_plan(source)
-    _raise_if_clocks_disagree(
-        source.deviations,
-        source.frame_times,
-        clock_offset_s=source.thermography.clock_offset_s,
-        source=str(source.campaign.path),
+    return [*frames_notices(source.frames_rejected), *_remark_notices(source.frames)]
+
+
+def _window_notice(source: CameraInputs) -> Notice:
+    """Return the notice that says what stands for cycles."""
+    bounds, stated = source.cycles.bounds, source.thermography.window_s is not None
+    minutes = float((bounds[0, 1] - bounds[0, 0]) / np.timedelta64(1, "m"))
+    return Notice(
+        "cycles_from_windows",
+        f"No laser gives cycles: the frames are divided into {counted(len(bounds), 'window')} of {minutes:g} min"
+        f"{', as thermography.window states' if stated else ', a usual length for a recording this long'}; each counts as a cycle.",
+        "" if stated else 'Write thermography.window, for example "5 min", for windows of another length.',
     )
-    notices += left_out_notices(source.deviations, "readings_left_out")
-    notes = json.loads(source.deviations.attrs.get("notes", "[]"))
-    if notes:
-        said = "; ".join(note.removeprefix("warning: ") for note in notes)
-        notices.append(
-            Notice(
-                "readings_as_read",
-                f"{source.interferometry.deviations} was read so: {said}.",
-                "Compare with the protocol of the test.",
-            )
-        )
+
+
+def _log_notices(source: Inputs) -> list[Notice]:
+    """Return a notice for the lines of the logs that are left out."""
+    notices = []
     for table, code in ((source.environment, "environment_rows_left_out"), (source.drivers, "driver_rows_left_out")):
         if table is not None:
             notices += left_out_notices(table, code)
+    return notices
+
+
+def _laser_notices(source: LaserInputs) -> list[Notice]:
+    """Return a notice for everything that is left out of the readings and the logs, or missing from them."""
+    notices = [
+        *left_out_notices(source.deviations, "readings_left_out"),
+        *_as_read_notices(source),
+        *_log_notices(source),
+    ]
     if source.environment is None:
         notices.append(
             Notice(
@@ -269,26 +291,44 @@ def _notices(source: Source) -> list[Notice]:
     return notices
 
 
-def _raise_if_too_small(source: Source) -> None:
-    """Raise if the campaign is too small for a model of the drift."""
-    sizes = source.deviations.sizes
+def _raise_if_too_few_readings(deviations: xr.Dataset, *, file: str) -> None:
+    """Raise if the test has neither scatter nor drift."""
+    sizes = deviations.sizes
     if sizes["cycle"] < _LEAST_CYCLES or sizes["target"] < _LEAST_TARGETS:
         raise SourceError(
-            f"{source.interferometry.deviations}: {counted(sizes['cycle'], 'cycle')} at {counted(sizes['target'], 'target')}; "
-            f"a model of the drift needs at least {_LEAST_CYCLES} cycles (better 50) at {_LEAST_TARGETS} targets, "
-            "thermofuse iso230 evaluates shorter tests"
+            f"{file}: {counted(sizes['cycle'], 'cycle')} at {counted(sizes['target'], 'target')}; "
+            f"scatter and drift need at least {_LEAST_CYCLES} cycles at {_LEAST_TARGETS} targets"
         )
-    if len(source.frames) < _LEAST_FRAMES:
-        reasons = (
-            listed(_reason(item) for item in source.frames_rejected) if source.frames_rejected else "none rejected"
+
+
+def _as_read_notices(source: LaserInputs) -> list[Notice]:
+    """Return the notice that says how the reader understood the laser file, where it had to choose."""
+    notes = json.loads(source.deviations.attrs.get("notes", "[]"))
+    if not notes:
+        return []
+    said = "; ".join(note.removeprefix("warning: ") for note in notes)
+    return [
+        Notice(
+            "readings_as_read",
+            f"{source.interferometry.deviations} was read so: {said}.",
+            "Compare with the protocol of the test.",
         )
+    ]
+
+
+def _raise_if_no_rise(
+    campaign: Campaign, frames: Sequence[FrameReference], rejected: Sequence[Mapping[str, Any]]
+) -> None:
+    """Raise if too few frames are left to show a rise."""
+    if len(frames) < _LEAST_FRAMES:
+        reasons = listed(_reason(item) for item in rejected) if rejected else "none rejected"
         raise SourceError(
-            f"{source.campaign.path}: {counted(len(source.frames), 'usable frame')}, at least {_LEAST_FRAMES} are needed "
+            f"{campaign.path}: {counted(len(frames), 'usable frame')}, at least {_LEAST_FRAMES} are needed "
             f"({reasons}); check thermography.frames"
         )
 
 
-def _raise_if_patch_outside(source: Source) -> None:
+def _raise_if_patch_outside(source: CameraInputs) -> None:
     """Raise if the reference patch leaves the frames."""
     patch = source.thermography.reference_patch_px
     if patch is None:
@@ -302,9 +342,9 @@ def _raise_if_patch_outside(source: Source) -> None:
         )
 
 
-def _raise_if_regions_unusable(source: Source) -> None:
+def _raise_if_regions_unusable(source: CameraInputs) -> None:
     """Raise if a region of an emissivity of its own has no cell of the plan to itself, or a state in a cycle that was not measured."""
-    grid, cycles = source.grid, source.deviations["cycle"].values
+    grid, cycles = source.grid, source.cycles.number
     for region in source.thermography.region:
         where = f"{source.campaign.path}: [[thermography.region]]"
         try:
@@ -319,7 +359,7 @@ def _raise_if_regions_unusable(source: Source) -> None:
         for state in region.states or ():
             if state.cycle not in cycles:
                 raise SourceError(
-                    f"{where}: the states of region {region.name} name cycle {state.cycle}, but {source.interferometry.deviations} holds "
+                    f"{where}: the states of region {region.name} name cycle {state.cycle}, but the campaign holds "
                     f"the cycles {cycles[0]} to {cycles[-1]}; name a measured one"
                 )
 

@@ -36,15 +36,15 @@ _LEAST_SIDE = 3
 _EXCHANGE_SIGMAS, _OPPOSITE_P = 8.0, 1e-3
 
 
-def check_readings(deviations: xr.Dataset, *, plan_extent_mm: float) -> list[Check]:
+def check_readings(deviations: xr.Dataset, *, plan_extent_mm: float | None) -> list[Check]:
     """Check what readings can say of themselves.
 
     Parameters
     ----------
     deviations : Dataset
         Keeps ``interferometry.contract.DEVIATIONS``.
-    plan_extent_mm : float
-        Extent of the plan along the axis, mm.
+    plan_extent_mm : float or None
+        Extent of the plan along the axis, mm; None where there is no plan, and the travel is held against nothing.
 
     Returns
     -------
@@ -55,7 +55,7 @@ def check_readings(deviations: xr.Dataset, *, plan_extent_mm: float) -> list[Che
     return [
         _largest_deviation(deviations),
         _least_noise(max(noise_um, _resolution_um(values) / np.sqrt(12.0))),
-        _travel(deviations, plan_extent_mm),
+        *([] if plan_extent_mm is None else [_travel(deviations, plan_extent_mm)]),
         _copied_cycles(deviations),
         _exchanged_approaches(deviations, noise_um),
         _datum(deviations, noise_um),

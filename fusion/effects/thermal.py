@@ -27,7 +27,7 @@ def needs_field(readings: Readings) -> str | None:
     ----------
     readings : with the series of the field, if there is one
     """
-    return None if "mean_rise" in readings.series else "the campaign holds no thermal frames"
+    return None if "mean_rise" in readings.series else "the campaign holds no temperature of the table"
 
 
 def _needs_driver(readings: Readings) -> str | None:

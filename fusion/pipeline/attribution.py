@@ -16,7 +16,7 @@ from fusion.attribution.family_wise import LEVEL
 from fusion.attribution.leading_source import LeadingSource, find_source, recommend_measurement
 from fusion.attribution.randomised_duty import randomisation_test
 from fusion.attribution.thermal_modes import Region, cluster_cells, disc
-from fusion.campaign.inputs import Source
+from fusion.campaign.sources import Source
 from fusion.pipeline.rise_scale import place_scale_u, scaled
 from fusion.products.progress import Report
 from fusion.products.results import Outcome
@@ -80,6 +80,36 @@ def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, re
         "correlation": _correlation_part(maps, find_source(maps), fields, areas),
     }
     return Outcome(maps, parts)
+
+
+def describe_hotspots(fields: xr.Dataset) -> list[dict[str, Any]]:
+    """Return the part ``hotspots`` of results.json where no drift was measured, or too little of it to be tested.
+
+    Parameters
+    ----------
+    fields : Dataset
+        Keeps ``thermography.contract.FIELDS``.
+    """
+    spots = detect_hotspots(fields["temperature_rise"].isel(cycle=-1))
+    return [
+        {**_peak_part(f"hotspot {k}", spot, fields), "targets": [], "p_value": None, "lag_s": None}
+        for k, spot in enumerate(spots, start=1)
+    ]
+
+
+def _peak_part(name: str, spot: Hotspot, fields: xr.Dataset) -> dict[str, Any]:
+    """Place, area and rise of a hotspot."""
+    u = fields["temperature_rise_u"].isel(cycle=-1).sel(x=spot.x_mm, y=spot.y_mm, method="nearest")
+    return {
+        "name": name,
+        "x_mm": spot.x_mm,
+        "y_mm": spot.y_mm,
+        "centroid_x_mm": spot.centroid_x_mm,
+        "centroid_y_mm": spot.centroid_y_mm,
+        "area": area_json(Area(*spot.extent_mm)),
+        "peak_rise_K": spot.peak_rise_K,
+        "peak_rise_u_K": float(u),
+    }
 
 
 def _hotspot_regions(spots: Sequence[Hotspot], field: xr.DataArray) -> list[Region]:
@@ -262,18 +292,7 @@ def _hotspot_part(name: str, spot: Hotspot, maps: xr.DataTree, fused: xr.Dataset
             "p_value": float(best["p_value"]),
             "lag_s": float(best["lag"]),
         }
-    u = fields["temperature_rise_u"].isel(cycle=-1).sel(x=spot.x_mm, y=spot.y_mm, method="nearest")
-    return {
-        "name": name,
-        "x_mm": spot.x_mm,
-        "y_mm": spot.y_mm,
-        "centroid_x_mm": spot.centroid_x_mm,
-        "centroid_y_mm": spot.centroid_y_mm,
-        "area": area_json(Area(*spot.extent_mm)),
-        "peak_rise_K": spot.peak_rise_K,
-        "peak_rise_u_K": float(u),
-        **tested,
-    }
+    return {**_peak_part(name, spot, fields), **tested}
 
 
 def _driven_targets(maps: xr.DataTree, fused: xr.Dataset, region: str, best: xr.Dataset) -> list[int]:

@@ -13,7 +13,8 @@ import xarray as xr
 from fusion._typing import Array
 from fusion.alignment.align import camera_on_laser_clock
 from fusion.campaign.config import relative_name
-from fusion.campaign.inputs import Source, SourceError, counted, frames_notices, listed
+from fusion.campaign.inputs import SourceError, counted, frames_notices, listed
+from fusion.campaign.sources import CameraInputs
 from fusion.products.progress import Report
 from fusion.products.results import Notice
 from thermography.errors import ThermographyError
@@ -43,7 +44,7 @@ class CameraState:
 
     Attributes
     ----------
-    source : Source
+    source : CameraInputs
         Inputs with the usable frames only.
     correction_K : (frames,) ndarray, K, or None
         To be added to the temperature of every usable frame; None where nothing is corrected.
@@ -55,7 +56,7 @@ class CameraState:
         What was left out, corrected, or cannot be told apart.
     """
 
-    source: Source
+    source: CameraInputs
     correction_K: Array | None
     u_K: Array
     part: dict[str, Any]
@@ -101,12 +102,12 @@ class CameraState:
         )
 
 
-def survey_campaign(source: Source, override: Overrides, *, report: Report) -> Survey:
+def survey_campaign(source: CameraInputs, override: Overrides, *, report: Report) -> Survey:
     """Read all frames of a campaign once.
 
     Parameters
     ----------
-    source : Source
+    source : CameraInputs
         Inputs of the campaign.
     override : Overrides
         Camera parameters that the campaign states.
@@ -158,12 +159,12 @@ def clear_frames(survey: Survey, most: int) -> list[FrameReference]:
     return (clear or survey.frames)[:most]
 
 
-def examine_camera(source: Source, survey: Survey, registration: Registration) -> CameraState:
+def examine_camera(source: CameraInputs, survey: Survey, registration: Registration) -> CameraState:
     """Leave damaged frames out, and estimate what the camera adds to all pixels alike.
 
     Parameters
     ----------
-    source : Source
+    source : CameraInputs
         Inputs of the campaign.
     survey : Survey
         Of its frames.
@@ -228,12 +229,12 @@ def examine_camera(source: Source, survey: Survey, registration: Registration) -
     )
 
 
-def _travel_shifts(source: Source) -> Array:
+def _travel_shifts(source: CameraInputs) -> Array:
     """Places between which a moving table travels, (positions, 2) mm on the plan; none of a table at rest."""
     if source.thermography.table != "moving":
         return np.zeros((0, 2))
-    travel = float(np.abs(source.deviations["position"].values).max())
-    return np.asarray(np.linspace(-travel, travel, _POSITIONS)[:, None] * np.array(source.plan.axis.direction))
+    travel = source.travel_mm
+    return np.asarray(np.linspace(-travel, travel, _POSITIONS)[:, None] * np.array(source.direction))
 
 
 def camera_corrected(part: Mapping[str, Any]) -> bool:
@@ -247,7 +248,7 @@ def camera_corrected(part: Mapping[str, Any]) -> bool:
     return bool(part["frames_damaged"] or part["steps"] or part["drift_K"])
 
 
-def _refuse_patch_on_plan(source: Source, blocks: Blocks) -> None:
+def _refuse_patch_on_plan(source: CameraInputs, blocks: Blocks) -> None:
     """Refuse a reference patch that shows the plan: what warms there is the table, not the camera."""
     patch = source.thermography.reference_patch_px
     if patch is None:
@@ -284,7 +285,7 @@ def _levels(survey: Survey, blocks: Blocks, kept: Array) -> tuple[Array, Array, 
     return background, np.nanmean(table, axis=1), np.nanstd(table, axis=1)
 
 
-def _series(source: Source, background: Array, table: Array) -> LevelSeries:
+def _series(source: CameraInputs, background: Array, table: Array) -> LevelSeries:
     """The levels with the temperatures inside the camera and of the room."""
     frames, times = source.frames, source.frame_times
     seconds = (times - times[0]) / np.timedelta64(1, "s")
@@ -350,8 +351,9 @@ def _correction_notices(correction: CameraCorrection, frames: Sequence[FrameRefe
         notices.append(
             Notice(
                 "camera_drift_undetermined",
-                f"What lies beside the table changed by {unexplained:.2f} K for which neither the logged air nor the camera accounts. "
-                f"A drift of the camera of this size cannot be told from warming; rises are uncertain by up to {u_K:.2g} K.",
+                f"What lies beside the table changed by {unexplained:.2f} K for which neither a logged air temperature nor "
+                "the camera accounts. A drift of the camera of this size cannot be told from warming; rises are uncertain by up to "
+                f"{u_K:.2g} K.",
                 "Log the air temperature, and keep a surface of constant temperature in view.",
             )
         )

@@ -10,8 +10,8 @@ import xarray as xr
 
 from fusion.alignment.align import camera_on_laser_clock
 from fusion.alignment.readings import read_fused
-from fusion.campaign.config import CampaignError
-from fusion.campaign.inputs import Source
+from fusion.campaign.config import Campaign, CampaignError
+from fusion.campaign.sources import CameraInputs, Inputs, LaserInputs, Source
 from fusion.consistency.camera_stamps import check_order, check_phase
 from fusion.consistency.checks import CODES, Check
 from fusion.consistency.clocks import check_camera_clock, check_load_clock, check_load_scale, check_material_clock
@@ -27,18 +27,18 @@ from fusion.consistency.temperature import check_material
 from fusion.pipeline.radiometry import overridden_parameters
 
 
-def check_source(source: Source) -> list[Check]:
+def check_source(source: Inputs) -> list[Check]:
     """Check what was read, before anything is calculated.
 
     Parameters
     ----------
-    source : Source
+    source : LaserInputs, CameraInputs or Source
         Inputs of the campaign.
 
     Returns
     -------
     list of Check
-        Of the readings, the logs and the frames.
+        Of the readings with their logs, and of the frames, as far as the campaign has them.
 
     Raises
     ------
@@ -50,13 +50,23 @@ def check_source(source: Source) -> list[Check]:
         raise CampaignError(
             f"{source.campaign.path}: accept.doubts = {unknown[0]!r}: no such check; there are: {', '.join(CODES)}"
         )
-    x, y = source.plan.axis.direction
-    width_mm, height_mm = source.plan.size_mm
+    checks: list[Check] = []
+    if isinstance(source, LaserInputs):
+        checks += _check_readings_and_logs(source)
+    if isinstance(source, CameraInputs):
+        checks += check_order(source.frames)
+        checks += _phase(source) if isinstance(source, Source) else []
+        checks += check_frames(source.frames, overridden=set(overridden_parameters(source.thermography)))
+    return checks
+
+
+def _check_readings_and_logs(source: LaserInputs) -> list[Check]:
+    """Checks of the readings in themselves, and of the logs beside them."""
     times = source.deviations["time"].values.ravel()
     interferometry, drivers = source.campaign.interferometry, source.campaign.drivers
     environment_file = interferometry.environment if interferometry is not None else None
     return [
-        *check_readings(source.deviations, plan_extent_mm=abs(x) * width_mm + abs(y) * height_mm),
+        *check_readings(source.deviations, plan_extent_mm=_extent_along_axis(source.campaign)),
         *check_signs(source.deviations),
         *check_log(
             source.environment,
@@ -73,10 +83,17 @@ def check_source(source: Source) -> list[Check]:
             endangers="every effect that follows a load, and the verdict that none is missing",
         ),
         *check_contact_sensors(source.environment, source.drivers, file=environment_file or "the environment log"),
-        *check_order(source.frames),
-        *_phase(source),
-        *check_frames(source.frames, overridden=set(overridden_parameters(source.thermography))),
     ]
+
+
+def _extent_along_axis(campaign: Campaign) -> float | None:
+    """Extent of the plan along the axis, mm; None where the campaign does not place the axis on a plan."""
+    plan = campaign.plan
+    if plan is None or plan.axis is None:
+        return None
+    x, y = plan.axis.direction
+    width_mm, height_mm = plan.size_mm
+    return abs(x) * width_mm + abs(y) * height_mm
 
 
 def _phase(source: Source) -> list[Check]:
@@ -120,27 +137,46 @@ def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[
     ]
 
 
-def check_plan(source: Source, registration: Mapping[str, Any]) -> list[Check]:
+def check_fields_alone(source: CameraInputs, fields: xr.Dataset) -> list[Check]:
+    """Check the fields in themselves, and against the logged loads, where there is no laser.
+
+    Parameters
+    ----------
+    source : CameraInputs
+        Inputs of the campaign.
+    fields : Dataset
+        Keeps ``thermography.contract.FIELDS``.
+    """
+    field, drivers = thin_fields(fields), source.campaign.drivers
+    drivers_file = drivers.file if drivers is not None else "the drivers' log"
+    return [
+        *check_load_clock(field, source.drivers, file=drivers_file),
+        *check_load_scale(field, source.drivers, file=drivers_file),
+        *check_place(fields),
+    ]
+
+
+def check_plan(source: CameraInputs, registration: Mapping[str, Any]) -> list[Check]:
     """Check what the registration found.
 
     Parameters
     ----------
-    source : Source
+    source : CameraInputs
         Inputs of the campaign.
     registration : mapping
         Part ``registration`` of results.json.
     """
-    return check_registration(registration, file=source.plan.fiducials)
+    return check_registration(registration, file=source.fiducials_file)
 
 
-def check_loop(loop: Mapping[str, Any], source: Source) -> list[Check]:
+def check_loop(loop: Mapping[str, Any], source: LaserInputs) -> list[Check]:
     """Check what the closed loop fitted against physics.
 
     Parameters
     ----------
     loop : mapping
         Part ``loop`` of results.json.
-    source : Source
+    source : LaserInputs
         Inputs of the campaign.
     """
     return check_coefficients(loop, travel_mm=float(np.abs(source.deviations["position"]).max()))

@@ -12,7 +12,8 @@ import xarray as xr
 
 from fusion.alignment.align import align
 from fusion.alignment.readings import Readings, read_fused
-from fusion.campaign.inputs import Source, counted
+from fusion.campaign.inputs import counted
+from fusion.campaign.sources import Inputs, LaserInputs, Source
 from fusion.consistency.axis_line import compare_lines
 from fusion.diagnosis.residual_tests import ResidualTests, examine_residual
 from fusion.effects.effect import Effect, Prior
@@ -48,7 +49,7 @@ class CorrectedCamera:
 
 
 def model_drift(
-    source: Source, fields: xr.Dataset, fused: xr.Dataset, deviations: xr.Dataset, *, report: Report
+    source: LaserInputs, fields: xr.Dataset | None, fused: xr.Dataset, deviations: xr.Dataset, *, report: Report
 ) -> Outcome:
     """Close the loop, then judge the positions that stand out from what the model explains.
 
@@ -57,8 +58,8 @@ def model_drift(
     Parameters
     ----------
     source : the campaign as read
-    fields : keeps ``thermography.contract.FIELDS``
-    fused : both recordings on one clock
+    fields : keeps ``thermography.contract.FIELDS``; None where there is no camera
+    fused : readings with what was seen and logged, on one clock
     deviations : keeps ``interferometry.contract.DEVIATIONS``
     report : called with the stage, steps done and steps in total
 
@@ -71,11 +72,13 @@ def model_drift(
     effects = library_for(source)
     result = close_loop(
         readings,
-        source.campaign.model.declared,
+        source.campaign.declared,
         effects=effects,
         progress=lambda done, total, what: report("closed loop", done, total),
     )
-    corrected = correct_camera(source, result, fields, fused, deviations)
+    corrected = None
+    if isinstance(source, Source) and fields is not None:
+        corrected = correct_camera(source, result, fields, fused, deviations)
     if corrected is not None:
         names = {error.effect for error in corrected.errors}
         result = on_corrected_fields(result, read_fused(corrected.fused), names, effects=effects)
@@ -89,20 +92,16 @@ def model_drift(
     positions = judge_positions(fused, deviations, variables["contribution"].sum("effect", skipna=False))
     result = set_aside_sites(result, sites_of(positions, deviations.sizes["target"]))
     report("anomalies", 1, 1)
-    line = compare_lines(result.after, len(result.declared), correct_fields(fields, errors), source.axis)
-    loop = scale_coefficients(
-        result.as_json(),
-        effects,
-        axis_u=axis_scale_u(fields, source.axis, deviations["position"].values),
-        plan_u=plan_scale_u(fields),
-    )
+    anomalies, line = [position.as_json() for position in positions], None
+    loop: dict[str, Any] = result.as_json()
+    if isinstance(source, Source) and fields is not None:
+        line = compare_lines(result.after, len(result.declared), correct_fields(fields, errors), source.axis)
+        anomalies = [scale_evidence(one, source.axis, fields, deviations["position"]) for one in anomalies]
+        axis_u = axis_scale_u(fields, source.axis, deviations["position"].values)
+        loop = scale_coefficients(loop, effects, axis_u=axis_u, plan_u=plan_scale_u(fields))
     parts = {
         "anomalies": [
-            {
-                **scale_evidence(position.as_json(), source.axis, fields, deviations["position"]),
-                "position_mm": float(deviations["position"].sel(target=position.anomaly.target)),
-            }
-            for position in positions
+            {**one, "position_mm": float(deviations["position"].sel(target=one["target"]))} for one in anomalies
         ],
         "loop": {
             **loop,
@@ -156,7 +155,7 @@ def both_models(result: LoopResult) -> dict[str, ModelFit]:
 
 
 def correction_variables(
-    corrected: CorrectedCamera | None, fields: xr.Dataset, fused: xr.Dataset
+    corrected: CorrectedCamera | None, fields: xr.Dataset | None, fused: xr.Dataset
 ) -> dict[str, xr.Variable | xr.DataArray]:
     """The correction of the fields and what it changes, for fusion.nc; empty where the camera did not err.
 
@@ -165,7 +164,7 @@ def correction_variables(
     corrected : of :func:`correct_camera`
     fields, fused : before the correction
     """
-    if corrected is None:
+    if corrected is None or fields is None:
         return {}
     names = ("mean_rise", "axis_integral", "local_rise")
     return {
@@ -198,7 +197,7 @@ def gap_notices(readings: Readings) -> list[Notice]:
     return notices
 
 
-def library_for(source: Source) -> dict[str, Effect]:
+def library_for(source: Inputs) -> dict[str, Effect]:
     """The library with what the campaign file says of the machine: the expansion coefficient that is expected, and how well it is known.
 
     Parameters
@@ -231,18 +230,21 @@ def field_notices(errors: Sequence[FieldFault]) -> list[Notice]:
     ]
 
 
-def join_fusion(fused: xr.Dataset, maps: xr.DataTree, loop: xr.Dataset) -> xr.DataTree:
+def join_fusion(fused: xr.Dataset, maps: xr.DataTree | None, loop: xr.Dataset | None) -> xr.DataTree:
     """Everything that joins both recordings, for fusion.nc: readings and loop at the root, the attribution in its own groups.
 
     Parameters
     ----------
     fused : both recordings on one clock
-    maps : of the attribution
-    loop : of the closed loop
+    maps : of the attribution; None where it was not possible
+    loop : of the closed loop; None where it was not possible
     """
+    root = fused if loop is None else joined(fused, loop=loop)
+    if maps is None:
+        return xr.DataTree(root)
     correlation = maps.copy()
     correlation.attrs = {name: value for name, value in maps.attrs.items() if name not in store.GLOBAL_ATTRIBUTES}
-    return xr.DataTree(joined(fused, loop=loop), children={"correlation": correlation})
+    return xr.DataTree(root, children={"correlation": correlation})
 
 
 def loop_variables(fused: xr.Dataset, models: Mapping[str, ModelFit], tests: Mapping[str, ResidualTests]) -> xr.Dataset:

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from fusion.alignment.align import align
-from fusion.campaign.inputs import Source, counted, listed
+from fusion.alignment.align import align, align_logs
+from fusion.campaign.inputs import counted, listed
+from fusion.campaign.sources import LaserInputs, Source
 from fusion.consistency.place import find_gaps, gap_words, in_gaps
 from fusion.consistency.readings import find_gross_readings
 from fusion.products.grouped import group, joined
@@ -30,12 +31,12 @@ LABELS = {
 }
 
 
-def evaluate_interferometry(source: Source) -> Outcome:
+def evaluate_interferometry(source: LaserInputs) -> Outcome:
     """Evaluate the readings conventionally, by the paper's differences, by ISO 230-2 and by the joint estimate.
 
     Parameters
     ----------
-    source : Source
+    source : LaserInputs
         Inputs of the campaign; its readings are compensated.
 
     Returns
@@ -167,14 +168,41 @@ def align_recordings(source: Source, fields: xr.Dataset, deviations: xr.Dataset)
     list of Notice
         Readings that were left out, or lie outside the frames.
     """
-    gross = find_gross_readings(group(deviations, "drift")["standardised"])
-    used = deviations.assign(deviation=deviations["deviation"].where(~gross))
+    used, gross = _without_gross(deviations)
     fused = align(used, fields, source.axis, environment=source.environment, drivers=source.drivers)
     return fused, [
         *_gross_notices(deviations, gross, source.campaign.zone_of("interferometry")),
         *_outside_notices(fused),
         *_gap_notices(fields, deviations),
     ]
+
+
+def align_with_logs(source: LaserInputs, deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
+    """Give every reading the environment and the drivers at its own time, where there are no frames.
+
+    Parameters
+    ----------
+    source : LaserInputs
+        Inputs of the campaign.
+    deviations : Dataset
+        Keeps ``interferometry.contract.DEVIATIONS``.
+
+    Returns
+    -------
+    Dataset
+        Result of `fusion.alignment.align.align_logs`, without the readings that are errors of reading.
+    list of Notice
+        Readings that were left out.
+    """
+    used, gross = _without_gross(deviations)
+    fused = align_logs(used, environment=source.environment, drivers=source.drivers)
+    return fused, _gross_notices(deviations, gross, source.campaign.zone_of("interferometry"))
+
+
+def _without_gross(deviations: xr.Dataset) -> tuple[xr.Dataset, xr.DataArray]:
+    """Return the readings without those that are errors of reading, and which these are."""
+    gross = find_gross_readings(group(deviations, "drift")["standardised"])
+    return deviations.assign(deviation=deviations["deviation"].where(~gross)), gross
 
 
 def _gross_notices(deviations: xr.Dataset, gross: xr.DataArray, zone: str | None) -> list[Notice]:

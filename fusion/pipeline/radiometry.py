@@ -10,7 +10,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.campaign.config import SurfaceTable, ThermographyTable
-from fusion.campaign.inputs import Source, counted
+from fusion.campaign.inputs import counted
+from fusion.campaign.sources import CameraInputs
 from fusion.products.results import Notice, Outcome
 from thermography.fields.cycle_fields import reference_cycle
 from thermography.fields.surfaces import (
@@ -83,12 +84,12 @@ def stated_uncertainty(table: ThermographyTable) -> InputUncertainty:
     return InputUncertainty(**{name: u for name, u in given.items() if u is not None})
 
 
-def complete_fields(source: Source, fields: xr.Dataset, parameters: Overrides) -> Outcome[xr.Dataset]:
+def complete_fields(source: CameraInputs, fields: xr.Dataset, parameters: Overrides) -> Outcome[xr.Dataset]:
     """Calibrate the surfaces that have an emissivity of their own, and add the total uncertainties.
 
     Parameters
     ----------
-    source : Source
+    source : CameraInputs
         Inputs of the campaign.
     fields : Dataset
         Fields as reduced, their times on the camera's clock, their cycles numbered as the readings.
@@ -126,7 +127,9 @@ def complete_fields(source: Source, fields: xr.Dataset, parameters: Overrides) -
     return Outcome(fields, {"radiometry": part}, (*_edge_notices(edge, regions), *_drift_notices(table, fields)))
 
 
-def _parameters_at(source: Source, parameters: Overrides, times: NDArray[np.datetime64]) -> list[CameraParameters]:
+def _parameters_at(
+    source: CameraInputs, parameters: Overrides, times: NDArray[np.datetime64]
+) -> list[CameraParameters]:
     """Parameters of the frame nearest to each time; frames of one cycle or block hardly ever differ in them."""
     frames = source.frame_times
     last = np.minimum(np.searchsorted(frames, np.where(np.isnat(times), frames[0], times)), len(frames) - 1)

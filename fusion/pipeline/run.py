@@ -10,14 +10,18 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import xarray as xr
+
 from fusion.campaign.config import Campaign, load_campaign
-from fusion.campaign.inputs import Source, compensate_by_camera, read_source
+from fusion.campaign.inputs import compensate_by_camera, read_source
+from fusion.campaign.sources import CameraInputs, LaserInputs, Source
 from fusion.consistency.checks import Check, doubt_notices, inputs_part, refuse_contradictions
 from fusion.pipeline import attribution, drift_model, interferometry, thermal
 from fusion.pipeline import record as record_stage
 from fusion.pipeline.camera import camera_corrected
-from fusion.pipeline.consistency import check_fields, check_loop, check_plan, check_source
+from fusion.pipeline.consistency import check_fields, check_fields_alone, check_loop, check_plan, check_source
 from fusion.pipeline.provenance import FileState, describe_run, hash_inputs, input_states, note_changes, versions
+from fusion.pipeline.sizes import lacks_for_correlation, lacks_for_model
 from fusion.products.folder import claim, open_folder
 from fusion.products.progress import Report, silent
 from fusion.products.results import Notice, Outcome, Results, assemble
@@ -214,61 +218,128 @@ def _start_run(campaign: Campaign, folder: Path, seen: Mapping[str, FileState], 
     return Run(campaign, folder, report, StageStamps(folder), inputs, seen, started)
 
 
-def _run_instruments(run: Run, source: Source, checks: Sequence[Check], *, scheduler: str | None) -> Results:
-    """Run a campaign with both instruments, stage after stage."""
-    folder, report = run.folder, run.report
+def _run_instruments(
+    run: Run, source: LaserInputs | CameraInputs | Source, checks: Sequence[Check], *, scheduler: str | None
+) -> Results:
+    """Run a campaign with the instruments that it has, stage after stage."""
     run.notices.extend(source.notices)
-    tables = ("thermography", "plan", "interferometry")
+    if isinstance(source, Source):
+        datasets, found = _run_both(run, source, scheduler=scheduler)
+    elif isinstance(source, CameraInputs):
+        datasets, found = _run_camera(run, source, scheduler=scheduler)
+    else:
+        datasets, found = _run_laser(run, source)
+    accepted = run.campaign.accept.doubts
+    checks = [*checks, *found]
+    run.parts["inputs"] = inputs_part(
+        checks,
+        accepted,
+        corrected="camera" in run.parts and camera_corrected(run.parts["camera"]),
+        recompensated=isinstance(source, LaserInputs) and source.is_recompensated,
+    )
+    run.notices = [*doubt_notices(checks, accepted), *run.notices]
+    return _finish(run, datasets)
+
+
+def _run_both(run: Run, source: Source, *, scheduler: str | None) -> tuple[dict[str, Any], list[Check]]:
+    """Fields, deviations, and what both show together."""
+    fields = _reduce(run, source, ("thermography", "plan", "interferometry"), scheduler=scheduler)
+    source, redone = compensate_by_camera(source, fields)
+    run.notices.extend(redone)
+    deviations = _evaluate(run, source, after=("fields",) if source.needs_camera else ())
+    fused, outside = interferometry.align_recordings(source, fields, deviations)
+    run.notices.extend(outside)
+    too_small = [*lacks_for_model(deviations), *lacks_for_correlation(fields)]
+    run.notices.extend(too_small)
+    maps = model = None
+    if too_small:
+        run.parts["hotspots"] = attribution.describe_hotspots(fields)
+    else:
+        maps = run.stage(
+            "correlation",
+            ("plan", "interferometry", "drivers"),
+            ("fields", "deviations"),
+            lambda: attribution.correlate_field(source, fields, fused, report=run.report),
+            read_tree,
+        )
+        model = _model(run, source, fields, fused, deviations, after=("fields", "deviations"))
+    fusion = _write_fusion(run, fused, maps, model)
+    _write_maps(run, fields)
+    checks = [*check_plan(source, run.parts["registration"]), *check_fields(source, fields, fused)]
+    checks += [] if model is None else check_loop(run.parts["loop"], source)
+    return {"fields": fields, "deviations": deviations, "fusion": fusion}, checks
+
+
+def _run_camera(run: Run, source: CameraInputs, *, scheduler: str | None) -> tuple[dict[str, Any], list[Check]]:
+    """Fields and hotspots, by windows of time in place of cycles."""
+    fields = _reduce(run, source, ("thermography", "plan"), scheduler=scheduler)
+    run.parts["hotspots"] = attribution.describe_hotspots(fields)
+    _write_maps(run, fields)
+    checks = [*check_plan(source, run.parts["registration"]), *check_fields_alone(source, fields)]
+    return {"fields": fields}, checks
+
+
+def _run_laser(run: Run, source: LaserInputs) -> tuple[dict[str, Any], list[Check]]:
+    """Deviations, and the model of the drift from what was logged."""
+    deviations = _evaluate(run, source, after=())
+    fused, outside = interferometry.align_with_logs(source, deviations)
+    too_small = lacks_for_model(deviations)
+    run.notices.extend([*outside, *too_small])
+    model = None if too_small else _model(run, source, None, fused, deviations, after=("deviations",))
+    fusion = _write_fusion(run, fused, None, model)
+    checks = [] if model is None else check_loop(run.parts["loop"], source)
+    return {"deviations": deviations, "fusion": fusion}, checks
+
+
+def _reduce(run: Run, source: CameraInputs, tables: tuple[str, ...], *, scheduler: str | None) -> xr.Dataset:
+    """The stage of the fields."""
     checkpoint = run.checkpoint(run.key_of("fields", tables, ()))
-    fields = run.stage(
+    return run.stage(
         "fields",
         tables,
         (),
-        lambda: thermal.reduce_thermography(source, checkpoint=checkpoint, scheduler=scheduler, report=report),
+        lambda: thermal.reduce_thermography(source, checkpoint=checkpoint, scheduler=scheduler, report=run.report),
         read_dataset,
     )
-    source, redone = compensate_by_camera(source, fields)
-    run.notices.extend(redone)
-    deviations = run.stage(
-        "deviations",
-        ("interferometry",),
-        ("fields",) if source.needs_camera else (),
-        lambda: interferometry.evaluate_interferometry(source),
-        read_dataset,
+
+
+def _evaluate(run: Run, source: LaserInputs, *, after: tuple[str, ...]) -> xr.Dataset:
+    """The stage of the deviations."""
+    return run.stage(
+        "deviations", ("interferometry",), after, lambda: interferometry.evaluate_interferometry(source), read_dataset
     )
-    fused, outside = interferometry.align_recordings(source, fields, deviations)
-    run.notices.extend(outside)
-    joint = ("plan", "interferometry", "drivers")
-    maps = run.stage(
-        "correlation",
-        joint,
-        ("fields", "deviations"),
-        lambda: attribution.correlate_field(source, fields, fused, report=report),
-        read_tree,
-    )
-    model = run.stage(
+
+
+def _model(
+    run: Run,
+    source: LaserInputs,
+    fields: xr.Dataset | None,
+    fused: xr.Dataset,
+    deviations: xr.Dataset,
+    *,
+    after: tuple[str, ...],
+) -> xr.Dataset:
+    """The stage of the model: closed loop, and positions that stand out."""
+    return run.stage(
         "model",
-        (*joint, "model"),
-        ("fields", "deviations"),
-        lambda: drift_model.model_drift(source, fields, fused, deviations, report=report),
+        ("plan", "interferometry", "drivers", "model"),
+        after,
+        lambda: drift_model.model_drift(source, fields, fused, deviations, report=run.report),
         read_dataset,
     )
+
+
+def _write_maps(run: Run, fields: xr.Dataset) -> None:
+    """Write the maps of every cycle as OpenEXR."""
+    claim(run.folder, *(f"maps/{thermal.map_name(cycle)}" for cycle in fields["cycle"].values))
+    thermal.write_exr(run.folder / "maps", fields, report=run.report)
+
+
+def _write_fusion(run: Run, fused: xr.Dataset, maps: xr.DataTree | None, model: xr.Dataset | None) -> xr.DataTree:
+    """Write fusion.nc: the readings on one clock, with what was found beside them."""
     fusion = run.described(drift_model.join_fusion(fused, maps, model))
-    write_dataset(folder / "fusion.nc", fusion)
-    claim(folder, *(f"maps/{thermal.map_name(cycle)}" for cycle in fields["cycle"].values))
-    thermal.write_exr(folder / "maps", fields, report=report)
-    accepted = run.campaign.accept.doubts
-    checks = [
-        *checks,
-        *check_plan(source, run.parts["registration"]),
-        *check_fields(source, fields, fused),
-        *check_loop(run.parts["loop"], source),
-    ]
-    run.parts["inputs"] = inputs_part(
-        checks, accepted, corrected=camera_corrected(run.parts["camera"]), recompensated=source.is_recompensated
-    )
-    run.notices = [*doubt_notices(checks, accepted), *run.notices]
-    return _finish(run, {"fields": fields, "deviations": deviations, "fusion": fusion})
+    write_dataset(run.folder / "fusion.nc", fusion)
+    return fusion
 
 
 def _run_record(run: Run, source: record_stage.RecordSource) -> Results:

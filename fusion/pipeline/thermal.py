@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 import xarray as xr
 
-from fusion.alignment.align import camera_on_laser_clock, cycle_bounds
-from fusion.campaign.inputs import Source, counted, listed
+from fusion.alignment.align import camera_on_laser_clock
+from fusion.campaign.inputs import counted, listed
+from fusion.campaign.sources import CameraInputs, Source
 from fusion.pipeline.camera import CameraState, clear_frames, examine_camera, survey_campaign
 from fusion.pipeline.radiometry import complete_fields, overridden_parameters
 from fusion.products.contracts import check
@@ -40,13 +41,13 @@ _CHECKPOINT_FRAMES = 2000
 _PIXEL_FRAMES = 24
 
 
-def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | None, report: Report) -> Outcome:
+def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: str | None, report: Report) -> Outcome:
     """Check the camera, register the plan on the first frames, and reduce all frames to one field per cycle.
 
     Parameters
     ----------
-    source : Source
-        Inputs of the campaign.
+    source : CameraInputs
+        Inputs of the campaign; a `Source` where the laser gives the cycles.
     checkpoint : Path
         Folder that keeps the finished cycles of a long recording, from which an interrupted run goes on.
     scheduler : str or None
@@ -82,7 +83,8 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
     fields, clock, clock_notices = _reduce_on_clock(
         camera, registration, override, checkpoint=checkpoint, scheduler=scheduler, report=report
     )
-    fields = fields.assign(camera.per_cycle(_bounds(source, clock["value"])))
+    offset_s = clock["value"]
+    fields = fields.assign(camera.per_cycle(_bounds(source, offset_s)))
     fields = fields.assign_attrs(
         frames_damaged=json.dumps(
             [f"{Path(one['file']).name}#{one['index']}" for one in camera.part["frames_damaged"]]
@@ -91,36 +93,34 @@ def reduce_thermography(source: Source, *, checkpoint: Path, scheduler: str | No
             [f"{one.path.name}#{one.index}" for one in compress(survey.frames, survey.repeated)]
         ),
     )
-    fields = fields.assign_coords(cycle=source.deviations["cycle"].values)
+    fields = fields.assign_coords(cycle=source.cycles.number)
     completed = complete_fields(source, fields, override)
     fields = check(completed.dataset, FIELDS, name="the fields")
     notices += [*clock_notices, *_registration_notices(registration), *_frame_notices(fields), *completed.notices]
     for name in ("time", "cycle_time", "frame_time"):
         if name in fields.variables:
-            moved = camera_on_laser_clock(fields[name].values, clock["value"])
+            moved = camera_on_laser_clock(fields[name].values, offset_s)
             fields[name] = (fields[name].dims, moved, fields[name].attrs)
-    fields = fields.assign(_registration_variables(registration, reference)).assign(_target_places(source))
-    parts = {
-        "registration": _registration_part(registration, source),
-        "alignment": {"clock_offset_s": clock},
-        "camera": camera.part,
-        **completed.parts,
-    }
+    fields = fields.assign(_registration_variables(registration, reference))
+    parts = {"registration": _registration_part(registration, source), "camera": camera.part, **completed.parts}
+    if isinstance(source, Source):
+        fields = fields.assign(_target_places(source))
+        parts["alignment"] = {"clock_offset_s": clock}
     return Outcome(fields, parts, tuple(notices))
 
 
-def _register(source: Source, reference: np.ndarray) -> Registration:
+def _register(source: CameraInputs, reference: np.ndarray) -> Registration:
     """Register the plan on the mean of the first frames; a refusal names the file of the fiducials."""
     moving = source.thermography.table == "moving"
     if moving and any(fiducial.is_point for fiducial in source.fiducials):
         raise RegistrationError(
-            f"{source.plan.fiducials}: points picked by hand hold for one position of the table only, but thermography.table = "
+            f"{source.fiducials_file}: points picked by hand hold for one position of the table only, but thermography.table = "
             '"moving"; paint discs, or use frames of the table at rest'
         )
     try:
         return register(reference, source.fiducials, grid=source.grid, lens=source.lens)
     except RegistrationError as error:
-        raise RegistrationError(f"{source.plan.fiducials}: {error}") from error
+        raise RegistrationError(f"{source.fiducials_file}: {error}") from error
 
 
 def _reduce_on_clock(
@@ -136,6 +136,11 @@ def _reduce_on_clock(
     source = camera.source
     given = source.thermography.clock_offset_s
     how: dict[str, Any] = {"scheduler": scheduler, "report": report}
+    if not isinstance(source, Source):
+        # Without a laser the logs are the other clock; an offset that is not stated is none.
+        stated_s = given or 0.0
+        fields = _reduce(camera, registration, override, stated_s, checkpoint=checkpoint, **how)
+        return fields, {"value": stated_s, "u": None}, []
     if given is not None:
         fields = _reduce(camera, registration, override, given, checkpoint=checkpoint, **how)
         return fields, {"value": given, "u": 0.0}, []
@@ -216,14 +221,15 @@ def _reduce(
         "progress": count,
     }
     if source.thermography.table == "moving":
-        direction = source.plan.axis.direction
-        return reduce_moving_frames(source.frames, registration, source.grid, bounds, direction=direction, **common)
+        return reduce_moving_frames(
+            source.frames, registration, source.grid, bounds, direction=source.direction, **common
+        )
     return reduce_frames(source.frames, registration, source.grid, bounds, **common)
 
 
-def _bounds(source: Source, offset_s: float) -> np.ndarray:
+def _bounds(source: CameraInputs, offset_s: float) -> np.ndarray:
     """Start and end of every cycle on the camera's clock, (cycles, 2)."""
-    return cycle_bounds(source.deviations) + np.timedelta64(round(offset_s * 1e9), "ns")
+    return source.cycles.bounds + np.timedelta64(round(offset_s * 1e9), "ns")
 
 
 def pixel_notices(counts: np.ndarray) -> list[Notice]:
@@ -272,7 +278,7 @@ def _registration_variables(registration: Registration, reference: np.ndarray) -
     return xr.Dataset(variables)
 
 
-def _registration_part(registration: Registration, source: Source) -> dict[str, Any]:
+def _registration_part(registration: Registration, source: CameraInputs) -> dict[str, Any]:
     """Return the part ``registration`` of results.json."""
     return {
         "rms_mm": registration.rms_mm,

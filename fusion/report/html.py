@@ -236,5 +236,7 @@ def _layer(name: str, values: np.ndarray, unit: str) -> dict[str, Any]:
 
 
 def _line(fields: xr.Dataset) -> list[list[float]]:
-    """Return the plan points of the targets along the measured line."""
+    """Return the plan points of the targets along the measured line; none where no laser measured."""
+    if "target_x" not in fields:
+        return []
     return np.stack([fields["target_x"].values, fields["target_y"].values], axis=1).tolist()

@@ -127,7 +127,7 @@ def describe_campaign(
     """
     deviations, fields, fused = (datasets.get(name) for name in ("deviations", "fields", "fusion"))
     correlation = None if fused is None else describe_correlation(fused, results.correlation, joint)
-    sentences = _sentences(results, deviations)
+    sentences = _sentences(results, deviations, fields)
     if correlation is not None:
         correlation["headline"] = conditional(correlation["headline"], results.inputs, "attribution")
         sentences.append(correlation["headline"])
@@ -176,7 +176,7 @@ def _subtitle(provenance: Mapping[str, Any], deviations: xr.Dataset | None) -> s
     return ", ".join(part for part in parts if part)
 
 
-def _sentences(results: Results, deviations: xr.Dataset | None) -> list[str]:
+def _sentences(results: Results, deviations: xr.Dataset | None, fields: xr.Dataset | None) -> list[str]:
     """What was measured, what the model says, what stands out: one sentence each."""
     sentences = []
     if deviations is not None:
@@ -184,8 +184,14 @@ def _sentences(results: Results, deviations: xr.Dataset | None) -> list[str]:
         first, last = time_span(deviations)
         position = deviations["position"].values
         sentences.append(
-            f"Measured: {sizes['target']} positions over {np.ptp(position):g} mm, approached from both sides in {sizes['cycle']} cycles, "
-            f"{duration(float((last - first) / np.timedelta64(1, 's')))} in all."
+            f"Measured: {sizes['target']} positions over {np.ptp(position):g} mm, approached {_approaches(deviations)} in "
+            f"{sizes['cycle']} cycles, {duration(float((last - first) / np.timedelta64(1, 's')))} in all."
+        )
+    elif fields is not None:
+        first, last = fields["time"].values[[0, -1]]
+        sentences.append(
+            f"Measured: {fields.sizes['time']} frames of the table over {duration(float((last - first) / np.timedelta64(1, 's')))}, "
+            f"reduced to {fields.sizes['cycle']} fields; no laser was used, so nothing is said of the positioning."
         )
     if results.loop is not None:
         sentences.append(verdict_numbers(results.loop))
@@ -193,6 +199,13 @@ def _sentences(results: Results, deviations: xr.Dataset | None) -> list[str]:
         rests_on = {figure for anomaly in results.anomalies for figure in anomaly_figures(anomaly)} or {"positions"}
         sentences.append(conditional(standing_out(results.anomalies), results.inputs, *sorted(rests_on)))
     return sentences
+
+
+def _approaches(deviations: xr.Dataset) -> str:
+    """From which sides the positions were approached, in words."""
+    read = deviations["deviation"].notnull().any(("cycle", "target"))
+    sides = [str(name) for name in read["direction"].values[read.values]]
+    return "from both sides" if len(sides) == 2 else f"in the {sides[0]} direction only"
 
 
 def _numbers(results: Results, deviations: xr.Dataset | None, fields: xr.Dataset | None) -> list[dict[str, str]]:
@@ -249,7 +262,8 @@ def _data_rows(
         rows.append(("Time", f"{moment(first)} to {moment(last)}"))
     if fields is not None:
         first, last = fields["time"].values[[0, -1]]
-        rows.append(("Frames", f"{fields.sizes['time']}, from {moment(first)} to {moment(last)} on the laser's clock"))
+        clock = " on the laser's clock" if results.alignment is not None else ""
+        rows.append(("Frames", f"{fields.sizes['time']}, from {moment(first)} to {moment(last)}{clock}"))
         cell = float(np.median(np.diff(fields["x"])))
         rows.append(("Plan", f"{fields.sizes['x']} × {fields.sizes['y']} cells of {cell:g} mm"))
         visible = float(np.isfinite(fields["temperature_rise"].isel(cycle=-1)).mean())

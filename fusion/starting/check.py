@@ -11,9 +11,10 @@ import numpy as np
 
 from fusion.alignment.align import camera_on_laser_clock
 from fusion.campaign.config import Campaign, load_campaign
-from fusion.campaign.inputs import Source, counted, read_source
+from fusion.campaign.inputs import counted, read_source
 from fusion.campaign.logged_tables import read_drivers
 from fusion.campaign.record_runs import read_record
+from fusion.campaign.sources import CameraInputs, Inputs, LaserInputs
 from fusion.consistency.checks import Check, ContradictionError, open_doubts, refuse_contradictions
 from fusion.errors import FusionError
 from fusion.pipeline import record as record_stage
@@ -167,14 +168,29 @@ def _check_instruments(campaign: Campaign) -> CampaignCheck:
     )
 
 
-def _content(source: Source) -> Iterator[str]:
+def _content(source: Inputs) -> Iterator[str]:
     """Say what was read."""
+    if isinstance(source, LaserInputs):
+        yield from _readings_content(source)
+    if isinstance(source, CameraInputs):
+        yield from _frames_content(source)
+    for name, log in (("environment", source.environment), ("drivers", source.drivers)):
+        if log is not None:
+            yield f"{name}: {counted(log.sizes['time'], 'row')}, {', '.join(str(column) for column in log.data_vars)}"
+
+
+def _readings_content(source: LaserInputs) -> Iterator[str]:
+    """Say what the laser file holds."""
     sizes, position = source.deviations.sizes, source.deviations["position"].values
     readings = int(source.deviations["deviation"].notnull().sum())
     yield (
         f"readings: {counted(sizes['cycle'], 'cycle')}, {counted(sizes['target'], 'target')} from {position.min():g} to "
         f"{position.max():g} mm, {readings} of {source.deviations['deviation'].size}"
     )
+
+
+def _frames_content(source: CameraInputs) -> Iterator[str]:
+    """Say what the frames and the plan hold."""
     first = source.frames[0]
     serial = f", serial {first.camera.serial}" if first.camera.serial else ""
     yield (
@@ -182,16 +198,15 @@ def _content(source: Source) -> Iterator[str]:
         f"{len(source.frames_rejected)} left out"
     )
     yield f"plan: {source.grid.width_mm:g} x {source.grid.height_mm:g} mm, {counted(len(source.fiducials), 'fiducial')}"
-    for name, log in (("environment", source.environment), ("drivers", source.drivers)):
-        if log is not None:
-            yield f"{name}: {counted(log.sizes['time'], 'row')}, {', '.join(str(column) for column in log.data_vars)}"
 
 
-def _recordings(source: Source) -> Iterator[Recording]:
+def _recordings(source: Inputs) -> Iterator[Recording]:
     """Return what was recorded when, on the laser's clock."""
-    offset_s = source.thermography.clock_offset_s or 0.0
-    yield Recording("frames", camera_on_laser_clock(source.frame_times, offset_s))
-    yield Recording("readings", source.deviations["time"].values.ravel())
+    if isinstance(source, CameraInputs):
+        offset_s = source.thermography.clock_offset_s or 0.0
+        yield Recording("frames", camera_on_laser_clock(source.frame_times, offset_s))
+    if isinstance(source, LaserInputs):
+        yield Recording("readings", source.deviations["time"].values.ravel())
     for name, log in (("environment", source.environment), ("drivers", source.drivers)):
         if log is not None:
             yield Recording(name, np.asarray(log["time"].values))

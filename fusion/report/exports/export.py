@@ -109,7 +109,7 @@ def export_results(
         raise ExportError(f'there is no format "{format}"; write one of {", ".join(FORMATS)}')
     source = results / "deviations.nc"
     if not source.is_file():
-        raise ExportError(f"{results}: there is no deviations.nc in it; name the results folder of a finished run")
+        return _export_camera(results, format, out, overwrite=overwrite)
     found, deviations = read_results(results), read_dataset(source)
     content: dict[str, Writer]
     if format == "csv":
@@ -259,6 +259,17 @@ def _axis_name(run: _Run, given: str | None, *, needed: bool) -> str:
 
 def _file_name(pattern: str, axis: str) -> str:
     return pattern.format(axis=axis) if axis else pattern.replace("_{axis}", "")
+
+
+def _export_camera(results: Path, format: str, out: Path, *, overwrite: bool) -> Exported:
+    """Write what a campaign without a laser has: its fields."""
+    if not (results / "fields.nc").is_file():
+        raise ExportError(f"{results}: there is no deviations.nc in it; name the results folder of a finished run")
+    if format != "csv":
+        raise ExportError(
+            f"{results}: this campaign has no laser, so there is neither drift nor profile to write; its fields are written by --format csv"
+        )
+    return Exported(_write(out, {"fields.csv": _frame_writer(tables.fields_table(results))}, overwrite=overwrite))
 
 
 def _csv_files(folder: Path, results: Results, deviations: xr.Dataset, *, with_fields: bool) -> dict[str, Writer]:

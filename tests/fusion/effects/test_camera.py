@@ -59,7 +59,7 @@ def test_a_reflecting_patch_is_weighed_by_what_the_model_makes_of_it():
 
 def test_what_is_missing_is_said():
     empty, quiet = campaign(), campaign(series={"mean_rise": logged(np.zeros(60), "K")})
-    assert CAMERA_OFFSET.needs(empty) == "the campaign holds no thermal frames"
+    assert CAMERA_OFFSET.needs(empty) == "the campaign holds no temperature of the table"
     assert CAMERA_OFFSET.needs(quiet) == "no frame jumps against its neighbours"
     assert CAMERA_OFFSET.needs(jumped()) is None
     assert REFLECTED_SOURCE.needs(quiet) == "no patch of the field switches faster than heat can flow"

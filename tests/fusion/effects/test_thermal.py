@@ -130,9 +130,9 @@ def test_a_quasi_static_response_has_a_column_for_every_sensor():
 
 def test_what_is_missing_is_said():
     empty = campaign()
-    assert needs_field(seen()) is None and needs_field(empty) == "the campaign holds no thermal frames"
+    assert needs_field(seen()) is None and needs_field(empty) == "the campaign holds no temperature of the table"
     for effect in (AXIS_EXPANSION, TABLE_OFFSET, THERMAL_LAG):
-        assert effect.needs(empty) == "the campaign holds no thermal frames"
+        assert effect.needs(empty) == "the campaign holds no temperature of the table"
         assert effect.needs(seen()) is None
     assert UNSEEN_HEAT_SOURCE.needs(seen()) is None
     assert UNSEEN_HEAT_SOURCE.needs(empty) == (

@@ -361,7 +361,9 @@ def test_a_declared_effect_has_the_prior_of_the_library():
     expansion, offset = declare(readings, DECLARED, library())
     assert (expansion.effect, expansion.candidate.prior) == ("axis_expansion", Prior(11.7, 2.0))
     assert (offset.effect, offset.candidate.prior) == ("table_offset", None)
-    with pytest.raises(LoopError, match="'axis_expansion' cannot be computed: the campaign holds no thermal frames"):
+    with pytest.raises(
+        LoopError, match="'axis_expansion' cannot be computed: the campaign holds no temperature of the table"
+    ):
         declare(campaign(), DECLARED, library())
 
 
@@ -407,7 +409,7 @@ def test_effects_that_cannot_be_tried_are_decided_at_the_start():
     problem = problem_of(effects=library())
     state = problem.start([])
     told = state.not_tried()
-    assert told["thermal_lag"] == "the campaign holds no thermal frames"
+    assert told["thermal_lag"] == "the campaign holds no temperature of the table"
     assert set(library()) - set(told) == {
         "angular_growth",
         "reversal_drift",

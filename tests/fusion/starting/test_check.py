@@ -12,6 +12,7 @@ from fusion.alignment.align import AlignmentError
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import read_source
 from fusion.starting.check import check_campaign
+from tests.fusion.campaign_parts import without
 
 
 def change(campaign: Path, old: str, new: str) -> Path:
@@ -99,3 +100,13 @@ def test_a_record_is_checked(tmp_path: Path) -> None:
     assert checked.faults == () and checked.content == ("record: 1 run, 1 temperature, 1 displacement, 600 rows",)
     file.write_text(file.read_text().replace('["ch*"]', '["z*"]'))
     assert 'no column is named "z*"' in check_campaign(file).faults[0]
+
+
+def test_a_campaign_of_one_instrument_is_checked_for_what_it_has(copied: Path) -> None:
+    campaign = copied / "campaign.toml"
+    laser = check_campaign(without(campaign, "thermography", "plan", "model", name="checked_laser.toml"))
+    camera = check_campaign(without(campaign, "interferometry", "model", name="checked_camera.toml"))
+    assert laser.faults == () and camera.faults == ()
+    assert [bar.name for bar in laser.recordings] == ["readings", "environment", "drivers"]
+    assert [bar.name for bar in camera.recordings] == ["frames", "drivers"]
+    assert laser.content[0].startswith("readings: 24 cycles") and camera.content[0].startswith("frames: ")

@@ -1,0 +1,160 @@
+"""Runs of campaigns that have one instrument only, or few cycles: what the data carry is there, the rest is named and shown nowhere."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fusion.campaign.config import CampaignError, load_campaign
+from fusion.pipeline.run import run_campaign
+from fusion.products.results import Results, read_results
+from fusion.products.store import read_dataset, read_tree
+from fusion.report.exports.export import ExportError, export_results
+from fusion.report.terminal import summary_rows
+from tests.fusion.campaign_parts import without
+
+CAMERA_CHECKS = ("camera", "fiducial", "plan", "frames", "frozen", "scene", "material", "axis_line")
+
+
+def sections(folder: Path) -> list[str]:
+    return re.findall(r'<section id="([a-z0-9]+)"', (folder / "report.html").read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def folder(campaign_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the small campaign for campaign files with some of its tables."""
+    return shutil.copytree(campaign_folder, tmp_path_factory.mktemp("parts") / "campaign")
+
+
+@pytest.fixture(scope="module")
+def laser_results(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The products of the small campaign without camera and plan."""
+    out = tmp_path_factory.mktemp("laser") / "results"
+    run_campaign(without(folder / "campaign.toml", "thermography", "plan", "model", name="laser.toml"), out)
+    return out
+
+
+def test_the_laser_alone_gives_all_that_needs_no_field(laser_results: Path, results_folder: Path) -> None:
+    results, both = read_results(laser_results), read_results(results_folder)
+    assert results.iso230 == both.iso230
+    assert results.drift == both.drift
+    assert results.neighbours == both.neighbours
+    assert results.loop is not None and results.loop.declared == ()
+    assert "reversal_drift" in [step.effect for step in results.loop.steps]
+    assert results.anomalies is not None
+    for part in ("registration", "camera", "radiometry", "alignment", "hotspots", "correlation"):
+        assert getattr(results, part) is None, part
+    assert sorted(path.name for path in laser_results.glob("[!.]*")) == [
+        "deviations.nc",
+        "fusion.nc",
+        "manifest.json",
+        "provenance.json",
+        "report.html",
+        "results.json",
+    ]
+
+
+def test_a_check_that_needs_the_camera_is_not_counted_as_passed(laser_results: Path) -> None:
+    results = read_results(laser_results)
+    assert results.inputs is not None
+    codes = [check.code for check in results.inputs.checks]
+    assert codes and not [code for code in codes if code.startswith(CAMERA_CHECKS)]
+
+
+def test_the_report_of_the_laser_has_no_section_of_the_camera(laser_results: Path) -> None:
+    found = sections(laser_results)
+    assert {"drift", "iso230", "anomalies", "loop"} <= set(found)
+    assert not {"registration", "fields", "correlation"} & set(found)
+    names = [name for name, _ in summary_rows(read_results(laser_results))]
+    assert "registration" not in names and "drift and field" not in names
+
+
+def test_effects_of_the_field_are_named_as_not_available_without_camera(laser_results: Path) -> None:
+    loop = json.loads((laser_results / "results.json").read_text(encoding="utf-8"))["loop"]
+    assert "the campaign holds no temperature of the table" in loop["not_tried"]["axis_expansion"]
+
+
+def test_an_effect_of_the_field_cannot_be_declared_without_one(copied: Path) -> None:
+    with pytest.raises(
+        CampaignError, match="follows the temperature of the table, which this campaign does not measure"
+    ):
+        load_campaign(without(copied / "campaign.toml", "thermography", "plan"))
+
+
+def test_the_products_of_the_laser_are_exported_and_resumed(laser_results: Path, folder: Path, tmp_path: Path) -> None:
+    names = [path.name for path in export_results(laser_results, "csv", tmp_path).files]
+    assert "drift.csv" in names and "fields.csv" not in names
+    before = read_results(laser_results)
+    labels: list[str] = []
+    kept = run_campaign(
+        folder / "laser.toml", laser_results, resume=True, report=lambda label, *_: labels.append(label)
+    )
+    assert kept == before
+    assert {"deviations (kept)", "anomalies and closed loop (kept)"} <= set(labels)
+
+
+@pytest.fixture(scope="module")
+def camera_results(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The products of the small campaign without the laser."""
+    out = tmp_path_factory.mktemp("camera") / "results"
+    path = without(folder / "campaign.toml", "interferometry", "plan.axis", "model", name="camera.toml")
+    path.write_text(path.read_text().replace('table = "still"', 'window = "6 min"\ntable = "still"'))
+    run_campaign(path, out)
+    return out
+
+
+def test_the_camera_alone_gives_fields_by_windows_of_time(camera_results: Path, results_folder: Path) -> None:
+    results = read_results(camera_results)
+    fields, both = read_dataset(camera_results / "fields.nc"), read_dataset(results_folder / "fields.nc")
+    # 24 cycles of 3 min, of which two make a window; the same frames in the same places.
+    assert fields.sizes["cycle"] == 12
+    np.testing.assert_allclose(fields["frame_temperature"], both["frame_temperature"], atol=1e-4)
+    assert len(list((camera_results / "maps").glob("*.exr"))) == 12
+    assert results.hotspots and all(spot.targets == () and spot.p_value is None for spot in results.hotspots)
+    (notice,) = [warning for warning in results.warnings if warning.code == "cycles_from_windows"]
+    assert "12 windows of 6 min, as thermography.window states" in notice.message
+    for part in ("iso230", "drift", "neighbours", "anomalies", "loop", "correlation", "alignment"):
+        assert getattr(results, part) is None, part
+
+
+def test_the_report_of_the_camera_has_no_section_of_the_laser(camera_results: Path) -> None:
+    found = sections(camera_results)
+    assert {"registration", "fields"} <= set(found)
+    assert not {"drift", "paper", "iso230", "anomalies", "correlation", "loop"} & set(found)
+    page = (camera_results / "report.html").read_text(encoding="utf-8")
+    assert "laser's clock" not in page
+
+
+def test_the_fields_of_the_camera_are_exported_and_no_compensation(camera_results: Path, tmp_path: Path) -> None:
+    assert [path.name for path in export_results(camera_results, "csv", tmp_path).files] == ["fields.csv"]
+    with pytest.raises(ExportError, match="this campaign has no laser"):
+        export_results(camera_results, "linuxcnc", tmp_path)
+
+
+@pytest.fixture(scope="module")
+def ordinary_test(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Results]:
+    """The first five cycles of the small campaign, with and without camera."""
+    lines = (folder / "laser.csv").read_text().splitlines()
+    short = [line for line in lines if line.split(",")[0] in {"cycle", "1", "2", "3", "4", "5"}]
+    (folder / "five.csv").write_text("\n".join(short) + "\n")
+    path = folder / "five.toml"
+    path.write_text((folder / "campaign.toml").read_text().replace('"laser.csv"', '"five.csv"'))
+    out = tmp_path_factory.mktemp("five") / "results"
+    return out, run_campaign(path, out)
+
+
+def test_five_cycles_give_all_but_causes_and_say_what_those_need(ordinary_test: tuple[Path, Results]) -> None:
+    out, results = ordinary_test
+    assert results.iso230 is not None and results.iso230.window == "cycles 1 to 5"
+    assert results.drift is not None and results.neighbours is not None and results.hotspots is not None
+    assert results.loop is None and results.anomalies is None and results.correlation is None
+    (notice,) = [warning for warning in results.warnings if warning.code == "too_small_for_model"]
+    assert notice.message.startswith("5 cycles at 6 targets: ISO 230-2, profile, scatter and drift are evaluated")
+    assert {"fields", "drift", "iso230"} <= set(sections(out))
+    assert not {"anomalies", "correlation", "loop"} & set(sections(out))
+    assert "mean_rise" in read_tree(out / "fusion.nc").to_dataset()
