@@ -122,6 +122,39 @@ def _folders(campaigns: list[Path], out: Path | None) -> list[tuple[Path, Path]]
 
 
 @app.command()
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with the files of one measurement.")],
+    yes: Annotated[
+        bool,
+        typer.Option("--yes", "-y", help="Ask nothing: leave marked lines to fill in for what the files cannot tell."),
+    ] = False,
+) -> None:
+    """Write a commented campaign file for a folder.
+
+    Its files are looked at, what they cannot tell is asked, and the result is checked. An existing campaign.toml is never replaced.
+    """
+    from fusion.starting.check import check_campaign
+    from fusion.starting.draft import DraftError, write_campaign
+    from fusion.starting.questions import Asker
+
+    with _answering():
+        if not yes and not sys.stdin.isatty():
+            raise DraftError("there is no terminal to ask at; add --yes, which leaves marked lines to fill in")
+        ask = (
+            None
+            if yes
+            else lambda question, default: typer.prompt(question, default=default, show_default=bool(default))
+        )
+        path, missing = write_campaign(
+            folder, Asker(ask, lambda text: errors.print(text, highlight=False, markup=False))
+        )
+        console.print(f"campaign: {path.resolve()}", soft_wrap=True, highlight=False, markup=False)
+        lines = [f"to fill in, {line}" for line in missing] or check_campaign(path).lines()
+        for line in lines:
+            console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
+@app.command()
 def check(
     campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN.toml", help="The campaign file.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,

@@ -119,7 +119,7 @@ def check_campaign(path: Path) -> CampaignCheck:
     try:
         campaign = load_campaign(path)
     except _BAD_INPUT as error:
-        return CampaignCheck(path, faults=tuple(_words(error).splitlines()))
+        return CampaignCheck(path, faults=tuple(dict.fromkeys(_words(error).splitlines())))
     if campaign.record is not None:
         return _check_record(campaign)
     return _check_instruments(campaign)

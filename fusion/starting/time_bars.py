@@ -13,6 +13,8 @@ from fusion.report.wording import duration
 _FULL, _EMPTY = "█", "·"
 #: Samples further apart than this many times their usual distance have a gap between them.
 _GAP_STEPS = 10.0
+#: Times before this one count from a start that is not stated.
+_NO_DATE = np.datetime64("1980-01-01")
 
 
 @dataclass(frozen=True)
@@ -68,8 +70,10 @@ def time_bars(recordings: Sequence[Recording], *, width: int = 60) -> list[str]:
     lines = [
         f"{name:<{label}}  {_bar(parts, first, last, width)}{_gap_words(parts)}" for name, parts in stretches.items()
     ]
-    left, right = (np.datetime_as_string(time, unit="m").replace("T", " ") for time in (first, last))
     length = duration(float((last - first) / np.timedelta64(1, "s")))
+    if first < _NO_DATE:
+        return [*lines, f"{'':<{label}}  {'start':<{width - len(length)}}{length}"]
+    left, right = (np.datetime_as_string(time, unit="m").replace("T", " ") for time in (first, last))
     middle = f"{length:^{max(width - len(left) - len(right), 0)}}"
     return [*lines, f"{'UTC':<{label}}  {left}{middle}{right}"]
 

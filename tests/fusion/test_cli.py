@@ -113,6 +113,17 @@ def test_inspect_tells_what_files_hold(campaign_folder: Path, tmp_path: Path) ->
     )
 
 
+def test_init_asks_at_a_terminal_only(campaign_folder: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(campaign_folder, tmp_path / "campaign")
+    (folder / "campaign.toml").unlink()
+    silent = invoke("init", folder)
+    assert (silent.exit_code, "add --yes" in silent.stderr) == (2, True)
+    written = invoke("init", folder, "--yes")
+    assert written.exit_code == 0, written.output
+    assert "to fill in, line" in written.output and (folder / "campaign.toml").is_file()
+    assert invoke("init", folder, "--yes").exit_code == 2
+
+
 def test_check_ends_with_0_where_a_run_would_start_and_with_2_where_not(campaign_folder: Path, tmp_path: Path) -> None:
     ready = invoke("check", campaign_folder / "campaign.toml")
     assert (ready.exit_code, ready.output.splitlines()[-1].partition(":")[0]) == (0, "ready to run")

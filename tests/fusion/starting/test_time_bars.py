@@ -42,3 +42,8 @@ def test_one_sample_is_seen() -> None:
     lines = time_bars([Recording("a", every(1, 0, 0)), Recording("b", every(1, 0, 60))], width=30)
     assert lines[0] == f"a    {'█'}{'·' * 29}"
     assert Recording("same", np.repeat(START, 4)).stretches() == [(START, START)]
+
+
+def test_a_test_without_a_date_counts_from_its_start() -> None:
+    seconds = np.datetime64("1970-01-01", "ns") + (np.arange(0, 36_000, 60) * 10**9).astype("timedelta64[ns]")
+    assert time_bars([Recording("record", seconds)], width=40)[1] == f"        start{'':<29}10.0 h"

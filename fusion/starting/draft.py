@@ -1,0 +1,273 @@
+"""A campaign file for a folder: what its files tell, what was answered, and marked lines for the rest."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from fusion.campaign.time_zones import lacks_zone
+from fusion.errors import FusionError
+from fusion.products.store import write_text
+from fusion.starting.folder import FolderContent, scan_folder
+from fusion.starting.kinds import Kind, Recognised, column_unit, is_displacement, is_temperature, is_time
+from fusion.starting.questions import TO_FILL, Asker
+from interferometry.io.readers import read_deviations
+from thermography.registration.plan import Fiducial, read_fiducials
+
+_FILE = "campaign.toml"
+
+
+class DraftError(FusionError):
+    """A folder for which no campaign file can be written; the message says why and what to do."""
+
+
+def write_campaign(folder: Path, asker: Asker) -> tuple[Path, list[str]]:
+    """Look at a folder and write a commented campaign file into it.
+
+    Parameters
+    ----------
+    folder : Path
+        With the files of one measurement.
+    asker : Asker
+        Answers what the files cannot tell.
+
+    Returns
+    -------
+    Path
+        ``campaign.toml``.
+    list of str
+        The lines that are to be filled in, with their numbers.
+
+    Raises
+    ------
+    DraftError
+        If the folder has a campaign file already, or holds nothing that can be evaluated.
+    """
+    path = folder / _FILE
+    if not folder.is_dir():
+        raise DraftError(f"{folder}: no such folder; name the folder that holds the files of the measurement")
+    if path.exists():
+        raise DraftError(f"{path} exists already and is not replaced; thermofuse check {path} says what it lacks")
+    content = scan_folder(folder.resolve())
+    lines = list(draft_lines(content, asker))
+    write_text(path, "\n".join(lines) + "\n")
+    return path, [
+        f"line {number}: {line}"
+        for number, line in enumerate(lines, start=1)
+        if f'"{TO_FILL}"' in line and not line.startswith("#")
+    ]
+
+
+def draft_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
+    """Yield the lines of a campaign file.
+
+    Parameters
+    ----------
+    content : FolderContent
+        What the folder holds.
+    asker : Asker
+        Answers what the files cannot tell.
+
+    Raises
+    ------
+    DraftError
+        If the folder holds neither frames nor readings nor a record.
+    """
+    readings, records = content.of(Kind.DEVIATIONS), content.of(Kind.RECORD)
+    if not (content.frames or readings or records):
+        unknown = "; ".join(f"{content.relative(one.path)}: {one.reason}" for one in content.unknown[:3])
+        raise DraftError(
+            f"{content.folder}: neither thermal frames nor deviations nor a record of temperatures and displacements in it"
+            + (f" ({unknown})" if unknown else "; name the folder that holds the files of the measurement")
+        )
+    yield "# Written by thermofuse init. Every quantity carries its unit in the value; paths start from the folder of this file."
+    yield f'# A line with "{TO_FILL}" has to be completed; thermofuse check {_FILE} says what is still missing.'
+    yield ""
+    yield "[campaign]"
+    yield f"title = {_quoted(asker.text('Title of the report', content.folder.name or 'Campaign'))}"
+    if content.frames or readings:
+        yield f"axis = {_quoted(asker.text('Axis that was measured', 'X'))}"
+    zone = asker.text("Time zone of times without one, an IANA name such as Europe/Vienna; empty: none needed", "")
+    yield (
+        f"time_zone = {_quoted(zone)}"
+        if zone
+        else '# time_zone = "Europe/Vienna"   # of times that the files give without a zone'
+    )
+    if content.frames:
+        yield from _thermography(content, asker)
+        yield from _plan(content, asker, along_axis=bool(readings))
+    if readings:
+        yield from _interferometry(content, asker)
+    if content.frames or readings:
+        yield from _drivers(content)
+    else:
+        yield from _record(content, records, asker)
+    if content.unknown:
+        yield from ("", "# Files in this folder that were not understood and are not used:")
+        yield from (f"#   {_plain(content.relative(one.path))}: {_plain(one.reason)}" for one in content.unknown)
+
+
+def _time_zone(readings: Sequence[Recognised], asker: Asker) -> Iterator[str]:
+    """Yield the zone of times that the readings give without one."""
+    without = [one.path.name for one in readings if lacks_zone(read_deviations(one.path))]
+    if not without:
+        yield '# time_zone = "Europe/Vienna"            # only where files give times without their zone'
+        return
+    zone = asker.text(f"Time zone of the times in {without[0]}, an IANA name such as Europe/Vienna", "UTC")
+    doubt = "   # taken, as the file gives none: check it" if asker.ask is None else ""
+    yield f"time_zone = {_quoted(zone)}{doubt}"
+
+
+def _thermography(content: FolderContent, asker: Asker) -> Iterator[str]:
+    yield from ("", "[thermography]")
+    yield f"frames = [{', '.join(_quoted(pattern) for pattern in content.frames)}]   # {len(content.frame_files)} files"
+    emissivity = asker.text("Emissivity of the table, such as 0.95 or 0.95 +- 0.02; empty: as stored in the frames", "")
+    yield (
+        f"emissivity = {_quoted(emissivity)}"
+        if emissivity
+        else '# emissivity = "0.95 +- 0.02"            # left out: as stored in the frames'
+    )
+    yield '# reflected_temperature = "22 degC"        # this and the next three: left out = as stored in the frames'
+    yield '# atmospheric_temperature = "22 degC"'
+    yield "# relative_humidity = 0.45"
+    yield '# object_distance = "1.2 m"'
+    yield '# clock_offset = "0 s"                     # camera clock minus laser clock; 0 s where both follow one time server'
+    yield 'table = "still"                          # every frame shows the table at axis position 0; "moving": frames during motion'
+    yield from _optional("lens", content, Kind.LENS)
+
+
+def _plan(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterator[str]:
+    yield from (
+        "",
+        "[plan]                                   # the table in mm: x to the right, y down, from one corner",
+    )
+    listed = content.of(Kind.FIDUCIALS)
+    fiducials = read_fiducials(listed[0].path) if listed else []
+    width, height = _extent(fiducials)
+    size = [
+        asker.quantity(f"{name} of the plan", "mm", default)
+        for name, default in (("Width (x)", width), ("Height (y)", height))
+    ]
+    guessed = (
+        "   # guessed from the fiducials, with the same margin on both sides: check it"
+        if asker.ask is None and width
+        else ""
+    )
+    yield f"size = [{', '.join(size)}]{guessed}"
+    yield f"cell_size = {asker.quantity('Size of a cell of the field; it divides both sides', 'mm', '5 mm')}"
+    name = _quoted(content.relative(listed[0].path) if listed else TO_FILL)
+    yield f"fiducials = {name}   # name,x_mm,y_mm,diameter_mm[,column_px,row_px]"
+    yield from _others("fiducials", content, listed)
+    yield from _optional("regions", content, Kind.REGIONS)
+    if not along_axis:
+        return
+    yield from ("", "[plan.axis]")
+    x = asker.quantity("Plan point under the spindle at axis position 0, x", "mm")
+    y = asker.quantity("Plan point under the spindle at axis position 0, y", "mm")
+    yield f"origin = [{x}, {y}]   # plan point under the spindle at axis position 0"
+    yield f"direction = {_direction(asker)}   # how that point moves as the axis position grows: [1, 0] right, [-1, 0] left, [0, 1] down"
+
+
+def _interferometry(content: FolderContent, asker: Asker) -> Iterator[str]:
+    readings = content.of(Kind.DEVIATIONS)
+    names = tuple(content.relative(one.path) for one in readings)
+    chosen = asker.choice("Which file holds the deviations", names)
+    yield from ("", "[interferometry]")
+    yield f"deviations = {_quoted(chosen)}"
+    yield from (f"# deviations = {_quoted(name)}   # found as well" for name in names if name != chosen)
+    yield from _optional(
+        "environment", content, Kind.ENVIRONMENT, lacking='# environment = "environment.csv"   # none was found'
+    )
+    coefficient = asker.quantity(
+        "Expansion coefficient of what carries the scale or the workpiece", "ppm/K", "11.7 ppm/K"
+    )
+    yield f"expansion_coefficient = {coefficient}"
+    yield f"dead_path = {asker.quantity('Dead path of the laser', 'mm', '0 mm')}"
+    times = read_deviations(content.folder / chosen)["time"].attrs.get("origin")
+    if times == "reconstructed":
+        yield '# feed = "300 mm/min"                     # with dwell: places the readings of this file more closely in time'
+        yield '# dwell = "2 s"'
+
+
+def _drivers(content: FolderContent) -> Iterator[str]:
+    listed = content.of(Kind.DRIVERS)
+    if listed:
+        yield from ("", "[drivers]")
+        yield f"file = {_quoted(content.relative(listed[0].path))}"
+        yield from _others("file", content, listed)
+    if content.frames and content.of(Kind.DEVIATIONS):
+        yield from ("", "[model]", 'declared = ["axis_expansion", "table_offset"]')
+
+
+def _record(content: FolderContent, records: Sequence[Recognised], asker: Asker) -> Iterator[str]:
+    """Yield a record: all files with the columns of the first are runs of one test."""
+    first = records[0]
+    runs = [one for one in records if one.headings == first.headings]
+    headings = first.headings
+    time = next(name for name in headings if is_time(name))
+    temperatures = [name for name in headings if is_temperature(name) and name != time]
+    displacements = [name for name in headings if is_displacement(name) and name != time]
+    others = [name for name in headings if name not in (time, *temperatures, *displacements) and column_unit(name)]
+    yield from ("", "[record]                                 # temperatures and displacements over time")
+    names = [_quoted(content.relative(one.path)) for one in runs]
+    yield f"files = [{', '.join(names)}]" if len(names) > 1 else f"file = {names[0]}"
+    yield f"time = {_quoted(time)}"
+    yield f"temperatures = {_list(temperatures)}"
+    yield f"displacements = {_list(displacements)}"
+    if others:
+        yield f"drivers = {_list(others)}   # what makes heat: leave out what does not"
+    yield from _others("file", content, [one for one in records if one not in runs], all_of_them=True)
+
+
+def _optional(key: str, content: FolderContent, kind: Kind, *, lacking: str = "") -> Iterator[str]:
+    """Yield the line of a file that a campaign may have."""
+    listed = content.of(kind)
+    if listed:
+        yield f"{key} = {_quoted(content.relative(listed[0].path))}"
+        yield from _others(key, content, listed)
+    elif lacking:
+        yield lacking
+
+
+def _others(
+    key: str, content: FolderContent, listed: Sequence[Recognised], *, all_of_them: bool = False
+) -> Iterator[str]:
+    """Yield files that could stand in place of the first as comments."""
+    for one in listed if all_of_them else listed[1:]:
+        yield f"# {key} = {_quoted(content.relative(one.path))}   # found as well"
+
+
+def _extent(fiducials: Sequence[Fiducial]) -> tuple[str, str]:
+    """Return width and height of a plan on which the fiducials have about the same margin on both sides; empty without fiducials."""
+    if not fiducials:
+        return "", ""
+    radius = max(one.diameter_mm for one in fiducials) / 2.0
+    sides = []
+    for places in ([one.x_mm for one in fiducials], [one.y_mm for one in fiducials]):
+        tens = max(round((min(places) + max(places)) / 10.0), math.ceil((max(places) + radius) / 10.0))
+        sides.append(f"{10 * tens} mm")
+    return sides[0], sides[1]
+
+
+def _direction(asker: Asker) -> str:
+    """Return the direction of the axis on the plan as a list of two numbers."""
+    known = {"right": "[1, 0]", "left": "[-1, 0]", "down": "[0, 1]", "up": "[0, -1]"}
+    if asker.ask is None:
+        return _quoted(TO_FILL)
+    return known[asker.choice("How that point moves over the plan as the axis position grows", tuple(known))]
+
+
+def _list(names: Sequence[str]) -> str:
+    return f"[{', '.join(_quoted(name) for name in names)}]"
+
+
+def _quoted(text: str) -> str:
+    """Return a text as a TOML string."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _plain(text: str) -> str:
+    """Return a text that stays on its line of comment."""
+    return "".join(letter if letter.isprintable() else " " for letter in text)

@@ -1,0 +1,95 @@
+"""What a folder holds for a campaign: frames by pattern, readings, logs, the plan, and what is not understood."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fusion.starting.kinds import Kind, Recognised, recognise
+from thermography.inspection import is_flir_file
+
+#: Folders that hold results, not inputs.
+_RESULTS = "results.json"
+#: Files of a series, those of one folder and ending, that decide whether it holds thermal frames.
+_LOOKED_INTO = 3
+
+
+@dataclass(frozen=True)
+class FolderContent:
+    """Files of a folder by what a campaign needs them for.
+
+    Attributes
+    ----------
+    folder : Path
+        The folder.
+    frames : tuple of str
+        Patterns of the thermal frames, relative to the folder.
+    frame_files : tuple of Path
+        Files that the patterns match.
+    files : dict of Kind to tuple of Recognised
+        All other files that are understood.
+    unknown : tuple of Recognised
+        Files that are not.
+    """
+
+    folder: Path
+    frames: tuple[str, ...] = ()
+    frame_files: tuple[Path, ...] = ()
+    files: dict[Kind, tuple[Recognised, ...]] = field(default_factory=dict)
+    unknown: tuple[Recognised, ...] = ()
+
+    def of(self, kind: Kind) -> tuple[Recognised, ...]:
+        """Return the files of a kind, sorted by name."""
+        return self.files.get(kind, ())
+
+    def relative(self, path: Path) -> str:
+        """Return a path as a campaign file in the folder writes it."""
+        return path.relative_to(self.folder).as_posix()
+
+
+def scan_folder(folder: Path) -> FolderContent:
+    """Look at every file of a folder and its subfolders.
+
+    Parameters
+    ----------
+    folder : Path
+        Hidden files, and subfolders that hold the results of a run, are left out.
+
+    Returns
+    -------
+    FolderContent
+    """
+    paths = list(_inputs(folder))
+    thermal = [path for path in paths if path.suffix.lower() != ".toml" and is_flir_file(path)]
+    series: dict[tuple[Path, str], list[Path]] = {}
+    for path in thermal:
+        series.setdefault((path.parent, path.suffix), []).append(path)
+    patterns, frames = [], []
+    found = [recognise(path) for path in paths if path not in set(thermal)]
+    for (parent, suffix), members in series.items():
+        # A long series is read whole by the run, which names the frames that it leaves out.
+        looked = [recognise(path) for path in members[:_LOOKED_INTO]]
+        if any(one.kind is Kind.FRAMES for one in looked):
+            patterns.append((parent.relative_to(folder) / f"*{suffix}").as_posix())
+            frames += members
+        else:
+            found += [Recognised(path, Kind.UNKNOWN, looked[0].reason) for path in members]
+    known: dict[Kind, list[Recognised]] = {}
+    for one in found:
+        known.setdefault(one.kind, []).append(one)
+    unknown = known.pop(Kind.UNKNOWN, [])
+    files = {kind: tuple(members) for kind, members in known.items()}
+    return FolderContent(folder, tuple(patterns), tuple(frames), files, tuple(unknown))
+
+
+def _inputs(folder: Path) -> Iterator[Path]:
+    """Yield the files of a folder and its subfolders, without hidden ones and without results."""
+    for path in sorted(folder.iterdir()):
+        if path.name.startswith("."):
+            continue
+        if path.is_dir():
+            if not (path / _RESULTS).is_file():
+                yield from _inputs(path)
+        elif path.is_file():
+            yield path

@@ -1,0 +1,217 @@
+"""What kind of file something is, told by its content: the campaign's own files, recordings, logs and plans."""
+
+from __future__ import annotations
+
+import csv
+import re
+import tomllib
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from fusion.campaign.quantities import unit_name
+from interferometry.errors import InterferometryError
+from interferometry.io.readers import is_environment_log, read_deviations
+from interferometry.io.workbook import is_workbook, read_sheets
+from thermography.inspection import is_flir_file
+from thermography.io.flir import index_frames
+
+#: Bytes that are read to tell the kind of a text.
+_START = 65_536
+#: Longest reason why a file is not understood, characters.
+_LONGEST_REASON = 160
+_ENCODINGS = ("utf-8-sig", "utf-16", "cp1252")
+_TABLES = ("thermography", "plan", "interferometry", "record", "drivers", "sensors")
+_RECIPE = ("test", "duty", "laser", "effect", "camera", "material")
+_HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
+_TEMPERATURE_UNITS, _LENGTH_UNITS, _TIME_UNITS = ("degC", "K", "degF"), ("um", "nm", "mm"), ("s", "ms", "min", "h")
+
+
+class Kind(StrEnum):
+    """Kinds of files, in the words of a message."""
+
+    CAMPAIGN = "campaign file"
+    RECIPE = "recipe of a simulation"
+    FRAMES = "thermal frames"
+    DEVIATIONS = "deviations"
+    ENVIRONMENT = "environment log"
+    FIDUCIALS = "fiducials"
+    REGIONS = "regions of the plan"
+    PLACES = "places on the plan"
+    LENS = "lens calibration"
+    DRIVERS = "log of drivers"
+    RECORD = "record of temperatures and displacements"
+    UNKNOWN = "not understood"
+
+
+@dataclass(frozen=True)
+class Recognised:
+    """A file and its kind.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    kind : Kind
+        Its kind.
+    reason : str
+        Why it is not understood; empty for every other kind.
+    headings : tuple of str
+        Of a table, the headings of its columns.
+    """
+
+    path: Path
+    kind: Kind
+    reason: str = ""
+    headings: tuple[str, ...] = ()
+
+
+def recognise(path: Path) -> Recognised:
+    """Tell the kind of a file by its content.
+
+    Parameters
+    ----------
+    path : Path
+        An existing file.
+
+    Returns
+    -------
+    Recognised
+        A table with the columns of a kind is of that kind, also where its rows are faulty: its reader says what is wrong.
+    """
+    if path.suffix.lower() == ".toml":
+        return _toml(path)
+    if is_flir_file(path):
+        references, rejected = index_frames([path])
+        return Recognised(path, Kind.FRAMES) if references else Recognised(path, Kind.UNKNOWN, rejected[0].reason)
+    text = _text_start(path)
+    if text is not None and ("camera_matrix" in text or "cameraMatrix" in text):
+        return Recognised(path, Kind.LENS)
+    try:
+        headings = _headings(text) if text is not None else _sheet_headings(path)
+        kind = _by_headings(headings)
+        if kind is None:
+            kind = Kind.ENVIRONMENT if is_environment_log(path) else Kind.DEVIATIONS
+        if kind is Kind.DEVIATIONS:
+            read_deviations(path, rotary=True)
+    except InterferometryError as error:
+        return Recognised(path, Kind.UNKNOWN, _shortened(str(error).removeprefix(f"{path}").lstrip(":, ")))
+    return Recognised(path, kind, headings=headings)
+
+
+def column_unit(heading: str) -> str:
+    """Return the unit in a heading such as ``"t1 [degC]"``; empty where it has none.
+
+    Parameters
+    ----------
+    heading : str
+        Heading of a column.
+    """
+    match = _HEADING.fullmatch(heading)
+    return unit_name(match.group(2)) if match else ""
+
+
+def is_temperature(heading: str) -> bool:
+    """Return whether a heading is that of a temperature.
+
+    Parameters
+    ----------
+    heading : str
+        Heading of a column.
+    """
+    return column_unit(heading) in _TEMPERATURE_UNITS
+
+
+def is_displacement(heading: str) -> bool:
+    """Return whether a heading is that of a displacement.
+
+    Parameters
+    ----------
+    heading : str
+        Heading of a column.
+    """
+    return column_unit(heading) in _LENGTH_UNITS
+
+
+def is_time(heading: str) -> bool:
+    """Return whether a heading is that of the time: ``time``, or a column in units of time.
+
+    Parameters
+    ----------
+    heading : str
+        Heading of a column.
+    """
+    return heading.strip().lower() == "time" or column_unit(heading) in _TIME_UNITS
+
+
+def _shortened(reason: str) -> str:
+    """Return a reason that repeats no whole line of a file."""
+    return reason if len(reason) <= _LONGEST_REASON else f"{reason[:_LONGEST_REASON]} ..."
+
+
+def _toml(path: Path) -> Recognised:
+    """Tell campaign files from recipes by their tables."""
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return Recognised(path, Kind.UNKNOWN, f"this is not TOML: {error}")
+    if any(name in content for name in _RECIPE):
+        return Recognised(path, Kind.RECIPE)
+    if any(name in content for name in _TABLES):
+        return Recognised(path, Kind.CAMPAIGN)
+    return Recognised(path, Kind.UNKNOWN, "neither a campaign nor a recipe: no table of either")
+
+
+def _text_start(path: Path) -> str | None:
+    """Return the beginning of a text; None where the file is no text."""
+    with path.open("rb") as file:
+        start = file.read(_START)
+    if b"\0" in start and not start.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return None
+    for encoding in _ENCODINGS:
+        try:
+            return start.decode(encoding)
+        except UnicodeDecodeError:
+            # A character may be cut in two by the end of what was read.
+            if len(start) == _START and encoding == "utf-8-sig":
+                return start.decode(encoding, errors="ignore")
+    return None
+
+
+def _headings(text: str) -> tuple[str, ...]:
+    """Return the fields of the first line that is neither empty nor a comment."""
+    line = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
+    delimiter = max(",;\t", key=line.count)
+    return tuple(name.strip() for name in next(csv.reader([line], delimiter=delimiter), []))
+
+
+def _by_headings(headings: tuple[str, ...]) -> Kind | None:
+    """Return the kind whose columns these are, None where they are of no kind of its own."""
+    names = set(headings)
+    if {"name", "x_mm", "y_mm"} <= names:
+        if "diameter_mm" in names:
+            return Kind.FIDUCIALS
+        return Kind.REGIONS
+    if _is_record(headings):
+        return Kind.RECORD
+    if "time" in names and len(headings) > 1 and all(column_unit(name) for name in headings if name != "time"):
+        return Kind.DRIVERS
+    return None
+
+
+def _is_record(headings: tuple[str, ...]) -> bool:
+    """Whether columns are a time, temperatures and displacements, each with its unit."""
+    return (
+        any(is_time(name) for name in headings)
+        and any(is_temperature(name) for name in headings)
+        and any(is_displacement(name) for name in headings)
+    )
+
+
+def _sheet_headings(path: Path) -> tuple[str, ...]:
+    """Return the headings of the first sheet of a spreadsheet; none where the file is neither that nor text."""
+    content = path.read_bytes()
+    if not is_workbook(content):
+        return ()
+    _, rows = next(iter(read_sheets(path, content).items()))
+    return tuple(name.strip() for name in rows[0][1]) if rows else ()

@@ -1,0 +1,110 @@
+"""Campaign files for folders: what the files tell, what is asked, and a check that says what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fusion.campaign.config import load_campaign
+from fusion.starting.check import check_campaign
+from fusion.starting.draft import DraftError, draft_lines, write_campaign
+from fusion.starting.folder import scan_folder
+from fusion.starting.questions import Asker
+
+ANSWERS = {
+    "Title of the report": 'The "small" one',
+    "Plan point under the spindle at axis position 0, x": "500 mm",
+    "Plan point under the spindle at axis position 0, y": "90 mm",
+    "How that point moves over the plan as the axis position grows (right, left, down, up)": "left",
+    "Size of a cell of the field; it divides both sides": "20 mm",
+}
+
+
+def answering(question: str, default: str) -> str:
+    return ANSWERS.get(question, default)
+
+
+def test_answers_make_a_campaign_that_is_ready(copied: Path) -> None:
+    original = load_campaign(copied / "campaign.toml")
+    (copied / "campaign.toml").unlink()
+    path, missing = write_campaign(copied, Asker(answering))
+    assert missing == [] and check_campaign(path).faults == ()
+    written = load_campaign(path)
+    assert written.campaign.title == 'The "small" one'
+    assert written.plan == original.plan
+    assert written.input_files() == original.input_files()
+
+
+def test_without_answers_the_missing_lines_are_marked_and_the_check_names_them(copied: Path) -> None:
+    (copied / "campaign.toml").unlink()
+    path, missing = write_campaign(copied, Asker(None))
+    assert [line.split(": ")[1].split(" = ")[0] for line in missing] == ["origin", "direction"]
+    faults = check_campaign(path).faults
+    numbers = {line.split(":")[0].removeprefix("line ") for line in missing}
+    assert {fault.split(", line ")[1].split(":")[0] for fault in faults} == numbers
+
+
+def test_an_existing_file_is_never_replaced(copied: Path) -> None:
+    before = (copied / "campaign.toml").read_text()
+    with pytest.raises(DraftError, match=r"campaign.toml exists already and is not replaced"):
+        write_campaign(copied, Asker(None))
+    assert (copied / "campaign.toml").read_text() == before
+
+
+def test_a_folder_without_measurements_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DraftError, match="neither thermal frames nor deviations nor a record"):
+        write_campaign(tmp_path, Asker(None))
+    (tmp_path / "notes.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(DraftError, match=r"in it \(notes.csv: "):
+        write_campaign(tmp_path, Asker(None))
+    assert not (tmp_path / "campaign.toml").exists()
+    with pytest.raises(DraftError, match="no such folder"):
+        write_campaign(tmp_path / "absent", Asker(None))
+
+
+def test_runs_of_a_record_are_one_campaign(tmp_path: Path) -> None:
+    seconds = np.arange(0, 36_000, 60)
+    warm = 20 + 5 * (1 - np.exp(-seconds / 9000))
+    rows = "".join(f"{s},{t:.3f},{3 * (t - 20):.3f},{s % 7}\n" for s, t in zip(seconds, warm, strict=True))
+    for name in ("run_1.csv", "run_2.csv"):
+        (tmp_path / name).write_text(f"time [s],t1 [degC],ch1 [um],speed [1/min]\n{rows}")
+    (tmp_path / "other.csv").write_text(f"time [s],t1 [degC],ch9 [um],speed [1/min]\n{rows}")
+    path, missing = write_campaign(tmp_path, Asker(None))
+    record = load_campaign(path).record
+    assert missing == [] and record is not None
+    # The first file decides, and the one with other columns is named beside it.
+    assert record.file == "other.csv" and '# file = "run_1.csv"   # found as well' in path.read_text()
+    (tmp_path / "other.csv").unlink()
+    path.unlink()
+    write_campaign(tmp_path, Asker(None))
+    record = load_campaign(path).record
+    assert record is not None and record.files == ("run_1.csv", "run_2.csv")
+    assert (record.temperatures, record.displacements, record.drivers) == (
+        ("t1 [degC]",),
+        ("ch1 [um]",),
+        ("speed [1/min]",),
+    )
+    assert check_campaign(path).faults == ()
+
+
+def test_names_from_files_stay_text(tmp_path: Path) -> None:
+    """A file name with a quote and a line break, in a folder of the same kind, makes no key of its own."""
+    folder = tmp_path / 'a"\n[accept]'
+    folder.mkdir()
+    (folder / "x.csv").write_text("time [s],t1 [degC],ch1 [um]\n0,20,0\n")
+    (folder / "y\nz.txt").write_text("nothing\n")
+    lines = "\n".join(draft_lines(scan_folder(folder), Asker(None)))
+    assert "\n[accept]" not in lines and "#   y z.txt: " in lines
+
+
+@pytest.mark.real_data
+def test_the_public_spindle_record_is_ready_at_once(real_file: Callable[[str], Path], tmp_path: Path) -> None:
+    (tmp_path / "data.xlsx").write_bytes(real_file("CAIVIAC__FL_THERMAL/data/data.xlsx").read_bytes())
+    path, missing = write_campaign(tmp_path, Asker(None))
+    record = load_campaign(path).record
+    assert missing == [] and record is not None
+    assert (len(record.temperatures), len(record.displacements), record.drivers) == (16, 5, ("spindle(RPM)",))
+    assert check_campaign(path).faults == ()

@@ -1,0 +1,35 @@
+"""A folder: frames by pattern, other files by kind, results and hidden files left out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fusion.starting.folder import scan_folder
+from fusion.starting.kinds import Kind
+
+
+def test_a_campaign_folder_is_sorted_out(campaign_folder: Path) -> None:
+    content = scan_folder(campaign_folder)
+    assert content.frames == ("thermal/*.jpg",)
+    assert len(content.frame_files) == len(list((campaign_folder / "thermal").iterdir()))
+    assert {kind: [content.relative(one.path) for one in files] for kind, files in content.files.items()} == {
+        Kind.CAMPAIGN: ["campaign.toml"],
+        Kind.DRIVERS: ["drivers.csv"],
+        Kind.ENVIRONMENT: ["environment.csv"],
+        Kind.FIDUCIALS: ["fiducials.csv"],
+        Kind.DEVIATIONS: ["laser.csv"],
+    }
+    assert content.unknown == () and content.of(Kind.LENS) == ()
+
+
+def test_photos_results_and_hidden_files_are_no_input(copied: Path) -> None:
+    (copied / "photos").mkdir()
+    for name in "abcd":
+        (copied / "photos" / f"{name}.jpg").write_bytes(b"\xff\xd8\xff\xe0" + b"\0" * 40 + b"\xff\xd9")
+    (copied / "results").mkdir()
+    (copied / "results" / "results.json").write_text("{}")
+    (copied / "results" / "drift.csv").write_text("cycle,direction\n")
+    (copied / ".hidden").write_text("x")
+    content = scan_folder(copied)
+    assert content.frames == ("thermal/*.jpg",)
+    assert [content.relative(one.path) for one in content.unknown] == [f"photos/{name}.jpg" for name in "abcd"]

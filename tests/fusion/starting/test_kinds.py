@@ -1,0 +1,76 @@
+"""Kinds of files by their content, whatever they are called."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from fusion.starting.kinds import Kind, column_unit, is_displacement, is_temperature, is_time, recognise
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "kind"),
+    [
+        ("a.toml", '[campaign]\ntitle = "A"\n[record]\nfile = "a.csv"\n', Kind.CAMPAIGN),
+        ("a.toml", '[campaign]\ntitle = "A"\n[test]\ncycles = 3\n', Kind.RECIPE),
+        ("a.toml", "[tool]\nx = 1\n", Kind.UNKNOWN),
+        ("a.toml", "[tool\n", Kind.UNKNOWN),
+        ("a.csv", "name,x_mm,y_mm,diameter_mm\nF1,40,20,16\n", Kind.FIDUCIALS),
+        ("a.csv", "name,x_mm,y_mm\nmotor,1,2\n", Kind.REGIONS),
+        ("a.csv", "# logged\n\ntime;air_temperature_degC;air_pressure_hPa\n", Kind.ENVIRONMENT),
+        ("a.csv", "Zeit;Lufttemperatur [°C];Luftdruck [hPa]\n", Kind.ENVIRONMENT),
+        ("a.csv", "Position [mm],1+ [um],1- [um]\n0,0.1,0.2\n100,0.3,0.4\n", Kind.DEVIATIONS),
+        ("a.csv", "time,spindle [1/min],pump [1]\n2026-03-09T06:30:00Z,1,0\n", Kind.DRIVERS),
+        ("a.txt", "zeit (s)\tt1(°C)\tch1(um)\n0\t20\t0\n", Kind.RECORD),
+        (
+            "a.csv",
+            "cycle,direction,target,position_mm,time,deviation_um\n1,positive,1,0,2026-03-09T06:30:00Z,0.1\n",
+            Kind.DEVIATIONS,
+        ),
+        ("a.yml", "%YAML:1.0\ncamera_matrix: !!opencv-matrix\n", Kind.LENS),
+        ("a.md", "# Notes\n\nNothing measured.\n", Kind.UNKNOWN),
+        ("a.bin", "\0\1\2", Kind.UNKNOWN),
+    ],
+)
+def test_the_content_decides(tmp_path: Path, name: str, text: str, kind: Kind) -> None:
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    found = recognise(path)
+    assert found.kind is kind
+    assert bool(found.reason) is (kind is Kind.UNKNOWN) and len(found.reason) < 180
+
+
+def test_a_workbook_is_looked_into(tmp_path: Path) -> None:
+    pd.DataFrame({"time (s)": [0, 1], "t1(°C)": [20, 20], "ch1(um)": [0, 1]}).to_excel(tmp_path / "a.xlsx", index=False)
+    assert recognise(tmp_path / "a.xlsx").kind is Kind.RECORD
+    pd.DataFrame({"a": [0, 1]}).to_excel(tmp_path / "b.xlsx", index=False)
+    assert recognise(tmp_path / "b.xlsx").kind is Kind.UNKNOWN
+
+
+def test_a_photo_is_no_thermal_frame(tmp_path: Path) -> None:
+    (tmp_path / "photo.jpg").write_bytes(b"\xff\xd8\xff\xe0" + b"\0" * 40 + b"\xff\xd9")
+    found = recognise(tmp_path / "photo.jpg")
+    assert (found.kind, bool(found.reason)) == (Kind.UNKNOWN, True)
+
+
+def test_other_encodings_are_read(tmp_path: Path) -> None:
+    for encoding in ("utf-16", "cp1252", "utf-8-sig"):
+        (tmp_path / "a.csv").write_text("time (s);t1 (°C);ch1 (µm)\n0;20;0\n", encoding=encoding)
+        assert recognise(tmp_path / "a.csv").kind is Kind.RECORD
+
+
+@pytest.mark.real_data
+def test_real_files_are_of_their_kind(real_file: Callable[[str], Path]) -> None:
+    assert recognise(real_file("friedcucumber__RenishawWork/data/22.rtl")).kind is Kind.DEVIATIONS
+    assert recognise(real_file("CAIVIAC__FL_THERMAL/data/data.xlsx")).kind is Kind.RECORD
+    assert recognise(real_file("gtatters__Thermimage/inst/extdata/SampleCSQ.csq")).kind is Kind.FRAMES
+
+
+def test_headings_say_what_a_column_is() -> None:
+    assert column_unit("t1 [°C]") == "degC" and column_unit("speed") == ""
+    assert is_temperature("t1(K)") and not is_temperature("rise")
+    assert is_displacement("ch1 [µm]") and not is_displacement("length [m2]")
+    assert is_time("time") and is_time("時間(s)") and not is_time("speed [1/min]")
