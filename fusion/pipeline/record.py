@@ -240,6 +240,15 @@ def record_variables(record: Record, result: RecordResult) -> xr.Dataset:
                 {"units": "degC", "units_metadata": "temperature: on_scale"},
             ),
             "driver": (("time", "driver_name"), drivers, {"units": "1", "long_name": "driver over its largest size"}),
+            "driver_size": (
+                ("driver_name",),
+                [record.driver_sizes[name][0] for name in record.drivers],
+                {"long_name": "largest size of the driver, in driver_units"},
+            ),
+            "driver_units": (
+                ("driver_name",),
+                np.array([record.driver_sizes[name][1] for name in record.drivers], dtype=object),
+            ),
             **_predictions(record, result),
             "predicted_u": (
                 "channel",

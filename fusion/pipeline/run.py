@@ -36,7 +36,6 @@ from fusion.products.store import (
     write_json,
     write_text,
 )
-from fusion.report.html import render_report
 
 #: Where each stage keeps its Dataset; what ends up in fusion.nc is kept apart while it may have to be resumed.
 FILES = {
@@ -352,6 +351,8 @@ def _run_record(run: Run, source: record_stage.RecordSource) -> Results:
 
 def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
     """Write results, provenance and report from what the stages found."""
+    from fusion.report.html import render_report  # its charts take half a second to import, which a run needs last
+
     run.notices.extend(note_changes(run.seen, input_states(run.campaign)))
     results = assemble(run.campaign.campaign.title, run.parts, run.notices)
     provenance = describe_run(run.campaign, run.inputs, started=run.started, seconds=run.seconds)

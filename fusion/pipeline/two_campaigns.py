@@ -12,8 +12,7 @@ from fusion.attribution.two_sessions import ChannelAgreement, SourceAgreement, c
 from fusion.products.results import read_results
 from fusion.products.store import read_dataset, read_tree, write_dataset, write_json, write_text
 from fusion.report.html import render_report
-from fusion.report.plots_attribution import CHANNELS
-from fusion.report.wording import duration, measured, number, p_value
+from fusion.report.wording import CHANNELS, duration, measured, number, p_value
 
 _READERS = {"fields": read_dataset, "deviations": read_dataset, "fusion": read_tree}
 

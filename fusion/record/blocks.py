@@ -7,7 +7,7 @@ time constant; drivers are averaged after they are raised to a power, because he
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -90,6 +90,7 @@ class Record:
     impossible : samples beyond what can be measured, which count as missing, by column
     runs : of a record of several runs; empty where there is one
     first : number of the first block of every run
+    driver_sizes : driver to its largest size and the unit of that
     """
 
     start: np.datetime64
@@ -107,6 +108,7 @@ class Record:
     impossible: Mapping[str, int] = field(default_factory=dict)
     runs: tuple[RecordedRun, ...] = ()
     first: tuple[int, ...] = (0,)
+    driver_sizes: Mapping[str, tuple[float, str]] = field(default_factory=dict)
 
     @property
     def rise(self) -> Array:
@@ -288,6 +290,7 @@ def reduce_record(table: xr.Dataset) -> Record:
         impossible=impossible,
         runs=_runs(table, blocks),
         first=blocks.first,
+        driver_sizes=_driver_sizes(table, drivers),
     )
 
 
@@ -368,6 +371,17 @@ def _drivers(table: xr.Dataset, blocks: _Blocks) -> dict[str, dict[int, Array]]:
             continue
         drivers[name] = {exponent: blocks.filled(name, (values / largest) ** exponent) for exponent in EXPONENTS}
     return drivers
+
+
+def _driver_sizes(table: xr.Dataset, kept: Collection[str]) -> dict[str, tuple[float, str]]:
+    """Largest size of every driver that was kept, with its unit ("1" where the table states none)."""
+    units = table["driver_units"].values if "driver_units" in table else ["1"] * table.sizes["driver_name"]
+    largest = np.nanmax(np.abs(table["driver"].values), axis=0, initial=0.0)
+    return {
+        str(name): (float(size), str(unit))
+        for name, size, unit in zip(table["driver_name"].values, largest, units, strict=True)
+        if str(name) in kept
+    }
 
 
 def independent(columns: Array, *, tolerance: float = 1e-8) -> list[int]:

@@ -11,10 +11,10 @@ import xarray as xr
 
 from fusion.attribution.family_wise import LEVEL
 from fusion.products.results_attribution import CorrelationPart, DutyPart, PlacePart, TestedPart
+from fusion.report.charts.attribution import caption_of, rate_text
 from fusion.report.findings import attribution_headline, randomised_causes
-from fusion.report.plots_attribution import CHANNELS, caption_of, rate_text
 from fusion.report.tables import Row, Table, Words, table
-from fusion.report.wording import duration, join, measured, number, p_value, place, quantity
+from fusion.report.wording import CHANNELS, duration, join, measured, number, p_value, place, quantity
 
 _SHORT = {"common": "common", "proportional": "growing", "reversal": "reversal", "joint": "common and growing"}
 _SENSITIVITY = "Sensitivity / (µm/K)"

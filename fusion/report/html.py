@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import base64
-import io
 import json
-import re
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from fusion.attribution.family_wise import LEVEL
 from fusion.products.grouped import group, has
 from fusion.products.results import Results
-from fusion.report import plots_attribution, plots_model, plots_plan, record_section, summary_section
+from fusion.report import record_section, summary_section
 from fusion.report.attribution_section import leading_region
-from fusion.report.charts.drift import plot_drift, plot_profile
+from fusion.report.charts import attribution, drift, neighbours, plan, readings, timeline
+from fusion.report.charts import loop as closed_loop
 from fusion.report.charts.style import Chart
 from fusion.report.page import render_page
-from interferometry import figures
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from interferometry.figures import evaluate_common_start
 
 #: Largest number of map values in the file; above it cycles are thinned and cells are averaged, and the report says so.
 _MAP_BUDGET = 2_000_000
@@ -75,115 +72,101 @@ def render_report(
     if "record" in datasets:
         return render_page(
             "record.html.j2",
-            {},
+            record_section.draw_record(datasets["record"]),
             results=results,
             provenance=provenance,
             summary=record_section.describe_record(results, provenance, datasets["record"]),
-            drawings={
-                name: _svg_text(draw, name) for name, draw in record_section.draw_record(datasets["record"]).items()
-            },
         )
     return render_page(
         "report.html.j2",
-        _draw_charts(datasets),
+        _draw_charts(results, datasets),
         results=results,
         provenance=provenance,
         summary=summary_section.describe_campaign(results, provenance, datasets, joint),
-        drawings=_draw_figures(results, datasets),
         maps=_embed_maps(datasets["fields"], results) if "fields" in datasets else None,
     )
 
 
-def _draw_charts(datasets: Mapping[str, Any]) -> dict[str, Chart]:
+def _draw_charts(results: Results, datasets: Mapping[str, Any]) -> dict[str, Chart]:
     """Return every chart that the data allow, by name."""
     charts: dict[str, Chart] = {}
-    if "deviations" in datasets:
-        deviations = datasets["deviations"]
-        drift = group(deviations, "drift")
-        charts["drift"] = plot_drift(drift, deviations)
-        charts["profile"] = plot_profile(drift, deviations["position"])
+    fields, deviations, fused = (datasets.get(name) for name in ("fields", "deviations", "fusion"))
+    if fields is not None:
+        charts |= {"registration": plan.plot_registration(fields), "rise_history": plan.plot_rise_history(fields)}
+    if deviations is not None:
+        charts |= _drift_charts(results, deviations)
+    if fused is not None:
+        root = fused.to_dataset()
+        if "time" in root:
+            charts["timeline"] = timeline.plot_timeline(root)
+        if "local_rise" in root:
+            charts["axis_temperature"] = plan.plot_axis_temperature(root)
+            if deviations is not None:
+                charts["drift_temperature"] = plan.plot_drift_temperature(root, group(deviations, "drift"))
+        if results.correlation is not None and "correlation" in fused.children:
+            charts |= _correlation_charts(fused, results.correlation.source.part)
+        if has(root, "loop") and deviations is not None:
+            charts |= _loop_charts(group(root, "loop"), deviations)
     return charts
 
 
-def _draw_figures(results: Results, datasets: Mapping[str, Any]) -> dict[str, str]:
-    """Return every figure that the data allow, by name, as SVG text."""
-    charts: dict[str, Callable[[], Axes]] = {}
-    if "fields" in datasets:
-        fields = datasets["fields"]
-        charts["registration"] = lambda: plots_plan.plot_registration(fields)
-        charts["rise_history"] = lambda: plots_plan.plot_rise_history(fields)
-    if "deviations" in datasets:
-        charts |= _drift_charts(results, datasets["deviations"])
-    fused = datasets.get("fusion")
-    if fused is not None and results.correlation is not None and "correlation" in fused.children:
-        charts |= _correlation_charts(fused, results.correlation.source.part)
-    if fused is not None and has(fused.to_dataset(), "loop") and "deviations" in datasets:
-        loop, deviations = group(fused.to_dataset(), "loop"), datasets["deviations"]
-        charts["residual_time"] = lambda: plots_model.plot_residual_time(loop, deviations)
-        charts["residual_position"] = lambda: plots_model.plot_residual_position(loop, deviations)
-        charts["residual_direction"] = lambda: plots_model.plot_residual_direction(loop, deviations)
-        charts["residual_spectrum"] = lambda: plots_model.plot_residual_spectrum(loop)
-        charts["residual_events"] = lambda: plots_model.plot_residual_events(loop, deviations)
-        charts["contributions"] = lambda: plots_model.plot_contributions(loop, deviations)
-    return {name: _svg_text(draw, name) for name, draw in charts.items()}
-
-
-def _drift_charts(results: Results, deviations: xr.Dataset) -> dict[str, Callable[[], Axes]]:
+def _drift_charts(results: Results, deviations: xr.Dataset) -> dict[str, Chart]:
     """The charts that need the readings alone."""
-    drift, chart, position = group(deviations, "drift"), group(deviations, "chart"), deviations["position"]
+    joint, position = group(deviations, "drift"), deviations["position"]
     flagged = {anomaly.target for anomaly in results.anomalies or ()}
     shown = min(flagged, default=int(deviations["target"][min(3, deviations.sizes["target"] - 1)]))
+    shifted = evaluate_common_start(deviations)
     return {
-        "deviations_positive": lambda: figures.plot_deviation_chart(deviations, direction="positive"),
-        "deviations_negative": lambda: figures.plot_deviation_chart(deviations, direction="negative"),
-        "common_start": lambda: figures.plot_deviation_chart(figures.evaluate_common_start(deviations)),
-        "history": lambda: figures.plot_position_history(
-            figures.evaluate_position_history(deviations, target=shown), drift=drift
-        ),
-        "scatter": lambda: figures.plot_comparison(group(deviations, "comparison")),
-        "mean_differences": lambda: figures.plot_mutual_deviations(group(deviations, "neighbours")),
-        "chart": lambda: figures.plot_reference_chart(chart.assign(position=position.sel(target=chart["target"]))),
-        "windows": lambda: plots_model.plot_windows(group(deviations, "iso")),
-        "reversal": lambda: plots_model.plot_reversal(drift, position),
-        "anomalies": lambda: plots_model.plot_position_scatter(drift, flagged),
+        **{f"deviations_{side}": readings.plot_cycles(deviations, side) for side in ("positive", "negative")},
+        **{
+            f"common_start_{side}": readings.plot_cycles(shifted, side, quantity="deviation from a common start")
+            for side in ("positive", "negative")
+        },
+        "deviation_map": drift.plot_deviation_map(deviations),
+        "drift_map": drift.plot_drift_map(joint, position),
+        "history": readings.plot_history(deviations, joint, shown),
+        "drift": drift.plot_drift(joint, deviations),
+        "profile": drift.plot_profile(joint, position),
+        "reversal": drift.plot_reversal(joint, position),
+        "scatter": neighbours.plot_scatter_comparison(group(deviations, "comparison"), position),
+        "mean_differences": neighbours.plot_mean_differences(group(deviations, "neighbours"), position),
+        "chart": neighbours.plot_reference_chart(group(deviations, "chart"), position),
+        "windows": readings.plot_windows(group(deviations, "iso")),
+        "anomalies": drift.plot_position_scatter(joint, position, flagged),
     }
 
 
-def _correlation_charts(fused: xr.DataTree, channel: str) -> dict[str, Callable[[], Axes]]:
+def _correlation_charts(fused: xr.DataTree, channel: str) -> dict[str, Chart]:
     """The maps of the leading part of the drift, the modes, the clusters, and the leading region by target."""
     maps = fused.children["correlation"]
     cells, position = maps.to_dataset(), fused.to_dataset()["position"]
-    charts: dict[str, Callable[[], Axes]] = {
-        "sensitivity": lambda: plots_attribution.plot_cells(
-            cells, "sensitivity", channel, label="sensitivity / (µm/K)"
-        ),
-        "significance": lambda: plots_attribution.plot_cells(cells, "p_value", channel, label="family-wise p"),
-        "clusters": lambda: plots_attribution.plot_clusters(maps.children["clusters"].to_dataset()),
-    }
+    charts = {"clusters": attribution.plot_clusters(maps.children["clusters"].to_dataset())}
+    if bool((cells["p_value"].sel(channel=channel) <= attribution.LEAST_SHOWN).any()):
+        charts["significance"] = attribution.plot_significance(cells, channel)
+    if bool((cells["p_value"].sel(channel=channel) <= LEVEL).any()):
+        charts["sensitivity"] = attribution.plot_sensitivity(cells, channel)
     if "modes" in maps.children:
-        charts["modes"] = lambda: plots_attribution.plot_modes(maps.children["modes"].to_dataset(), channel)
+        modes = maps.children["modes"].to_dataset()
+        charts |= {f"mode_{mode}": attribution.plot_mode(modes, int(mode), channel) for mode in modes["mode"].values}
     if "target_regions" in maps.children:
         region, targets = leading_region(maps), maps.children["target_regions"].to_dataset()
-        charts["region_targets"] = lambda: plots_attribution.plot_region_targets(targets, region, position)
+        charts["region_targets"] = attribution.plot_region_targets(targets, region, position)
     return charts
 
 
-def _svg_text(draw: Callable[[], Axes], name: str) -> str:
-    """Return a chart as an SVG element whose identifiers start with `name`, so that several fit into one page."""
-    import matplotlib as mpl
-    from matplotlib import pyplot as plt
-
-    with mpl.rc_context({**figures.STYLE, "backend": "Agg"}):
-        figure = draw().get_figure(root=True)
-        assert figure is not None
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-        plt.close(figure)
-    text = buffer.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r'\bid="([^"]+)"', rf'id="{name}-\1"', text)
-    text = re.sub(r'(url\(#|href="#)', rf"\g<1>{name}-", text)
-    return text.replace("<svg ", f'<svg role="img" aria-label="{name.replace("_", " ")}" ', 1)
+def _loop_charts(loop: xr.Dataset, deviations: xr.Dataset) -> dict[str, Chart]:
+    """The charts of the closed loop."""
+    charts = {
+        "residual_direction": closed_loop.plot_residual_direction(loop, deviations),
+        "residual_spectrum": closed_loop.plot_residual_spectrum(loop),
+        "residual_events": closed_loop.plot_residual_events(loop, deviations),
+        "contributions": closed_loop.plot_contributions(loop, deviations),
+    }
+    if "held_out_error_final" in loop and bool(loop["held_out_error_final"].notnull().any()):
+        charts["held_out_errors"] = closed_loop.plot_held_out_errors(loop, deviations)
+        charts["held_out_positions"] = closed_loop.plot_held_out_positions(loop, deviations)
+        charts["predicted_measured"] = closed_loop.plot_predicted_measured(loop, deviations)
+    return charts
 
 
 def _embed_maps(fields: xr.Dataset, results: Results) -> dict[str, Any]:
@@ -227,7 +210,7 @@ def _layer(name: str, values: np.ndarray, unit: str) -> dict[str, Any]:
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     step = max((high - low) / 60000.0, 1e-6)
     stored = np.where(np.isfinite(values), np.round((values - low) / step) - 30000, _MISSING).astype("<i2")
-    palette = np.round(mpl.colormaps[plots_plan.HEAT_MAP](np.arange(256))[:, :3] * 255).astype(int)
+    palette = np.round(mpl.colormaps["inferno"](np.arange(256))[:, :3] * 255).astype(int)
     return {
         "name": name, "unit": unit, "offset": low + 30000 * step, "step": step,
         "low": float(np.nanpercentile(values, 0.1)), "high": float(np.nanpercentile(values, 99.9)),

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,7 +12,8 @@ from fusion.alignment.sensor_health import describe_fault
 from fusion.products.results import Results
 from fusion.products.results_loop import RecordLoop, RecordScorePart
 from fusion.record.problem import ENTRY_LEVEL
-from fusion.report import plots_record
+from fusion.report.charts import record as charts
+from fusion.report.charts.style import Chart
 from fusion.report.model_section import DECIDED_BEFORE, errors_table, parameters, refused_effects, steps_table
 from fusion.report.tables import Row, Table, Words, table
 from fusion.report.wording import (
@@ -26,9 +27,6 @@ from fusion.report.wording import (
     verdict_headline,
     verdict_numbers,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 #: Largest number of channels with charts; all of them are in fusion.nc.
 _MOST_CHANNELS = 6
@@ -53,22 +51,23 @@ _GLOSSARY = (
 )
 
 
-def draw_record(record: xr.Dataset) -> dict[str, Callable[[], Axes]]:
-    """Return the charts of a record by name, each drawn when it is called.
+def draw_record(record: xr.Dataset) -> dict[str, Chart]:
+    """Return the charts of a record by name.
 
     Parameters
     ----------
     record : Dataset
         fusion.nc of a record.
     """
-    charts: dict[str, Callable[[], Axes]] = {"temperatures": lambda: plots_record.plot_temperatures(record)}
+    drawn = {"temperatures": charts.plot_temperatures(record)}
     if record.sizes["driver_name"]:
-        charts["drivers"] = lambda: plots_record.plot_drivers(record)
+        drawn["drivers"] = charts.plot_drivers(record)
     for k, name in enumerate(_shown_channels(record)):
-        charts[f"prediction_{k}"] = lambda name=name: plots_record.plot_prediction(record, name)  # type: ignore[misc]
-        charts[f"residual_{k}"] = lambda name=name: plots_record.plot_residuals(record, name)  # type: ignore[misc]
-        charts[f"contribution_{k}"] = lambda name=name: plots_record.plot_contributions(record, name)  # type: ignore[misc]
-    return charts
+        drawn[f"prediction_{k}"] = charts.plot_prediction(record, name)
+        drawn[f"residual_{k}"] = charts.plot_residuals(record, name)
+        if record.sizes["effect"]:
+            drawn[f"contribution_{k}"] = charts.plot_contributions(record, name)
+    return drawn
 
 
 def _shown_channels(record: xr.Dataset) -> list[str]:

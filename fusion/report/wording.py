@@ -24,6 +24,15 @@ _FIGURE_WORDS: dict[Figures, str] = {
 }
 
 
+#: Parts of the drift as the correlation names them, in plain words.
+CHANNELS = {
+    "common": "drift common to all positions",
+    "proportional": "drift that grows with position",
+    "reversal": "drift of the reversal",
+    "joint": "common and growing drift together",
+}
+
+
 class EffectWords(NamedTuple):
     """An effect as a reader meets it.
 
@@ -125,7 +134,7 @@ def print_unit(unit: str) -> str:
     unit : str
         Unit of a variable, for example ``um/K``.
     """
-    return unit.replace("um", "µm")
+    return {"degC": "°C", "percent": "%", "1": ""}.get(unit, unit.replace("um", "µm"))
 
 
 def p_value(p: float | None) -> str:

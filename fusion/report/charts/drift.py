@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
-from bokeh.models import Label, LinearColorMapper
+from bokeh.models import BoxAnnotation, Label, LinearColorMapper
 from bokeh.plotting import figure
 
 from fusion.report.charts.style import (
+    DIVERGING,
     MARKERS,
     Chart,
     add_band,
     add_colour_bar,
     add_hover,
+    add_ordered_lines,
+    add_series,
     add_zero_line,
+    fix_range,
     new_figure,
     ordered_colours,
+    palette,
+    shared_range,
     span_words,
 )
-from fusion.report.wording import number
-from interferometry.figures import ARROWS, COLOURS, hours_since_start
+from fusion.report.wording import join, number
+from interferometry.figures import ACCENT, ARROWS, COLOURS, INK, hours_since_start
 
 
 def plot_drift(drift: xr.Dataset, deviations: xr.Dataset) -> Chart:
@@ -49,22 +55,15 @@ def plot_drift(drift: xr.Dataset, deviations: xr.Dataset) -> Chart:
         add_band(
             drawn, hours[:, place], lines[:, place] - band[:, place], lines[:, place] + band[:, place], colours[rank]
         )
-    renderer = drawn.multi_line(
-        xs="hours", ys="drift", line_color="colour", line_width=1.6, hover_line_width=3.5,
-        source={
-            "hours": [hours[:, place] for place in order],
-            "drift": [lines[:, place] for place in order],
-            "colour": colours,
-            "position": position[order],
-        },
-    )  # fmt: skip
-    add_hover(
-        drawn, [("position", "@position{0.###} mm"), ("time", "$x{0.00} h"), ("drift", "$y{0.00} µm")], [renderer]
+    add_ordered_lines(
+        drawn,
+        [hours[:, place] for place in order],
+        [lines[:, place] for place in order],
+        position[order],
+        "position / mm",
     )
     for rank, place in ((0, order[0]), (position.size - 1, order[-1])):
         _name_end(drawn, hours[:, place], lines[:, place], f"{position[place]:g} mm", colours[rank])
-    mapper = LinearColorMapper(ordered_colours(256), low=float(position.min()), high=float(position.max()))
-    add_colour_bar(drawn, mapper, "position / mm", place="below")
     change = np.nanmean(lines[-1] - lines[0])
     far = np.nanargmax(np.nanmax(np.abs(lines), axis=0))
     seen = (
@@ -126,11 +125,9 @@ def plot_profile(drift: xr.Dataset, position: xr.DataArray) -> Chart:
         row = drift.sel(direction=direction)
         value, half = row["profile"].values, 2 * row["profile_u"].values
         add_band(drawn, x, value - half, value + half, COLOURS[direction])
-        source = {"x": x, "y": value, "half": half, "target": row["target"].values}
-        style = {"color": COLOURS[direction], "legend_label": ARROWS[direction]}
-        drawn.line("x", "y", source=source, line_width=1.6, **style)
-        points = drawn.scatter("x", "y", source=source, marker=MARKERS[direction], size=7, **style)
-        add_hover(drawn, [("position", "@x{0.###} mm"), (ARROWS[direction], "@y{0.00} ± @half{0.00} µm")], [points])
+        add_series(
+            drawn, x, value, name=ARROWS[direction], colour=COLOURS[direction], marker=MARKERS[direction], half=half
+        )
         columns[f"profile, {ARROWS[direction]} / µm"] = value
         columns[f"95 % band ±, {ARROWS[direction]} / µm"] = half
     rows = "; ".join(
@@ -139,3 +136,173 @@ def plot_profile(drift: xr.Dataset, position: xr.DataArray) -> Chart:
     )
     seen = f"Drift-free deviation over {span_words(x, 'mm')} of the axis: {rows}."
     return Chart(drawn, seen, columns)
+
+
+def plot_reversal(drift: xr.Dataset, position: xr.DataArray) -> Chart:
+    """Draw the reversal (positive minus negative approach) of every position with its 95 % interval.
+
+    Parameters
+    ----------
+    drift : Dataset
+        Group ``drift`` of deviations.nc.
+    position : (target,) DataArray
+        Target positions, mm.
+
+    Returns
+    -------
+    Chart
+    """
+    drawn = new_figure(x="position / mm", y="positive − negative approach / µm")
+    add_zero_line(drawn)
+    x, value, half = position.values.astype(float), drift["reversal"].values, 2 * drift["reversal_u"].values
+    add_series(drawn, x, value, name="reversal", colour=INK, line=False, marker="circle", half=half, legend=False)
+    apart = int((np.abs(value) > half).sum())
+    seen = f"Reversal of {x.size} positions: {span_words(value, 'µm')}; {apart} of them differ from zero by more than their 95 % interval."
+    return Chart(drawn, seen, {"position / mm": x, "reversal / µm": value, "95 % interval ± / µm": half})
+
+
+def plot_position_scatter(drift: xr.Dataset, position: xr.DataArray, flagged: set[int]) -> Chart:
+    """Draw the random scatter of every position and approach with its 95 % interval; flagged positions are shaded.
+
+    Parameters
+    ----------
+    drift : Dataset
+        Group ``drift`` of deviations.nc.
+    position : (target,) DataArray
+        Target positions, mm.
+    flagged : set of int
+        Targets that stand out.
+
+    Returns
+    -------
+    Chart
+    """
+    x = position.values.astype(float)
+    step = float(np.median(np.diff(np.sort(x)))) if x.size > 1 else 1.0
+    drawn = new_figure(x="position / mm", y="scatter s / µm")
+    for target in sorted(flagged):
+        place = float(position.sel(target=target))
+        drawn.add_layout(
+            BoxAnnotation(
+                left=place - 0.4 * step, right=place + 0.4 * step, fill_color=ACCENT, fill_alpha=0.12, level="underlay"
+            )
+        )
+    columns: dict[str, np.ndarray] = {"position / mm": x}
+    for shift, direction in zip((-0.12, 0.12), drift["direction"].values, strict=False):
+        value, half = (drift[name].sel(direction=direction).values for name in ("scatter", "scatter_u"))
+        add_series(
+            drawn, x + shift * step, value, name=ARROWS[direction], colour=COLOURS[direction], line=False,
+            marker=MARKERS[direction], half=2 * half,
+        )  # fmt: skip
+        columns[f"scatter, {ARROWS[direction]} / µm"] = value
+        columns[f"95 % interval ±, {ARROWS[direction]} / µm"] = 2 * half
+    fix_range(drawn, 0.0, 1.06 * float(np.nanmax(drift["scatter"] + 2 * drift["scatter_u"])))
+    places = join([f"{float(position.sel(target=target)):g} mm" for target in sorted(flagged)])
+    seen = f"Random scatter of {x.size} positions: {span_words(drift['scatter'], 'µm')}; " + (
+        f"marked as standing out: {places}." if flagged else "none is marked as standing out."
+    )
+    return Chart(drawn, seen, columns)
+
+
+def plot_drift_map(drift: xr.Dataset, position: xr.DataArray) -> Chart:
+    """Draw the drift as colours over cycle and position, mean of both approaches.
+
+    Parameters
+    ----------
+    drift : Dataset
+        Group ``drift`` of deviations.nc.
+    position : (target,) DataArray
+        Target positions, mm.
+
+    Returns
+    -------
+    Chart
+    """
+    return cycle_map(drift["drift"].mean("direction"), position, "drift / µm")
+
+
+def plot_deviation_map(deviations: xr.Dataset) -> Chart:
+    """Draw the readings as colours over cycle and position, mean of both approaches, each position about its mean over the cycles.
+
+    Parameters
+    ----------
+    deviations : Dataset
+        Content of deviations.nc.
+
+    Returns
+    -------
+    Chart
+    """
+    read = deviations["deviation"].mean("direction")
+    return cycle_map(read - read.mean("cycle"), deviations["position"], "deviation from the mean of the position / µm")
+
+
+def cycle_map(values: xr.DataArray, position: xr.DataArray, label: str) -> Chart:
+    """Draw values as colours over cycle and position; a value that is missing is left blank.
+
+    Parameters
+    ----------
+    values : (cycle, target) DataArray
+        Signed, in the unit of `label`.
+    position : (target,) DataArray
+        Target positions, mm.
+    label : str
+        "quantity / unit".
+
+    Returns
+    -------
+    Chart
+    """
+    order = np.argsort(position.values, kind="stable")
+    field = values.transpose("cycle", "target").values[:, order]
+    cycle, place = values["cycle"].values.astype(float), position.values[order].astype(float)
+    quantity, _, unit = label.rpartition(" / ")
+    low, high = shared_range(field, symmetrical=True)
+    mapper = LinearColorMapper(palette(DIVERGING), low=low, high=high, nan_color="#ffffff")
+    (left, right), (bottom, top) = edges(cycle), edges(place)
+    drawn = new_figure(
+        x="cycle", y="position / mm", height=300, x_range=(left[0], right[-1]), y_range=(bottom[0], top[-1])
+    )
+    drawn.grid.grid_line_color = None
+    across, along = field.shape
+    cells = drawn.quad(
+        left="left", right="right", bottom="bottom", top="top", line_color=None,
+        fill_color={"field": "value", "transform": mapper},
+        source={
+            "left": np.repeat(left, along), "right": np.repeat(right, along), "bottom": np.tile(bottom, across),
+            "top": np.tile(top, across), "value": field.ravel(), "cycle": np.repeat(cycle, along), "place": np.tile(place, across),
+        },
+    )  # fmt: skip
+    tips = [("cycle", "@cycle{0}"), ("position", "@place{0.[000]} mm"), (quantity, f"@value{{0.00}} {unit}")]
+    add_hover(drawn, tips, [cells])
+    add_colour_bar(drawn, mapper, label)
+    largest = np.unravel_index(np.nanargmax(np.abs(field)), field.shape)
+    seen = (
+        f"{quantity.capitalize()} of {across} cycles at {along} positions: {span_words(field, unit)}; the largest size is in cycle "
+        f"{cycle[largest[0]]:.0f} at {place[largest[1]]:g} mm."
+    )
+    columns = {
+        "cycle": np.repeat(cycle, along).astype(int),
+        "position / mm": np.tile(place, across),
+        label: field.ravel(),
+    }
+    return Chart(drawn, seen, columns)
+
+
+def edges(middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends of the cells about points along an axis: half-way to the neighbours.
+
+    Parameters
+    ----------
+    middle : (n,) ndarray
+        Rising.
+
+    Returns
+    -------
+    low, high : (n,) ndarray
+    """
+    if middle.size < 2:
+        return middle - 0.5, middle + 0.5
+    between = (middle[1:] + middle[:-1]) / 2
+    first, last = 2 * middle[0] - between[0], 2 * middle[-1] - between[-1]
+    return np.concatenate([[first], between]), np.concatenate([between, [last]])

@@ -9,20 +9,23 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from bokeh.models import (
+    BoxAnnotation,
     ColorBar,
     ColorMapper,
+    ColumnDataSource,
     FixedTicker,
     GlyphRenderer,
     HoverTool,
     LayoutDOM,
     Legend,
+    LinearColorMapper,
     PanTool,
     Range1d,
     WheelZoomTool,
 )
 from bokeh.plotting import figure
 
-from interferometry.figures import COLOURS, GRID, INK, MUTED
+from interferometry.figures import ACCENT, COLOURS, GRID, INK, MUTED
 
 #: Colours of named lines, each readable on white and told apart by colour-blind readers together with the dashes of `DASHES`.
 CATEGORIES = (COLOURS["positive"], COLOURS["negative"], "#6a3d9a", INK, "#4d7c0f", "#a0447f", "#1f66b0", "#7a5c00")
@@ -35,6 +38,8 @@ MARKERS = {"positive": "triangle", "negative": "inverted_triangle"}
 SEQUENTIAL, DIVERGING = "inferno", "RdBu_r"
 #: Share of the scale of ordered lines that is dark enough to be read on white (contrast of at least 3 : 1).
 _DARK_SHARE = 0.58
+#: Labels of logarithmic axes: 1, 2 and 5 of every decade.
+_LOG_TICKS = [step * 10.0**decade for decade in range(-6, 7) for step in (1, 2, 5)]
 _FONT = "system-ui, Segoe UI, Roboto, Helvetica Neue, DejaVu Sans, sans-serif"
 
 
@@ -111,6 +116,9 @@ def new_figure(
             axis_label_text_color=INK, major_label_text_font=_FONT, major_label_text_font_size="11px",
             major_label_text_color=INK, axis_line_color=MUTED, major_tick_line_color=MUTED, minor_tick_line_color=None,
         )  # fmt: skip
+    for axis, scale in ((drawn.xaxis, x_type), (drawn.yaxis, y_type)):
+        if scale == "log":
+            axis.ticker = FixedTicker(ticks=_LOG_TICKS)
     drawn.grid.grid_line_color = GRID
     if title:
         drawn.title.update(text_font=_FONT, text_font_size="13px", text_color=INK)
@@ -145,6 +153,111 @@ def add_hover(
         Whether the pointer must be on a mark, or only at its place along x.
     """
     drawn.add_tools(HoverTool(tooltips=list(tips), renderers=list(renderers), mode=mode))
+
+
+def add_series(
+    drawn: figure,
+    x: np.ndarray,
+    y: np.ndarray,
+    *,
+    name: str,
+    colour: str,
+    dash: str = "solid",
+    line: bool = True,
+    marker: str | None = None,
+    half: np.ndarray | None = None,
+    width: float = 1.7,
+    size: float = 7.0,
+    legend: bool = True,
+) -> None:
+    """Draw a named series with its values under the pointer.
+
+    Parameters
+    ----------
+    drawn : figure
+        The chart; the tips take quantity and unit from the labels of its axes.
+    x, y : (n,) ndarray
+        Units of the axes.
+    name : str
+        For legend and tips.
+    colour : str
+        CSS colour.
+    dash : str
+        Dash of the line, see `DASHES`.
+    line : bool
+        Whether the points are joined.
+    marker : str, optional
+        Bokeh marker of every point; None: no marks.
+    half : (n,) ndarray, optional
+        Half length of the interval about each point, unit of y; None: no intervals.
+    width : float
+        Of the line, CSS px.
+    size : float
+        Of the marks, CSS px.
+    legend : bool
+        Whether the legend names it.
+    """
+    source = ColumnDataSource({"x": np.asarray(x), "y": np.asarray(y)})
+    named: dict[str, Any] = {"legend_label": name} if legend else {}
+    parts = []
+    if half is not None:
+        source.data["half"] = np.asarray(half)
+        source.data["low"], source.data["high"] = np.asarray(y) - half, np.asarray(y) + half
+        drawn.segment("x", "low", "x", "high", source=source, line_color=colour, line_width=1.3, **named)
+    if line:
+        parts.append(drawn.line("x", "y", source=source, line_color=colour, line_dash=dash, line_width=width, **named))
+    if marker is not None:
+        parts.append(drawn.scatter("x", "y", source=source, marker=marker, size=size, color=colour, **named))
+    (along, unit), (quantity, y_unit) = (_parts(axis.axis_label) for axis in (drawn.xaxis[0], drawn.yaxis[0]))
+    shown = "@y{0.000}" + (" ± @half{0.000}" if half is not None else "")
+    add_hover(drawn, [("", name), (along, f"@x{{0.[000]}} {unit}"), (quantity, f"{shown} {y_unit}")], parts[-1:])
+
+
+def _parts(label: str) -> tuple[str, str]:
+    """Return quantity and unit of the label of an axis."""
+    quantity, _, unit = label.partition(" / ")
+    return quantity, unit.removesuffix(" (logarithmic)")
+
+
+def add_ordered_lines(
+    drawn: figure, xs: Sequence[np.ndarray], ys: Sequence[np.ndarray], order: np.ndarray, label: str
+) -> None:
+    """Draw one line for each value of an ordered quantity, such as a cycle, with colour bar and values under the pointer.
+
+    Parameters
+    ----------
+    drawn : figure
+        The chart.
+    xs, ys : sequence of (n,) ndarray
+        Units of the axes, one pair for each line, in rising `order`.
+    order : (lines,) ndarray
+        The quantity.
+    label : str
+        "quantity / unit" of the quantity.
+    """
+    (along, x_unit), (quantity, y_unit) = (_parts(axis.axis_label) for axis in (drawn.xaxis[0], drawn.yaxis[0]))
+    source = {"xs": list(xs), "ys": list(ys), "order": np.asarray(order, float), "colour": ordered_colours(len(order))}
+    lines = drawn.multi_line(
+        "xs", "ys", line_color="colour", line_width=1.4, hover_line_width=3.5, hover_line_color="colour", source=source
+    )
+    name, unit = _parts(label)
+    tips = [(name, f"@order{{0.[000]}} {unit}"), (along, f"$x{{0.[00]}} {x_unit}"), (quantity, f"$y{{0.00}} {y_unit}")]
+    add_hover(drawn, tips, [lines])
+    low, high = float(np.min(order)), float(np.max(order))
+    add_colour_bar(drawn, LinearColorMapper(ordered_colours(256), low=low, high=high if high > low else low + 1), label)
+
+
+def add_hold_out(drawn: figure, low: float, high: float) -> None:
+    """Shade the part of a test that took no part in any choice.
+
+    Parameters
+    ----------
+    drawn : figure
+        The chart.
+    low, high : float
+        Its ends along x.
+    """
+    drawn.add_layout(BoxAnnotation(left=low, right=high, fill_color=ACCENT, fill_alpha=0.08, level="underlay"))
 
 
 def add_zero_line(drawn: figure) -> None:
