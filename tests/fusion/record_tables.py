@@ -101,4 +101,5 @@ def record_of(
         duplicates=(),
         chained=np.arange(blocks) * parts // blocks,
         gaps={},
+        driver_sizes=dict.fromkeys(drivers or {}, (1.0, "1")),
     )

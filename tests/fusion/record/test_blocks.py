@@ -16,6 +16,7 @@ def test_blocks_hold_the_means_of_their_samples(rng):
     np.testing.assert_allclose(record.displacement[7], displacement[28:32].mean(axis=0), rtol=1e-12)
     np.testing.assert_allclose(record.temperature[7], temperature[28:32].mean(axis=0), rtol=1e-12)
     assert record.seconds[7] == pytest.approx(np.mean(np.arange(28, 32) * 60.0))
+    assert record.driver_sizes["speed"][0] == 3000.0
     np.testing.assert_allclose(record.drivers["speed"][2][:50], np.zeros(50))
     assert record.drivers["speed"][1].max() == 1.0
 
