@@ -69,4 +69,4 @@ def test_a_log_is_described_with_its_range(tmp_path: Path) -> None:
     path.write_text("\n".join([head, *rows]) + "\n")
     lines = describe_file(path)
     assert lines[0] == f"{path}: environment, 10 rows, 2026-03-09 06:00 UTC to 2026-03-09 06:09 UTC"
-    assert "  air_temperature 20.00 to 20.90 degC" in lines
+    assert "  air_temperature 20.00 to 20.90 °C" in lines
