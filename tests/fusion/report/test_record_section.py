@@ -17,7 +17,13 @@ def record(channels: int = 1, drivers: int = 1) -> xr.Dataset:
     time = np.datetime64("2026-01-05T06:00", "ns") + np.arange(4) * np.timedelta64(60, "s")
     return xr.Dataset(
         {
-            "displacement": (("time", "channel"), np.zeros((4, channels))),
+            **{
+                name: (("time", "channel"), np.zeros((4, channels)))
+                for name in ("displacement", "predicted_declared", "predicted_final")
+            },
+            "predicted_u": ("channel", np.full(channels, 0.1)),
+            "temperature": (("time", "sensor"), np.full((4, 2), 20.0)),
+            "sealed": ("time", [False, False, False, True]),
             "driver": (("time", "driver_name"), np.zeros((4, drivers))),
         },
         coords={
@@ -25,6 +31,7 @@ def record(channels: int = 1, drivers: int = 1) -> xr.Dataset:
             "channel": ["X", *(f"c{k}" for k in range(1, channels))],
             "sensor": ["t1", "t2"],
             "driver_name": ["speed"] * drivers,
+            "effect": [],
         },
         attrs={"block_s": 60.0},
     )
@@ -45,7 +52,9 @@ def test_the_page_stays_readable_with_many_channels() -> None:
     told = describe_record(RESULTS, {"inputs": {}}, record(channels=9, drivers=0))
     assert (len(told["shown"]), told["omitted"]) == (6, 3)
     assert "driver" not in told["sentences"][0]
-    assert "drivers" not in draw_record(record(channels=9, drivers=0))
+    charts = draw_record(record(channels=9, drivers=0))
+    assert "drivers" not in charts
+    assert len([name for name in charts if name.startswith("prediction_")]) == 6
 
 
 def test_a_candidate_that_was_tried_and_not_chosen_is_rejected_whatever_the_sentence() -> None:
