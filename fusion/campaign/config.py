@@ -23,6 +23,7 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 from fusion.campaign.messages import describe, find_line, key_lines, suggest
 from fusion.campaign.needed_tables import check_tables
 from fusion.campaign.quantities import split_uncertainty
+from fusion.campaign.standard_test import AcceptanceTable, ReportTable, UncertaintyTable
 from fusion.campaign.value_types import (
     Celsius,
     Feed,
@@ -354,6 +355,19 @@ class InterferometryTable(_Measured):
     material_temperature: Literal["logged", "camera"] = "logged"
     material_sensor_mm: tuple[Millimetres, Millimetres] | None = Field(default=None, alias="material_sensor")
     environment_factor_mm: tuple[Millimetres, Millimetres] | None = Field(default=None, alias="environment_factor")
+    uncertainty: UncertaintyTable = UncertaintyTable()
+
+    @model_validator(mode="after")
+    def _coefficient_u_once(self) -> InterferometryTable:
+        """Refuse two standard uncertainties of one coefficient."""
+        one, other = self.expansion_coefficient_u_ppm_per_K, self.uncertainty.expansion_coefficient_ppm_per_K
+        if one is not None and other is not None and one != other:
+            text = (
+                f"the standard uncertainty of the expansion coefficient is {one:g} ppm/K beside the coefficient and {other:g} ppm/K under "
+                "[interferometry.uncertainty]; state it once"
+            )
+            raise PydanticCustomError("twice", "{text}", {"text": text})
+        return self
 
 
 class DriversTable(_Table):
@@ -439,6 +453,8 @@ class Campaign(_Table):
     record: RecordTable | None = None
     model: ModelTable = ModelTable()
     accept: AcceptTable = AcceptTable()
+    acceptance: AcceptanceTable = AcceptanceTable()
+    report: ReportTable = ReportTable()
 
     @property
     def folder(self) -> Path:

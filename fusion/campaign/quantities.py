@@ -16,12 +16,13 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "degC": {"degC": (1.0, 0.0), "K": (1.0, -273.15), "degF": (5.0 / 9.0, -160.0 / 9.0)},
     "K": {"mK": (1e-3, 0.0), "K": (1.0, 0.0), "degC": (1.0, 0.0), "degF": (5.0 / 9.0, 0.0)},
     "s": {"ms": (1e-3, 0.0), "s": (1.0, 0.0), "min": (60.0, 0.0), "h": (3600.0, 0.0)},
+    "ppm": {"ppb": (1e-3, 0.0), "ppm": (1.0, 0.0), "um/m": (1.0, 0.0), "%": (1e4, 0.0)},
     "ppm/K": {"ppm/K": (1.0, 0.0), "um/m/K": (1.0, 0.0), "1/K": (1e6, 0.0)},
     "mm/min": {"mm/min": (1.0, 0.0), "m/min": (1e3, 0.0), "mm/s": (60.0, 0.0)},
 }  # fmt: skip
 _SPELLINGS = {
     "µm": "um", "μm": "um", "°C": "degC", "℃": "degC", "C": "degC", "°F": "degF", "F": "degF", "sec": "s",
-    "ppm/degC": "ppm/K", "ppm/°C": "ppm/K", "um/(m K)": "um/m/K", "µm/m/K": "um/m/K",
+    "µm/m": "um/m", "μm/m": "um/m", "ppm/degC": "ppm/K", "ppm/°C": "ppm/K", "um/(m K)": "um/m/K", "µm/m/K": "um/m/K",
     "K^-1": "1/K",
 }  # fmt: skip
 #: Units written out, in any case.
@@ -32,11 +33,12 @@ _WORDS = {
     "minutes": "min", "hr": "h", "hrs": "h", "hour": "h", "hours": "h",
 }  # fmt: skip
 _EXAMPLES = {
-    "mm": "5 mm", "um": "5 um", "degC": "22 degC", "K": "1 K", "s": "37 s", "ppm/K": "11.7 ppm/K", "mm/min": "300 mm/min",
+    "mm": "5 mm", "um": "5 um", "degC": "22 degC", "K": "1 K", "s": "37 s",
+    "ppm": "0.25 ppm", "ppm/K": "11.7 ppm/K", "mm/min": "300 mm/min",
 }  # fmt: skip
 _KINDS = {
     "mm": "a length", "um": "a displacement", "degC": "a temperature", "K": "a temperature difference", "s": "a time",
-    "ppm/K": "an expansion coefficient", "mm/min": "a feed rate",
+    "ppm": "a share of a length", "ppm/K": "an expansion coefficient", "mm/min": "a feed rate",
 }  # fmt: skip
 #: Between a value and its standard uncertainty.
 _PLUS_MINUS = re.compile(r"\s*(?:\+/?-|±)\s*")
@@ -67,7 +69,7 @@ def conversion(unit: str, target: str) -> tuple[float, float]:
     unit : str
         Unit as it was written.
     target : str
-        Canonical unit: mm, um, degC, K (a difference), s, ppm/K or mm/min.
+        Canonical unit: mm, um, degC, K (a difference), s, ppm, ppm/K or mm/min.
 
     Returns
     -------

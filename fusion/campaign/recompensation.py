@@ -9,16 +9,15 @@ import xarray as xr
 
 from fusion.alignment.align import AxisGeometry, MeasuredLine, interpolate_series
 from fusion.campaign.config import CampaignError, InterferometryTable
+from fusion.campaign.iso_budget import StatedBudget, state_budget
 from fusion.products.results import Notice
 from interferometry.compensation import (
-    REFERENCE_TEMPERATURE_DEGC,
     SensorUncertainty,
     air_index,
     compensate,
     dead_path_error_um,
     followed_factor_um,
 )
-from interferometry.iso230 import Iso230Budget
 
 _NO_LOG = "log air temperature, pressure and humidity, and name the file as [interferometry] environment"
 
@@ -35,14 +34,14 @@ class Compensated:
     ----------
     deviations : Dataset
         Keeps ``interferometry.contract.DEVIATIONS``.
-    budget : Iso230Budget or None
-        Uncertainty contributions to ISO 230-2 values; None for readings as recorded.
+    budget : StatedBudget
+        Uncertainty contributions to ISO 230-2 values.
     notices : list of Notice
         What was done, or could not be done.
     """
 
     deviations: xr.Dataset
-    budget: Iso230Budget | None = None
+    budget: StatedBudget
     notices: list[Notice] = field(default_factory=list)
 
 
@@ -101,13 +100,17 @@ def compensate_readings(
                 "add it, or leave them out"
             )
         corrected, notices = _correct_dead_path(deviations, environment, table.dead_path_mm)
-        return Compensated(corrected, None, notices)
+        return Compensated(corrected, state_budget(table), notices)
     if environment is None:
         raise RecompensationError(f'[interferometry] compensation = "redo" needs the air: {_NO_LOG}')
     log, coefficient = environment.dropna("time"), table.expansion_coefficient_ppm_per_K
     stated = _stated_factor_um(deviations, table)
     applied = stated or followed_factor_um(deviations, log, expansion_coefficient_ppm_per_K=coefficient)
-    sensors = SensorUncertainty() if material is None else SensorUncertainty(material_temperature_K=material.u_K)
+    stated_budget = state_budget(table, camera_u_K=None if material is None else material.u_K)
+    sensors = SensorUncertainty(
+        material_temperature_K=stated_budget.budget.material_temperature_K,
+        expansion_coefficient_ppm_per_K=stated_budget.budget.expansion_coefficient_ppm_per_K,
+    )
     redone = compensate(
         deviations,
         log,
@@ -118,14 +121,7 @@ def compensate_readings(
         away=table.dead_path_mm >= 0,
         uncertainty=sensors,
     )
-    temperature = log["material_temperature"] if material is None else material.temperature
-    budget = Iso230Budget(
-        machine_temperature_K=sensors.material_temperature_K,
-        expansion_coefficient_ppm_per_K=sensors.expansion_coefficient_ppm_per_K,
-        difference_from_20_degC_K=abs(float(temperature.mean()) - REFERENCE_TEMPERATURE_DEGC),
-        nominal_expansion_ppm_per_K=coefficient,
-    )
-    return Compensated(redone, budget, [_redone(redone, stated is not None, material)])
+    return Compensated(redone, stated_budget, [_redone(redone, stated is not None, material)])
 
 
 def _stated_factor_um(deviations: xr.Dataset, table: InterferometryTable) -> tuple[float, float] | None:

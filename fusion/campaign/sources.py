@@ -13,8 +13,8 @@ from fusion.alignment.align import AxisGeometry, cycle_bounds
 from fusion.attribution.randomised_duty import DutyLaw
 from fusion.attribution.thermal_modes import Region
 from fusion.campaign.config import Campaign, InterferometryTable, PlanTable, ThermographyTable
+from fusion.campaign.iso_budget import StatedBudget
 from fusion.products.results import Notice
-from interferometry.iso230 import Iso230Budget
 from thermography.io.flir import FrameReference
 from thermography.registration.lens import Lens
 from thermography.registration.plan import Fiducial, PlanGrid
@@ -127,13 +127,13 @@ class LaserInputs(Inputs):
         ``[interferometry]`` of the campaign file.
     deviations : Dataset
         Readings that keep ``interferometry.contract.DEVIATIONS``.
-    iso_budget : Iso230Budget or None
-        Uncertainty contributions to ISO 230-2 values; None for those of the readings as recorded.
+    iso_budget : StatedBudget
+        Uncertainty contributions to ISO 230-2 values.
     """
 
     interferometry: InterferometryTable
     deviations: xr.Dataset
-    iso_budget: Iso230Budget | None = None
+    iso_budget: StatedBudget
 
     @property
     def is_recompensated(self) -> bool:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import xarray as xr
 
 from fusion.alignment.align import align, align_logs
 from fusion.campaign.inputs import counted, listed
+from fusion.campaign.iso_budget import material_by_cycle
 from fusion.campaign.sources import LaserInputs, Source
 from fusion.consistency.place import find_gaps, gap_words, in_gaps
 from fusion.consistency.readings import find_gross_readings
+from fusion.pipeline.iso230.evaluation import evaluate_standard
 from fusion.products.grouped import group, joined
 from fusion.products.results import Notice, Outcome
 from fusion.report.wording import moment
-from interferometry import iso230, neighbours
+from interferometry import neighbours
 from interferometry.deviations import OUTLIER
 from interferometry.drift.estimate import estimate_drift, flag_outliers
 
@@ -48,7 +48,12 @@ def evaluate_interferometry(source: LaserInputs) -> Outcome:
     drift = estimate_drift(deviations)
     deviations = flag_outliers(deviations, drift)
     comparison = neighbours.compare(deviations, drift)
-    windows = iso230.evaluate_windows(deviations, budget=source.iso_budget)
+    windows, settled, standard = evaluate_standard(
+        deviations,
+        source.iso_budget,
+        drift=drift["drift"],
+        material_degC=material_by_cycle(deviations, source.environment),
+    )
     dataset = joined(
         deviations,
         conventional=neighbours.evaluate_conventional(deviations),
@@ -56,13 +61,14 @@ def evaluate_interferometry(source: LaserInputs) -> Outcome:
         comparison=comparison,
         chart=neighbours.build_chart(deviations),
         iso=windows,
+        settled=settled,
         drift=drift,
     )
     time = deviations["time"].values[np.isfinite(deviations["deviation"].values)]
     zone = source.campaign.zone_of("interferometry")
     parts = {
         "time": {"first": utc(time.min()), "last": utc(time.max()), "zone": zone},
-        "iso230": _iso_part(windows),
+        "iso230": standard,
         "neighbours": {
             "conventional_s_um": by_direction(comparison["conventional"]),
             "pair_s_um": by_direction(comparison["differenced"]),
@@ -128,14 +134,6 @@ def _reading_notices(deviations: xr.Dataset, drift: xr.Dataset, zone: str | None
             )
         )
     return notices
-
-
-def _iso_part(windows: xr.Dataset) -> dict[str, Any]:
-    """Return the axis values of the first window, as the standard's test would have found them."""
-    first = windows.isel(window=0)
-    names = (*iso230.QUANTITIES, "mean_reversal")
-    values = {f"{name}_um": {"value": float(first[name]), "u": float(first[f"{name}_u"])} for name in names}
-    return {"window": str(first["window"].values), **values, "B_of_scatter_um": float(first["B_of_scatter"])}
 
 
 def by_direction(values: xr.DataArray) -> dict[str, list[float]]:

@@ -49,7 +49,7 @@ FILES = {
 PAGES = ("results.json", "provenance.json", "report.html")
 
 #: Number of the products' layout: stages that were kept in another one are computed again.
-PRODUCT_LAYOUT = 4
+PRODUCT_LAYOUT = 5
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """Several results on the axes of one Dataset, each behind a prefix: the parts of deviations.nc, and the closed loop in fusion.nc.
 
-In deviations.nc these are conventional, neighbours, comparison, chart, iso and drift; in the root of fusion.nc it is the loop. Most of
-their variables share the coordinates of the readings, so that plain arithmetic between them works. The variables are prefixed,
+In deviations.nc these are conventional, neighbours, comparison, chart, iso, settled and drift; in the root of fusion.nc it is the loop.
+Most of their variables share the coordinates of the readings, so that plain arithmetic between them works. The variables are prefixed,
 dimensions and coordinates are not: they stay on the Dataset under their own names. The correlation, which has axes of its own, is a group
 of fusion.nc without a prefix; see `fusion.products.store.write_dataset`.
 """

@@ -85,11 +85,49 @@ class AlignmentPart(ResultPart):
     """Camera clock minus laser clock, s; u is 0 where the campaign states the offset and null where it is assumed."""
 
 
-class Iso230Part(ResultPart):
-    """Axis values by ISO 230-2:2014, clause 4, of one window of cycles."""
+class Iso230Contribution(ResultPart):
+    """One input of the uncertainty budget of ISO 230-2 values."""
+
+    contributor: str
+    """Name of the input."""
+    u: Number
+    """Its standard uncertainty (k = 1), in ``unit``; null where it is not one number."""
+    unit: str
+    """Unit of ``u``."""
+    origin: str
+    """Whether it was stated, assumed or measured, and how."""
+    A_um: Number
+    """Contribution to the standard uncertainty of A, um."""
+    R_um: Number
+    """Contribution to the standard uncertainty of R, um."""
+    E_um: Number
+    """Contribution to the standard uncertainty of E, um."""
+    M_um: Number
+    """Contribution to the standard uncertainty of M, um."""
+    B_um: Number
+    """Contribution to the standard uncertainty of B, um."""
+    mean_reversal_um: Number
+    """Contribution to the standard uncertainty of the mean reversal error, um."""
+
+
+class Iso230Direction(ResultPart):
+    """Axis values of one direction of approach; null where it was not measured."""
+
+    A_um: Quantity
+    """Unidirectional positioning accuracy, um."""
+    R_um: Quantity
+    """Unidirectional positioning repeatability, um."""
+    E_um: Quantity
+    """Unidirectional systematic positioning error, um."""
+
+
+class Iso230Window(ResultPart):
+    """Axis values by ISO 230-2:2014, clause 3, of one window of cycles, with their uncertainty budget."""
 
     window: str
     """Cycles that were evaluated."""
+    cycles: tuple[int, ...]
+    """Numbers of these cycles."""
     B_um: Quantity
     """Reversal error B of the axis, um."""
     R_um: Quantity
@@ -104,6 +142,52 @@ class Iso230Part(ResultPart):
     """Mean reversal error of the axis with its sign, um."""
     B_of_scatter_um: Number
     """B that scatter alone gives in half of such tests of an axis without reversal error, um."""
+    positive: Iso230Direction
+    """Values of the approach in positive direction."""
+    negative: Iso230Direction
+    """Values of the approach in negative direction."""
+    u_without_sampling_um: Mapping[str, Number]
+    """Standard uncertainty of A, R, E, M, B and mean_reversal without the sampling of the cycles, um; that of each value holds it."""
+    contributions: tuple[Iso230Contribution, ...]
+    """Inputs of the budget."""
+
+
+class Iso230Range(ResultPart):
+    """Smallest and largest value of a quantity over the windows of a test."""
+
+    lowest: Number
+    """Smallest value, um."""
+    highest: Number
+    """Largest value, um."""
+
+
+class Iso230Part(ResultPart):
+    """Axis values by ISO 230-2:2014, clause 3; those at this level belong to the first window of cycles, which may be a cold start."""
+
+    window: str
+    """Cycles of the values at this level: the first window."""
+    B_um: Quantity
+    """Reversal error B of the axis, um."""
+    R_um: Quantity
+    """Bidirectional positioning repeatability R, um."""
+    E_um: Quantity
+    """Bidirectional systematic positioning error E, um."""
+    M_um: Quantity
+    """Mean bidirectional positioning error M, um."""
+    A_um: Quantity
+    """Bidirectional positioning accuracy A, um."""
+    mean_reversal_um: Quantity
+    """Mean reversal error of the axis with its sign, um."""
+    B_of_scatter_um: Number
+    """B that scatter alone gives in half of such tests of an axis without reversal error, um."""
+    settled: Iso230Window | None = None
+    """The most settled window of the second half of the test, which shows the warmed-up axis: the values to quote."""
+    settled_rule: str = ""
+    """How that window was chosen."""
+    first: Iso230Window | None = None
+    """The first window, with its budget."""
+    range_um: Mapping[str, Iso230Range] = Field(default_factory=dict)
+    """Range of A, R, E, M and B over all windows of the standard's number of cycles, um."""
 
 
 class NeighboursPart(ResultPart):

@@ -6,7 +6,7 @@ import numpy as np
 
 from fusion.diagnosis.causes import CAUSES
 from fusion.products.results_attribution import CorrelationPart
-from fusion.products.results_axis import AnomalyPart, DriftPart, Iso230Part
+from fusion.products.results_axis import AnomalyPart, DriftPart, Iso230Part, Iso230Window
 from fusion.products.results_inputs import Figures
 from fusion.products.results_loop import Loop, StepPart
 from fusion.report.wording import BASELINES, join, number, p_value, place, quantity
@@ -21,30 +21,41 @@ ISO230_TERMS = {
 }
 
 
-def iso230_values(iso: Iso230Part) -> dict[str, str]:
+def quoted_window(iso: Iso230Part) -> Iso230Part | Iso230Window:
+    """Return the window whose values are quoted: the most settled one, the first of results that hold no other.
+
+    Parameters
+    ----------
+    iso : Iso230Part
+        The part ``iso230`` of the results.
+    """
+    return iso if iso.settled is None else iso.settled
+
+
+def iso230_values(iso: Iso230Part | Iso230Window) -> dict[str, str]:
     """Return the axis values with their expanded uncertainty (k = 2) by symbol, µm.
 
     Parameters
     ----------
-    iso : Iso230Part
-        The part ``iso230`` of the results.
+    iso : Iso230Part or Iso230Window
+        A window of the part ``iso230`` of the results.
     """
     return {symbol: quantity(getattr(iso, f"{symbol}_um"), "µm") for symbol in ISO230_TERMS}
 
 
-def reversal_note(iso: Iso230Part) -> str:
-    """Return one sentence on what B means beside the scatter of the readings; empty where the approaches were not compared.
+def reversal_note(iso: Iso230Part | Iso230Window) -> str:
+    """Return what B means beside the scatter of the readings; empty where the approaches were not compared.
 
     Parameters
     ----------
-    iso : Iso230Part
-        The part ``iso230`` of the results.
+    iso : Iso230Part or Iso230Window
+        A window of the part ``iso230`` of the results.
     """
     if iso.B_of_scatter_um is None:
         return ""
     return (
-        f"B is the largest of noisy values: scatter alone gives {number(iso.B_of_scatter_um, 2)} µm in half of such tests of an axis "
-        f"without reversal error, which its uncertainty does not hold. The mean reversal error, "
+        "B is the largest |B_i| of the positions, and so the largest of noisy values: scatter alone gives "
+        f"{number(iso.B_of_scatter_um, 2)} µm in half of such tests of an axis without reversal error. The mean reversal error, "
         f"{quantity(iso.mean_reversal_um, 'µm')}, is free of that."
     )
 

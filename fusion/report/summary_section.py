@@ -25,9 +25,10 @@ from fusion.report.findings import (
     anomaly_figures,
     anomaly_place,
     iso230_values,
-    reversal_note,
+    quoted_window,
     standing_out,
 )
+from fusion.report.iso230_section import contained_sentence, describe_iso230
 from fusion.report.model_section import (
     DECIDED_BEFORE,
     describe_candidates,
@@ -68,7 +69,10 @@ _GLOSSARY = (
         "Neighbour difference",
         "Difference of readings at adjacent positions of one pass; its scatter contains hardly any drift.",
     ),
-    ("Reversal error B", "Difference of the mean deviations of both approaches, positive minus negative."),
+    (
+        "Reversal error B_i and B",
+        "B_i: difference of the mean deviations of both approaches at a position, positive minus negative. B: the largest |B_i|.",
+    ),
     (
         "Held-out error",
         "Root mean square error on cycles that took no part in fitting: only this says whether a model predicts.",
@@ -159,8 +163,7 @@ def describe_campaign(
         "positions": None if deviations is None else _positions_table(deviations),
         "neighbours": "" if results.neighbours is None else _neighbours_text(results.neighbours),
         "comparison": None if deviations is None else _comparison_table(deviations),
-        "iso230": None if results.iso230 is None else _iso230_table(results),
-        "reversal": "" if results.iso230 is None else reversal_note(results.iso230),
+        "iso230": None if results.iso230 is None else describe_iso230(results.iso230),
         "anomalies": _anomalies(results),
         "correlation": correlation,
         "joint": None if joint is None else {**joint, "table": _joint_table(joint)},
@@ -223,12 +226,13 @@ def _numbers(results: Results, deviations: xr.Dataset | None, fields: xr.Dataset
         sigma = float(drift["sigma"])
         add("Scatter of single readings", f"{number(sigma, 2)} µm", "standard deviation, drift subtracted")
     if results.iso230 is not None:
-        values = iso230_values(results.iso230)
+        quoted = quoted_window(results.iso230)
+        values = iso230_values(quoted)
         for symbol in _KEY_VALUES:
             add(
                 ISO230_TERMS[symbol],
                 values[symbol],
-                f"{results.iso230.window} {condition(results.inputs, 'positions')}".rstrip(),
+                f"{quoted.window} {condition(results.inputs, 'positions')}".rstrip(),
             )
     if fields is not None:
         rise = fields["temperature_rise"].isel(cycle=-1)
@@ -433,14 +437,6 @@ def _neighbours_text(part: NeighboursPart) -> str:
     )
 
 
-def _iso230_table(results: Results) -> Table:
-    """Return the axis values in the terms of the standard."""
-    assert results.iso230 is not None
-    values = iso230_values(results.iso230)
-    rows = [[term, values[symbol]] for symbol, term in ISO230_TERMS.items()]
-    return table([Words(results.iso230.window), "Value (k = 2)"], rows)
-
-
 def _anomalies(results: Results) -> list[dict[str, Any]]:
     """Return every position that stands out, with its evidence."""
     described = []
@@ -491,9 +487,10 @@ def _uncertainty(results: Results, fields: xr.Dataset | None) -> list[str]:
         sentences.append(
             "Profile and drift come from one estimate over all readings at their own times (generalised least squares under a "
             "random drift); their uncertainty contains the noise of the readings and what the drift could have done between "
-            "them. It does not contain the laser's own calibration, cosine error or expansion coefficient; those enter the "
-            "ISO 230-2 values."
+            "them. It does not contain errors of the laser, its alignment, the temperature of the material or the expansion coefficient."
         )
+    if results.iso230 is not None and results.iso230.settled is not None:
+        sentences.append(f"ISO 230-2 values: {contained_sentence(results.iso230.settled)}")
     if fields is not None:
         sentences.append(
             "Temperatures hold for the emissivity that the campaign states. A constant error of the camera cancels in the rise; an error "

@@ -29,6 +29,7 @@ from fusion.report.findings import (
     baseline_errors,
     hold_out_errors,
     iso230_values,
+    quoted_window,
     randomised_causes,
     scatter_range,
     step_errors,
@@ -85,10 +86,10 @@ def summary_rows(results: Results) -> list[tuple[str, str]]:
     if results.registration is not None:
         rows.append(("registration", _registration(results.registration)))
     if results.iso230 is not None:
-        values = iso230_values(results.iso230)
+        quoted = quoted_window(results.iso230)
+        values = iso230_values(quoted)
         rows += [
-            (f"{symbol} ({results.iso230.window})", _under(values[symbol], results, "positions"))
-            for symbol in ("A", "R", "B")
+            (f"{symbol} ({quoted.window})", _under(values[symbol], results, "positions")) for symbol in ("A", "R", "B")
         ]
     if results.drift is not None:
         rows.append(("scatter per position", _under(scatter_range(results.drift), results, "positions")))

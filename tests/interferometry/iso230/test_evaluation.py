@@ -1,4 +1,4 @@
-"""ISO 230-2 against four published tests, against arithmetic by hand, and its uncertainty against Monte Carlo."""
+"""ISO 230-2 against four published tests and against arithmetic by hand; windows along a test."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from interferometry.deviations import build_deviations
 from interferometry.io.readers import read_deviations
-from interferometry.iso230 import Iso230Budget, budget_table, evaluate_iso230, evaluate_windows
+from interferometry.iso230 import Iso230Budget, evaluate_iso230, evaluate_windows, settled_window
+from tests.interferometry.iso230.made_tests import by_hand, test_made
 from tests.interferometry.simulated_campaigns import simulate
 
 MOTION = "anderssandstrom__ecmc_target_muts_logger/b02"
@@ -33,30 +33,6 @@ PRINTED_ONE_WAY = {
 }
 #: The reports print micrometres with two decimals.
 PRINTED_TOLERANCE = 0.0051
-
-
-def test_made(x: np.ndarray) -> xr.Dataset:
-    """A test from (cycle, direction, target) deviations in um."""
-    time = np.full(x.shape, np.datetime64("NaT", "ns"))
-    return build_deviations(range(1, len(x) + 1), range(1, x.shape[2] + 1), np.arange(x.shape[2]) * 10.0, x, time)
-
-
-test_made.__test__ = False  # type: ignore[attr-defined]
-
-
-def by_hand(x: np.ndarray) -> dict[str, float]:
-    """The axis quantities straight from the standard's definitions."""
-    mean, s = x.mean(axis=0), x.std(axis=0, ddof=1)
-    b = mean[0] - mean[1]
-    r = np.max([2 * s[0] + 2 * s[1] + abs(b), 4 * s[0], 4 * s[1]], axis=0)
-    both = mean.mean(axis=0)
-    return {
-        "B": np.abs(b).max(),
-        "R": r.max(),
-        "E": mean.max() - mean.min(),
-        "M": np.ptp(both),
-        "A": (mean + 2 * s).max() - (mean - 2 * s).min(),
-    }
 
 
 @pytest.mark.real_data
@@ -158,73 +134,6 @@ def test_windows_show_how_drift_enters_repeatability_and_accuracy(rng: np.random
     assert float(windows["A"][-1]) > float(windows["A"][:-1].max())
 
 
-def test_uncertainty_agrees_with_repeated_tests() -> None:
-    rng = np.random.default_rng(7)
-    profile = np.array([[0.0, 3.0, 9.0, 20.0], [4.0, 8.0, 12.0, 26.0]])
-    repeated = [by_hand(profile + rng.normal(0, 0.5, (20, 2, 4))) for _ in range(2000)]
-    zero = Iso230Budget(device_ppm=0.0)
-    stated = evaluate_iso230(test_made(profile + rng.normal(0, 0.5, (20, 2, 4))), budget=zero)
-    for name in ("B", "E", "M", "A"):
-        spread = np.std([one[name] for one in repeated], ddof=1)
-        # One test knows its own s to 1/sqrt(2 * 19) = 16 %; the extremes over positions add a little.
-        assert float(stated[f"{name}_u"]) == pytest.approx(spread, rel=0.45)
-
-
-def test_every_quantity_has_an_uncertainty_in_both_directions_that_repeated_tests_confirm() -> None:
-    rng = np.random.default_rng(11)
-    profile = np.array([[0.0, 3.0, 9.0, 20.0], [4.0, 8.0, 12.0, 26.0]])
-    zero = Iso230Budget(device_ppm=0.0)
-    tests = [evaluate_iso230(test_made(profile + rng.normal(0, 0.5, (20, 2, 4))), budget=zero) for _ in range(60)]
-    values = [name for name in tests[0].data_vars if f"{name}_u" in tests[0]]
-    assert len(values) == 15
-    for name in values:
-        spread = np.std([one[name].values for one in tests], axis=0, ddof=1)
-        stated = np.mean([one[f"{name}_u"].values for one in tests], axis=0)
-        assert tests[0][f"{name}_u"].dims == tests[0][name].dims
-        # 60 tests know a spread to 9 %. R and A take the largest of positions that scatter alike: that spreads less than each.
-        assert (stated > 0.65 * spread).all(), name
-        assert (stated < (1.9 if name[0] in "RA" else 1.35) * spread).all(), name
-
-
-def test_one_direction_has_its_own_uncertainties(rng: np.random.Generator) -> None:
-    x = rng.normal(0, 1, (5, 2, 4))
-    x[:, 1] = np.nan
-    result = evaluate_iso230(test_made(x))
-    for name in ("R_unidirectional_u", "E_unidirectional_u", "A_unidirectional_u"):
-        assert np.isfinite(result[name].values).tolist() == [True, False]
-    assert np.isfinite(result["mean_unidirectional_u"].values).tolist() == [[True] * 4, [False] * 4]
-    assert np.isnan([float(result[f"{name}_u"]) for name in ("B", "mean_reversal", "R", "E", "M", "A")]).all()
-
-
-def test_errors_that_grow_with_position_act_over_the_distance_between_the_deciding_targets() -> None:
-    x = np.array([[[0.0, 1.0, 5.0], [0.5, 1.5, 5.5]]]) + np.array([[[-0.01]], [[0.01]]])
-    test = test_made(x)
-    budget = Iso230Budget(device_ppm=10.0)
-    parts = dict(budget_table(test, "E", budget=budget))
-    # E is decided by targets 1 and 3, 20 mm apart: 10 ppm of 20 mm.
-    assert parts["device"] == pytest.approx(0.2)
-    assert "device" not in dict(budget_table(test, "B", budget=budget))
-
-
-def test_temperature_and_expansion_enter_as_the_product_rule_says() -> None:
-    x = np.array([[[0.0, 5.0], [0.5, 5.5]]]) + np.array([[[-0.01]], [[0.01]]])
-    budget = Iso230Budget(
-        device_ppm=0.0,
-        machine_temperature_K=0.5,
-        expansion_coefficient_ppm_per_K=2.0,
-        difference_from_20_degC_K=4.0,
-        nominal_expansion_ppm_per_K=11.7,
-    )
-    parts = dict(budget_table(test_made(x), "M", budget=budget))
-    assert parts["machine temperature"] == pytest.approx(11.7 * 0.5 * 0.01)
-    assert parts["expansion coefficient"] == pytest.approx(2.0 * 4.0 * 0.01)
-
-
-def test_a_negative_uncertainty_is_refused() -> None:
-    with pytest.raises(ValueError, match="device_ppm=-1 is negative"):
-        Iso230Budget(device_ppm=-1)
-
-
 def test_the_reversal_error_that_scatter_alone_gives_is_met_by_half_of_such_tests() -> None:
     rng = np.random.default_rng(12)
     results = [evaluate_iso230(test_made(rng.normal(0.0, 0.5, (5, 2, 11)))) for _ in range(200)]
@@ -234,3 +143,32 @@ def test_the_reversal_error_that_scatter_alone_gives_is_met_by_half_of_such_test
     one_sided = rng.normal(size=(5, 2, 3))
     one_sided[:, 1] = np.nan
     assert np.isnan(evaluate_iso230(test_made(one_sided))["B_of_scatter"])
+
+
+def test_the_settled_window_is_that_of_the_second_half_whose_drift_varies_least() -> None:
+    rng = np.random.default_rng(5)
+    test = test_made(rng.normal(0.0, 0.5, (40, 2, 4)))
+    drift = xr.zeros_like(test["deviation"])
+    # Cycles 31 to 35 stand still; so do cycles 1 to 5, which are in the first half; elsewhere the drift goes on.
+    drift[:] = np.arange(40.0)[:, None, None]
+    drift[30:35], drift[0:5] = 30.0, 0.0
+    windows = evaluate_windows(test, drift=drift)
+    chosen = settled_window(windows)
+    assert windows["first_cycle"].values[chosen], windows["last_cycle"].values[chosen] == (31, 35)
+    assert float(windows["drift_variation"][chosen]) == 0.0
+    assert float(windows["drift_variation"][1]) == pytest.approx(np.std(np.arange(5.0), ddof=1))
+    assert settled_window(evaluate_windows(test)) == 7
+    assert settled_window(evaluate_windows(test.isel(cycle=slice(0, 4)))) == 0
+
+
+def test_the_drift_and_the_temperature_of_a_window_enter_its_budget() -> None:
+    rng = np.random.default_rng(6)
+    test = test_made(rng.normal(0.0, 0.5, (10, 2, 4)))
+    drift = test["deviation"].copy(data=np.broadcast_to(np.arange(10.0)[:, None, None], (10, 2, 4)))
+    material = xr.DataArray(np.linspace(21.0, 30.0, 10), dims="cycle", coords={"cycle": test["cycle"]})
+    result = evaluate_iso230(test, cycles=[6, 7, 8, 9, 10], drift=drift, material_degC=material)
+    assert float(result["environmental_variation"]) == pytest.approx(np.std(np.arange(5.0), ddof=1))
+    assert float(result["temperature_difference"]) == pytest.approx(8.0)
+    stated = evaluate_iso230(test, budget=Iso230Budget(environmental_variation_um=0.2), drift=drift)
+    assert float(stated["environmental_variation"]) == 0.2
+    assert np.isnan(evaluate_iso230(test)["environmental_variation"])

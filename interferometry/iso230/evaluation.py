@@ -1,0 +1,318 @@
+"""Accuracy and repeatability of positioning by ISO 230-2:2014, over any window of cycles, each quantity with its uncertainty.
+
+The acceptance test of the standard has five cycles of a warmed-up axis. In a longer test R and A contain the drift: the window that
+was evaluated is part of every result.
+
+Names are those of the standard: x_ij positioning deviation, mean unidirectional positioning deviation at a position, s_i its standard
+deviation, B_i reversal error at a position, R_i repeatability at a position; of the axis: reversal error B, mean reversal error,
+bidirectional repeatability R, bidirectional systematic positioning error E, mean bidirectional positioning error M, bidirectional
+accuracy A.
+
+In this order: the evaluation of one window; windows along a test and which of them is the most settled; the quantities as numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import xarray as xr
+from scipy.stats import norm
+
+from interferometry.compensation import REFERENCE_TEMPERATURE_DEGC
+from interferometry.contract import check_dataset
+from interferometry.deviations import DIRECTIONS
+from interferometry.errors import InterferometryError
+from interferometry.iso230.budget import CONTRIBUTIONS, SCATTER_ALONE, Iso230Budget
+from interferometry.iso230.quantities import axis_quantities, target_quantities
+from interferometry.iso230.uncertainty import AXIS, ONE_WAY, UncertainTest
+
+#: Quantities of the axis: reversal error, bidirectional repeatability, bidirectional systematic positioning error, mean bidirectional
+#: positioning error, bidirectional accuracy.
+QUANTITIES = ("B", "R", "E", "M", "A")
+STANDARD_CYCLES = 5
+
+
+def evaluate_iso230(
+    deviations: xr.Dataset,
+    *,
+    cycles: Sequence[int] | None = None,
+    budget: Iso230Budget | None = None,
+    drift: xr.DataArray | None = None,
+    material_degC: xr.DataArray | None = None,
+) -> xr.Dataset:
+    """Evaluate a window of cycles by ISO 230-2.
+
+    Parameters
+    ----------
+    deviations : xarray.Dataset
+        Positioning deviations (cycle, direction, target) in um, as `build_deviations` returns them; readings may be missing. Of a rotary
+        axis they are in arcsec, as the units of ``deviation`` say.
+    cycles : sequence of int, optional
+        Numbers of the cycles of the window; None: all.
+    budget : Iso230Budget, optional
+        None: the assumptions of `Iso230Budget`; of a rotary axis the scatter alone, as the budget is one of lengths.
+    drift : (cycle, direction, target) DataArray, optional
+        Drift of the joint estimate, um: its standard deviation within the window is the environmental variation where the budget
+        states none. None: without either, the uncertainty holds no environmental variation.
+    material_degC : (cycle) DataArray, optional
+        Temperature of the material, degC: its mean over the window replaces the difference from 20 degC of the budget.
+
+    Returns
+    -------
+    xarray.Dataset
+        In um (arcsec), each with its standard uncertainty ``<name>_u``.
+
+        - Per direction and target: ``mean_unidirectional``, ``standard_deviation`` (s_i), ``repeatability`` (4 s_i), ``count`` (1).
+        - Per target: ``mean_bidirectional``, ``reversal`` (B_i), ``repeatability_bidirectional`` (R_i).
+        - Per direction: ``R_unidirectional``, ``E_unidirectional``, ``A_unidirectional``.
+        - Of the axis: ``B`` reversal error; ``B_of_scatter``, what scatter alone gives in half of such tests of an axis without reversal
+          error (B is the largest of noisy values; no uncertainty); ``mean_reversal`` (signed), ``R`` bidirectional repeatability, ``E``
+          bidirectional systematic positioning error, ``M`` mean bidirectional positioning error, ``A`` bidirectional accuracy.
+        - Of the budget: ``contribution`` (quantity, contributor) to the standard uncertainty of each quantity of the axis;
+          ``environmental_variation`` that was used, ``drift_variation``, the standard deviation of the drift at the position where it is
+          largest (NaN where not known), and ``temperature_difference`` (K), that of the material from 20 degC.
+
+        The uncertainties of mean deviations are relative to the first position. Quantities that need both directions are NaN where
+        one was not measured. ``attrs["window"]`` names the cycles, says if they are not the five of the standard, and which targets
+        are left out because a direction has fewer than two readings there.
+
+    Raises
+    ------
+    InterferometryError
+        ``deviations`` lack a variable of ``contract.DEVIATIONS``, the window names a cycle that was not measured, no target has two
+        readings in it, or a budget is given for a rotary axis.
+
+    Notes
+    -----
+    ISO 230-2:2014, clause 3; docs/method/iso230.md. With mean deviations m and their standard deviations s, up and down for the
+    directions: B = max |m_up - m_down|, R_i = max(2 s_up + 2 s_down + |B_i|, 4 s_up, 4 s_down), R = max R_i, E = max m - min m,
+    M = range of (m_up + m_down) / 2, A = max(m + 2 s) - min(m - 2 s). Uncertainties by the law of propagation (JCGM 100:2008) with the
+    contributions of Annex A.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from interferometry.deviations import build_deviations
+    >>> deviation = np.array([[[0.0, 5.0], [2.0, 6.0]], [[0.0, 5.0], [2.0, 6.0]]])
+    >>> time = np.full(deviation.shape, np.datetime64("NaT", "ns"))
+    >>> test = build_deviations([1, 2], [1, 2], np.array([0.0, 100.0]), deviation, time)
+    >>> result = evaluate_iso230(test)
+    >>> {name: float(result[name]) for name in QUANTITIES}
+    {'B': 2.0, 'R': 2.0, 'E': 6.0, 'M': 4.5, 'A': 6.0}
+    """
+    check_dataset(deviations, "deviations")
+    unit = deviations["deviation"].attrs.get("units", "um")
+    if budget is not None and unit == "arcsec":
+        raise InterferometryError(
+            "budget: its contributions are parts per million of a length; leave it out for a rotary axis, where only the scatter enters"
+        )
+    deviations = deviations.reindex(direction=list(DIRECTIONS))
+    x, numbers = _select(deviations, cycles)
+    count = np.isfinite(x).sum(axis=0)
+    x, count, left_out = _leave_out_single_readings(deviations, x, count)
+    result = xr.Dataset(
+        _quantities(x, count),
+        coords={"direction": deviations["direction"].values, "target": deviations["target"].values},
+    )
+    varied = np.nan if drift is None else _drift_variation(drift.reindex_like(deviations["deviation"]), numbers)
+    used = _budget_of_window(
+        budget or (SCATTER_ALONE if unit == "arcsec" else Iso230Budget()), varied, material_degC, numbers
+    )
+    uncertain = UncertainTest(result, deviations["position"].values, used)
+    stated = np.nan if used.environmental_variation_um is None else used.environmental_variation_um
+    result = result.assign(uncertain.uncertainties()).assign(
+        environmental_variation=stated, drift_variation=varied, temperature_difference=used.difference_from_20_degC_K
+    )
+    result = result.assign_coords(quantity=list(AXIS), contributor=list(CONTRIBUTIONS))
+    for name in result.data_vars:
+        result[name].attrs["units"] = {"count": "1", "temperature_difference": "K"}.get(str(name), unit)
+    result.attrs["window"] = _name_window(numbers, left_out)
+    return result
+
+
+def _drift_variation(drift: xr.DataArray, cycles: np.ndarray) -> float:
+    """Return the standard deviation of the drift over the cycles of a window, at the position and approach where it is largest, um."""
+    within = drift.sel(cycle=cycles).values
+    known = np.isfinite(within).sum(axis=0) >= 2
+    return float(np.nanstd(within[:, known], axis=0, ddof=1).max()) if known.any() else np.nan
+
+
+def _budget_of_window(
+    budget: Iso230Budget, drift_variation: float, material_degC: xr.DataArray | None, cycles: np.ndarray
+) -> Iso230Budget:
+    """Return the budget with what was measured during a window: the variation of the drift, and the temperature of the material."""
+    if budget.environmental_variation_um is None and np.isfinite(drift_variation):
+        budget = replace(budget, environmental_variation_um=drift_variation)
+    if material_degC is not None:
+        mean = float(material_degC.sel(cycle=cycles).mean())
+        if np.isfinite(mean):
+            budget = replace(budget, difference_from_20_degC_K=abs(mean - REFERENCE_TEMPERATURE_DEGC))
+    return budget
+
+
+def evaluate_windows(
+    deviations: xr.Dataset,
+    *,
+    length: int = STANDARD_CYCLES,
+    budget: Iso230Budget | None = None,
+    drift: xr.DataArray | None = None,
+    material_degC: xr.DataArray | None = None,
+) -> xr.Dataset:
+    """Evaluate windows of a few cycles along a long test, and the whole test as the last window.
+
+    Within a window of the standard's length the drift is small; between windows it shows as a change of the means, and in the last
+    window as larger R and A.
+
+    Parameters
+    ----------
+    deviations : xarray.Dataset
+        Keeps ``contract.DEVIATIONS``.
+    length : int
+        Cycles of a window.
+    budget, drift, material_degC
+        See `evaluate_iso230`.
+
+    Returns
+    -------
+    xarray.Dataset
+        What `evaluate_iso230` returns for the axis and per direction, along ``window``, whose coordinate names the cycles;
+        ``first_cycle``, ``middle_cycle`` and ``last_cycle`` are those of each. Windows in which no target has two readings are not
+        listed; a test shorter than one window is its only window.
+
+    Raises
+    ------
+    InterferometryError
+        No target has two readings in the whole test.
+    """
+    numbers = deviations["cycle"].values.tolist()
+    windows = [numbers[start : start + length] for start in range(0, len(numbers) - length + 1, length)]
+    windows = [window for window in windows if _can_be_evaluated(deviations.sel(cycle=window))] + [numbers]
+    results = [
+        evaluate_iso230(deviations, cycles=window, budget=budget, drift=drift, material_degC=material_degC)
+        for window in windows
+    ]
+    kept = [name for name in results[0].data_vars if "target" not in results[0][name].dims]
+    joined = xr.concat([result[kept] for result in results], dim="window", coords="minimal", compat="override")
+    names = [result.attrs["window"] for result in results]
+    return joined.assign_coords(
+        window=names,
+        middle_cycle=("window", [float(np.mean(window)) for window in windows]),
+        first_cycle=("window", [window[0] for window in windows]),
+        last_cycle=("window", [window[-1] for window in windows]),
+    ).assign_attrs(window="several")
+
+
+def settled_window(windows: xr.Dataset) -> int:
+    """Return which window of a test shows the warmed-up axis: in its second half, the one in which the drift varied least.
+
+    Parameters
+    ----------
+    windows : xarray.Dataset
+        What `evaluate_windows` returns.
+
+    Returns
+    -------
+    int
+        Index along ``window``. Without a drift estimate it is the last window before the whole test; a test shorter than two windows
+        is its only one.
+
+    Notes
+    -----
+    ISO 230-2 asks for a warmed-up axis. The rule looks at the drift alone, not at the quantities that it selects.
+    """
+    several = windows.sizes["window"] - 1
+    if several < 1:
+        return 0
+    middle = windows["middle_cycle"].values
+    late = np.flatnonzero(middle[:several] >= middle[several])
+    late = late if late.size else np.array([several - 1])
+    varied = windows["drift_variation"].values[late]
+    if not np.isfinite(varied).any():
+        return int(late[-1])
+    least = np.flatnonzero(varied == np.nanmin(varied))
+    return int(late[least[-1]])
+
+
+def _select(deviations: xr.Dataset, cycles: Sequence[int] | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the readings of the window as (cycle, direction, target), and the numbers of its cycles."""
+    numbers = deviations["cycle"].values
+    if cycles is None:
+        return deviations["deviation"].values, np.asarray(numbers)
+    missing = sorted(set(cycles) - set(numbers.tolist()))
+    if missing:
+        raise InterferometryError(
+            f"cycles {missing} of the window were not measured; the test holds {numbers.tolist()}"
+        )
+    chosen = np.isin(numbers, list(cycles))
+    return deviations["deviation"].values[chosen], numbers[chosen]
+
+
+def _leave_out_single_readings(
+    deviations: xr.Dataset, x: np.ndarray, count: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Leave out, by name, positions with fewer than two readings in a measured direction: they have no standard deviation."""
+    measured = count.any(axis=1, keepdims=True)
+    single = (count < 2) & measured
+    if not ((count >= 2) & measured).any():
+        window = "one cycle" if x.shape[0] == 1 else f"{x.shape[0]} cycles"
+        raise InterferometryError(
+            f"no target has two readings from one side in a window of {window}; ISO 230-2 asks for {STANDARD_CYCLES} cycles, and "
+            "scatter needs two: measure more, or widen the window"
+        )
+    names = [
+        f"{deviations['target'].values[target]} {deviations['direction'].values[direction]}"
+        for direction, target in np.argwhere(single)
+    ]
+    return np.where(single, np.nan, x), np.where(single, 0, count), names
+
+
+def _mean_and_s(x: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and sample standard deviation over cycles; NaN where a direction was not measured."""
+    filled = np.where(np.isfinite(x), x, 0.0)
+    mean = filled.sum(axis=0) / np.where(count > 0, count, np.nan)
+    squares = np.where(np.isfinite(x), (x - mean) ** 2, 0.0).sum(axis=0)
+    return mean, np.sqrt(squares / np.where(count > 1, count - 1, np.nan))
+
+
+def _name_window(cycles: np.ndarray, left_out: Sequence[str]) -> str:
+    name = f"cycles {cycles[0]} to {cycles[-1]}" if cycles.size > 1 else f"cycle {cycles[0]}"
+    if cycles.size != STANDARD_CYCLES:
+        name += f" ({cycles.size} cycles, not the {STANDARD_CYCLES} of the standard's acceptance test)"
+    return name + (f"; without targets {', '.join(left_out)} (fewer than two readings)" if left_out else "")
+
+
+def _quantities(x: np.ndarray, count: np.ndarray) -> dict[str, tuple[tuple[str, ...], object]]:
+    """Return the quantities of the standard from deviations x and their numbers (cycle, direction, target), as variables."""
+    mean, s = _mean_and_s(x, count)
+    both, reversal, repeatability = target_quantities(mean, s)
+    known = reversal[np.isfinite(reversal)]
+    of_axis = axis_quantities(mean, s)
+    return {
+        "mean_unidirectional": (("direction", "target"), mean),
+        "standard_deviation": (("direction", "target"), s),
+        "repeatability": (("direction", "target"), 4 * s),
+        "count": (("direction", "target"), count),
+        "mean_bidirectional": (("target",), both),
+        "reversal": (("target",), reversal),
+        "repeatability_bidirectional": (("target",), repeatability),
+        **{name: (("direction",), values) for name, values in of_axis.items() if name in ONE_WAY},
+        **{name: ((), float(value)) for name, value in of_axis.items() if name not in ONE_WAY},
+        "B_of_scatter": ((), _reversal_of_scatter(s, count)),
+        "mean_reversal": ((), float(np.mean(known)) if known.size else np.nan),
+    }
+
+
+def _reversal_of_scatter(s: np.ndarray, count: np.ndarray) -> float:
+    """Return the B that scatter alone gives in half of such tests, um.
+
+    The median q of max |z| over m targets solves (2 Phi(q) - 1)^m = 1/2.
+    """
+    variance = (s**2 / np.fmax(count, 1)).sum(axis=0)
+    both = variance[np.isfinite(variance)]
+    return float(norm.ppf((1.0 + 0.5 ** (1.0 / both.size)) / 2.0) * np.sqrt(both.mean())) if both.size else np.nan
+
+
+def _can_be_evaluated(deviations: xr.Dataset) -> bool:
+    return bool((deviations["deviation"].count("cycle") >= 2).any())

@@ -1,0 +1,245 @@
+"""Uncertainty of the quantities of ISO 230-2: each as an uncertain number that carries its correlations, and its budget."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import GTC
+import numpy as np
+import xarray as xr
+
+from interferometry.iso230.budget import CONTRIBUTIONS, Iso230Budget
+from interferometry.iso230.quantities import axis_quantities
+
+#: Quantities of the axis that have an uncertainty: reversal error, bidirectional repeatability, bidirectional systematic positioning
+#: error, mean bidirectional positioning error, bidirectional accuracy, signed mean of the reversal errors.
+AXIS = ("B", "R", "E", "M", "A", "mean_reversal")
+ONE_WAY = ("R_unidirectional", "E_unidirectional", "A_unidirectional")
+#: Tests that are drawn to see by how much the largest of noisy values is too large: enough to know it to a tenth of itself.
+_DRAWS, _SEED = 400, 230
+
+
+class UncertainTest:
+    """The quantities of one evaluation as GTC numbers.
+
+    A mean deviation is that of its readings, plus the environmental variation during them, plus the errors that grow with position and
+    are the same in every cycle and direction. The latter cancel in the reversal error and in repeatability. Every quantity but the mean
+    reversal error is the largest of noisy values, which is too large on average: that excess is not corrected and enters the uncertainty.
+
+    Parameters
+    ----------
+    result : xarray.Dataset
+        Quantities of the standard, see `interferometry.iso230.evaluation.evaluate_iso230`.
+    position_mm : (target,) ndarray
+        Target positions, mm.
+    budget : Iso230Budget
+        Its environmental variation is a number.
+
+    References
+    ----------
+    JCGM 100:2008, clauses 5 and F.2.4.5 (a known bias that is not corrected); GUM Tree Calculator (GTC); Efron and Tibshirani 1993, *An
+    introduction to the bootstrap*, chapters 6 and 10 (parametric bootstrap, bias of an estimate).
+    """
+
+    def __init__(self, result: xr.Dataset, position_mm: np.ndarray, budget: Iso230Budget) -> None:
+        self._result = result
+        self._variation = budget.environmental_variation_um or 0.0
+        self._mean, self._s = result["mean_unidirectional"].values, result["standard_deviation"].values
+        self._count, self._distance_mm = result["count"].values, position_mm - position_mm.min()
+        self._deviations: dict[tuple[int, int], GTC.lib.UncertainReal] = {}
+        self._sigmas: dict[tuple[int, int], GTC.lib.UncertainReal] = {}
+        self._excess = _excess_of_extremes(self._mean, self._s, self._count)
+        self._scale = 1e-3 * (
+            GTC.ureal(0, budget.device_ppm, label="device")
+            + GTC.ureal(0, budget.alignment_ppm, label="alignment")
+            + budget.nominal_expansion_ppm_per_K
+            * GTC.ureal(0, budget.material_temperature_K, label="material_temperature")
+            + budget.difference_from_20_degC_K
+            * GTC.ureal(0, budget.expansion_coefficient_ppm_per_K, label="expansion_coefficient")
+        )
+
+    def _make_deviation(self, direction: int, target: int) -> GTC.lib.UncertainReal:
+        readings = int(self._count[direction, target])
+        scatter = GTC.ureal(0, self._s[direction, target] / readings**0.5, readings - 1, label="sampling")
+        environment = GTC.ureal(0, self._variation / readings**0.5, label="environmental_variation")
+        return (
+            float(self._mean[direction, target])
+            + scatter
+            + environment
+            + float(self._distance_mm[target]) * self._scale
+        )
+
+    def _make_sigma(self, direction: int, target: int) -> GTC.lib.UncertainReal:
+        """Return s with the scatter of an estimate, and with what the environmental variation has added to it."""
+        readings, s = int(self._count[direction, target]), float(self._s[direction, target])
+        added = s - np.sqrt(max(s**2 - self._variation**2, 0.0))
+        scatter = GTC.ureal(s, s / (2 * (readings - 1)) ** 0.5, readings - 1, label="sampling")
+        return scatter + GTC.ureal(0, added, label="environmental_variation")
+
+    def deviation(self, direction: int, target: int) -> GTC.lib.UncertainReal:
+        """Mean deviation of one approach to one target: the same correlated number wherever it enters."""
+        cell = direction, target
+        if cell not in self._deviations:
+            self._deviations[cell] = self._make_deviation(*cell)
+        return self._deviations[cell]
+
+    def sigma(self, direction: int, target: int) -> GTC.lib.UncertainReal:
+        """Standard deviation of one approach to one target, likewise."""
+        cell = direction, target
+        if cell not in self._sigmas:
+            self._sigmas[cell] = self._make_sigma(*cell)
+        return self._sigmas[cell]
+
+    def reversal(self, target: int) -> GTC.lib.UncertainReal:
+        """Reversal error B_i, signed."""
+        return self.deviation(0, target) - self.deviation(1, target)
+
+    def bidirectional_mean(self, target: int) -> GTC.lib.UncertainReal:
+        """Mean bidirectional positioning deviation."""
+        return (self.deviation(0, target) + self.deviation(1, target)) / 2
+
+    def repeatability(self, target: int) -> GTC.lib.UncertainReal:
+        """R_i by the term that decides it: both directions with the reversal error, or one of them."""
+        unidirectional = 4 * self._s[:, target]
+        best = int(np.argmax(unidirectional))
+        if unidirectional[best] >= float(self._result["repeatability_bidirectional"][target]):
+            return 4 * self.sigma(best, target)
+        return 2 * self.sigma(0, target) + 2 * self.sigma(1, target) + _magnitude(self.reversal(target))
+
+    def axis(self) -> dict[str, GTC.lib.UncertainReal]:
+        """Quantities of the axis by name; empty where a direction was not measured."""
+        reversal = self._result["reversal"].values
+        both = np.flatnonzero(np.isfinite(reversal))
+        if both.size == 0:
+            return {}
+        middle = self._result["mean_bidirectional"].values
+        top, bottom = _cell_of(np.nanargmax, self._mean), _cell_of(np.nanargmin, self._mean)
+        extremes = {
+            "B": _magnitude(self.reversal(int(np.nanargmax(np.abs(reversal))))),
+            "R": self.repeatability(int(np.nanargmax(self._result["repeatability_bidirectional"].values))),
+            "E": self.deviation(*top) - self.deviation(*bottom),
+            "M": self.bidirectional_mean(int(np.nanargmax(middle)))
+            - self.bidirectional_mean(int(np.nanargmin(middle))),
+            "A": self._accuracy(range(2)),
+        }
+        mean_reversal = sum(self.reversal(int(target)) for target in both) / both.size
+        return {name: value + _bias(float(self._excess[name])) for name, value in extremes.items()} | {
+            "mean_reversal": mean_reversal
+        }
+
+    def of_direction(self, direction: int) -> dict[str, GTC.lib.UncertainReal]:
+        """E, R and A of one direction by name; empty where it was not measured."""
+        mean = self._mean[direction]
+        if not np.isfinite(mean).any():
+            return {}
+        top, bottom, wide = int(np.nanargmax(mean)), int(np.nanargmin(mean)), int(np.nanargmax(self._s[direction]))
+        extremes = {
+            "R_unidirectional": 4 * self.sigma(direction, wide),
+            "E_unidirectional": self.deviation(direction, top) - self.deviation(direction, bottom),
+            "A_unidirectional": self._accuracy([direction]),
+        }
+        return {name: value + _bias(float(self._excess[name][direction])) for name, value in extremes.items()}
+
+    def _accuracy(self, directions: Iterable[int]) -> GTC.lib.UncertainReal:
+        rows = list(directions)
+        mean, s = self._mean[rows], self._s[rows]
+        high, low = _cell_of(np.nanargmax, mean + 2 * s), _cell_of(np.nanargmin, mean - 2 * s)
+        high, low = (rows[high[0]], high[1]), (rows[low[0]], low[1])
+        return self.deviation(*high) + 2 * self.sigma(*high) - (self.deviation(*low) - 2 * self.sigma(*low))
+
+    def uncertainties(self) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
+        """Standard uncertainty of every quantity in um, NaN where the quantity is, as variables ``<name>_u``, and ``contribution``."""
+        directions, targets = self._mean.shape
+        measured = np.isfinite(self._mean)
+        both = measured.all(axis=0)
+
+        def per_cell(quantity: Callable[[int, int], GTC.lib.UncertainReal]) -> np.ndarray:
+            u = np.full(self._mean.shape, np.nan)
+            for direction, target in np.argwhere(measured):
+                u[direction, target] = GTC.uncertainty(quantity(int(direction), int(target)))
+            return u
+
+        def per_target(quantity: Callable[[int], GTC.lib.UncertainReal]) -> np.ndarray:
+            u = [GTC.uncertainty(quantity(int(target))) if both[target] else np.nan for target in range(targets)]
+            return np.array(u, dtype=float)
+
+        s_u = per_cell(self.sigma)
+        variables: dict[str, tuple[tuple[str, ...], np.ndarray]] = {
+            "mean_unidirectional_u": (("direction", "target"), per_cell(self.deviation)),
+            "standard_deviation_u": (("direction", "target"), s_u),
+            "repeatability_u": (("direction", "target"), 4 * s_u),
+            "mean_bidirectional_u": (("target",), per_target(self.bidirectional_mean)),
+            "reversal_u": (("target",), per_target(self.reversal)),
+            "repeatability_bidirectional_u": (("target",), per_target(self.repeatability)),
+        }
+        by_direction = [self.of_direction(direction) for direction in range(directions)]
+        for name in ONE_WAY:
+            u = [GTC.uncertainty(values[name]) if values else np.nan for values in by_direction]
+            variables[f"{name}_u"] = (("direction",), np.array(u, dtype=float))
+        axis = self.axis()
+        for name in AXIS:
+            variables[f"{name}_u"] = ((), np.array(GTC.uncertainty(axis[name]) if axis else np.nan, dtype=float))
+        shares = [_contributions(axis[name]) if axis else [np.nan] * len(CONTRIBUTIONS) for name in AXIS]
+        variables["contribution"] = (("quantity", "contributor"), np.array(shares, dtype=float))
+        return variables
+
+
+def _contributions(value: GTC.lib.UncertainReal) -> list[float]:
+    """Return the contribution of each group of inputs to the standard uncertainty, in the order of CONTRIBUTIONS."""
+    squares = dict.fromkeys(CONTRIBUTIONS, 0.0)
+    for part in GTC.reporting.budget(value, trim=0):
+        squares[part.label] += float(part.u) ** 2
+    return [float(np.sqrt(squares[name])) for name in CONTRIBUTIONS]
+
+
+def _excess_of_extremes(mean: np.ndarray, s: np.ndarray, count: np.ndarray) -> dict[str, np.ndarray]:
+    """Return by how much the quantities of tests of an axis exceed those of the axis itself, on average, um.
+
+    The axis is the test without the spread that its scatter has put between positions. Means are drawn with s / sqrt(n), variances with
+    n - 1 degrees of freedom.
+    """
+    rng = np.random.default_rng(_SEED)
+    readings = np.where(np.isfinite(mean), count, 2)
+    u = s / np.sqrt(readings)
+    axis = _without_scatter(mean, u)
+    shape = (_DRAWS, *mean.shape)
+    drawn_s = s * np.sqrt(rng.chisquare(readings - 1, shape) / (readings - 1))
+    drawn, own = axis_quantities(axis + u * rng.standard_normal(shape), drawn_s), axis_quantities(axis, s)
+    return {name: np.fmax(values.mean(axis=0) - own[name], 0.0) for name, values in drawn.items()}
+
+
+def _without_scatter(mean: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return mean deviations whose bidirectional means and reversal errors differ between positions by no more than the axis makes them.
+
+    Each series is drawn towards its mean over the positions until its variance is that which scatter of standard uncertainty u does not
+    explain. With one direction the series is that direction.
+    """
+    if not np.isfinite(mean).all(axis=0).any():
+        return _drawn_together(mean, u)
+    noise = np.sqrt((u**2).sum(axis=0))
+    both, reversal = _drawn_together(mean.mean(axis=0), noise / 2), _drawn_together(mean[0] - mean[1], noise)
+    together = np.stack([both + reversal / 2, both - reversal / 2])
+    return np.where(np.isfinite(together), together, mean)
+
+
+def _drawn_together(values: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return values (..., target) drawn towards their mean until the variance that u explains is gone."""
+    known = np.isfinite(values)
+    if known.sum() < 2:
+        return values
+    centre, spread = values[known].mean(), values[known].var(ddof=1)
+    share = max(1.0 - float((u[known] ** 2).mean()) / spread, 0.0) if spread > 0 else 0.0
+    return centre + np.sqrt(share) * (values - centre)
+
+
+def _bias(size: float) -> GTC.lib.UncertainReal:
+    return GTC.ureal(0, size, label="extremes")
+
+
+def _magnitude(value: GTC.lib.UncertainReal) -> GTC.lib.UncertainReal:
+    return value if GTC.value(value) >= 0 else -value
+
+
+def _cell_of(extreme: Callable[[np.ndarray], np.intp], values: np.ndarray) -> tuple[int, int]:
+    direction, target = np.unravel_index(int(extreme(values)), values.shape)
+    return int(direction), int(target)

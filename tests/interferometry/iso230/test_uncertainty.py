@@ -1,0 +1,103 @@
+"""Uncertainty of ISO 230-2 quantities against repeated tests and against the product rule."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from interferometry.iso230 import CONTRIBUTIONS, Iso230Budget, evaluate_iso230
+from interferometry.iso230.budget import SCATTER_ALONE
+from tests.interferometry.iso230.made_tests import by_hand, test_made
+
+
+def test_uncertainty_agrees_with_repeated_tests() -> None:
+    rng = np.random.default_rng(7)
+    profile = np.array([[0.0, 3.0, 9.0, 20.0], [4.0, 8.0, 12.0, 26.0]])
+    repeated = [by_hand(profile + rng.normal(0, 0.5, (20, 2, 4))) for _ in range(2000)]
+    zero = SCATTER_ALONE
+    stated = evaluate_iso230(test_made(profile + rng.normal(0, 0.5, (20, 2, 4))), budget=zero)
+    for name in ("B", "E", "M", "A"):
+        spread = np.std([one[name] for one in repeated], ddof=1)
+        # One test knows its own s to 1/sqrt(2 * 19) = 16 %; the extremes over positions add a little.
+        assert float(stated[f"{name}_u"]) == pytest.approx(spread, rel=0.45)
+
+
+def test_every_quantity_has_an_uncertainty_in_both_directions_that_repeated_tests_confirm() -> None:
+    rng = np.random.default_rng(11)
+    profile = np.array([[0.0, 3.0, 9.0, 20.0], [4.0, 8.0, 12.0, 26.0]])
+    zero = SCATTER_ALONE
+    tests = [evaluate_iso230(test_made(profile + rng.normal(0, 0.5, (20, 2, 4))), budget=zero) for _ in range(60)]
+    values = [name for name in tests[0].data_vars if f"{name}_u" in tests[0]]
+    assert len(values) == 15
+    for name in values:
+        spread = np.std([one[name].values for one in tests], axis=0, ddof=1)
+        stated = np.mean([one[f"{name}_u"].values for one in tests], axis=0)
+        assert tests[0][f"{name}_u"].dims == tests[0][name].dims
+        # 60 tests know a spread to 9 %. R and A take the largest of positions that scatter alike: that spreads less than each.
+        assert (stated > 0.65 * spread).all(), name
+        assert (stated < (1.9 if name[0] in "RA" else 1.35) * spread).all(), name
+
+
+def test_one_direction_has_its_own_uncertainties(rng: np.random.Generator) -> None:
+    x = rng.normal(0, 1, (5, 2, 4))
+    x[:, 1] = np.nan
+    result = evaluate_iso230(test_made(x))
+    for name in ("R_unidirectional_u", "E_unidirectional_u", "A_unidirectional_u"):
+        assert np.isfinite(result[name].values).tolist() == [True, False]
+    assert np.isfinite(result["mean_unidirectional_u"].values).tolist() == [[True] * 4, [False] * 4]
+    assert np.isnan([float(result[f"{name}_u"]) for name in ("B", "mean_reversal", "R", "E", "M", "A")]).all()
+
+
+def test_errors_that_grow_with_position_act_over_the_distance_between_the_deciding_targets() -> None:
+    x = np.array([[[0.0, 1.0, 5.0], [0.5, 1.5, 5.5]]]) + np.array([[[-0.01]], [[0.01]]])
+    shares = evaluate_iso230(test_made(x), budget=Iso230Budget(device_ppm=10.0))["contribution"]
+    # E is decided by targets 1 and 3, 20 mm apart: 10 ppm of 20 mm.
+    assert float(shares.sel(quantity="E", contributor="device")) == pytest.approx(0.2)
+    assert float(shares.sel(quantity="B", contributor="device")) == 0.0
+
+
+def test_temperature_and_expansion_enter_as_the_product_rule_says() -> None:
+    x = np.array([[[0.0, 5.0], [0.5, 5.5]]]) + np.array([[[-0.01]], [[0.01]]])
+    budget = Iso230Budget(
+        device_ppm=0.0,
+        material_temperature_K=0.5,
+        expansion_coefficient_ppm_per_K=2.0,
+        difference_from_20_degC_K=4.0,
+        nominal_expansion_ppm_per_K=11.7,
+    )
+    shares = evaluate_iso230(test_made(x), budget=budget)["contribution"].sel(quantity="M")
+    assert float(shares.sel(contributor="material_temperature")) == pytest.approx(11.7 * 0.5 * 0.01)
+    assert float(shares.sel(contributor="expansion_coefficient")) == pytest.approx(2.0 * 4.0 * 0.01)
+
+
+def test_contributions_add_up_to_the_uncertainty() -> None:
+    rng = np.random.default_rng(3)
+    result = evaluate_iso230(
+        test_made(rng.normal(0, 1, (5, 2, 6))), budget=Iso230Budget(environmental_variation_um=0.4)
+    )
+    assert result["contributor"].values.tolist() == list(CONTRIBUTIONS)
+    for name in result["quantity"].values:
+        total = np.sqrt((result["contribution"].sel(quantity=name) ** 2).sum())
+        assert float(total) == pytest.approx(float(result[f"{name}_u"]), rel=1e-12)
+
+
+def test_an_environmental_variation_explains_no_more_of_s_than_there_is() -> None:
+    rng = np.random.default_rng(4)
+    test = test_made(rng.normal(0, 0.5, (5, 2, 6)))
+    shares = evaluate_iso230(test, budget=Iso230Budget(environmental_variation_um=100.0))["contribution"]
+    s = evaluate_iso230(test)["standard_deviation"].values
+    within = float(shares.sel(quantity="R", contributor="environmental_variation"))
+    # The whole of both standard deviations of the deciding position, and the reversal error between its means.
+    assert within <= np.hypot(2 * np.sqrt((s**2).sum(axis=0).max()) * 2, 100.0 * np.sqrt(2 / 5))
+
+
+def test_the_largest_of_noisy_values_is_covered() -> None:
+    """B of an axis whose reversal error is 2 um at every position: without its excess U would cover 0.67 of such tests."""
+    rng = np.random.default_rng(8)
+    profile = np.stack([np.linspace(0, 15, 11) + 1.0, np.linspace(0, 15, 11) - 1.0])
+    covered = 0
+    for _ in range(100):
+        result = evaluate_iso230(test_made(profile + rng.normal(0, 0.5, (5, 2, 11))), budget=SCATTER_ALONE)
+        covered += abs(float(result["B"]) - 2.0) <= 2 * float(result["B_u"])
+    # 0.93 of 400 such tests; three standard deviations of a share of 100 are 0.08.
+    assert covered >= 85
