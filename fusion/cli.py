@@ -82,11 +82,15 @@ def run(
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="dask scheduler for the per-frame work.")
     ] = None,
+    no_plugins: Annotated[
+        bool, typer.Option("--no-plugins", help="Leave out effects that other installed distributions add.")
+    ] = False,
 ) -> None:
     """Run the whole pipeline on a campaign.
 
     Temperature maps, drift, anomalies, the closed loop, and report.html.
     """
+    from fusion.effects.plugins import leave_plugins_out
     from fusion.pipeline.run import run_campaign
     from fusion.pipeline.two_campaigns import join_campaigns
     from fusion.pipeline.two_records import join_records, of_one_kind
@@ -97,6 +101,8 @@ def run(
         errors.print("thermofuse: one campaign, or two of one machine, can be analysed at a time", highlight=False)
         raise typer.Exit(ExitCode.BAD_INPUT)
 
+    if no_plugins:
+        leave_plugins_out()
     folders = _folders(campaigns, out)
     with _answering([folder for _, folder in folders]):
         records = len(folders) == 2 and of_one_kind(campaigns)

@@ -105,6 +105,22 @@ def read_regions(path: str | Path) -> list[Region]:
         If a column is missing, a coordinate is no number, or a region has fewer than three corners; with file, line and remedy.
     """
     path = Path(path)
+    try:
+        corners = _read_corners(path)
+    except UnicodeDecodeError as error:
+        raise RegionError(f"{path}: byte {error.start} is not UTF-8; save the file as CSV in UTF-8") from None
+    except csv.Error as error:
+        raise RegionError(f"{path}: is not CSV ({error}); save the file as CSV in UTF-8") from None
+    for name, points in corners.items():
+        if len(points) < 3:
+            raise RegionError(f"{path}: region {name!r} has {len(points)} corners; an outline needs at least 3")
+    if not corners:
+        raise RegionError(f"{path}: lists no region; write one line per corner, or leave plan.regions out")
+    return [Region(name, np.array(points)) for name, points in corners.items()]
+
+
+def _read_corners(path: Path) -> dict[str, list[tuple[float, float]]]:
+    """Return the corners of every region, in the order of the lines."""
     corners: dict[str, list[tuple[float, float]]] = {}
     with path.open(newline="", encoding="utf-8-sig") as file:
         reader = csv.DictReader(file)
@@ -126,12 +142,7 @@ def read_regions(path: str | Path) -> list[Region]:
                     "write a name and two numbers in mm"
                 )
             corners.setdefault(row["name"].strip(), []).append(point)
-    for name, points in corners.items():
-        if len(points) < 3:
-            raise RegionError(f"{path}: region {name!r} has {len(points)} corners; an outline needs at least 3")
-    if not corners:
-        raise RegionError(f"{path}: lists no region; write one line per corner, or leave plan.regions out")
-    return [Region(name, np.array(points)) for name, points in corners.items()]
+    return corners
 
 
 def region_courses(values: Array, seen: NDArray[np.bool_], plane: xr.DataArray, regions: Sequence[Region]) -> Array:

@@ -21,6 +21,7 @@ from fusion.errors import FusionError
 from interferometry.io.dates import describe_time_zone, parse_time
 from interferometry.io.delimited import delimiter_of, find_header, read_table, read_timed_rows
 from interferometry.io.faults import BadReading, RejectedLine, raise_if_mostly_invalid
+from interferometry.io.workbook import refuse_bomb
 
 #: Warning of pandas about a line with more fields than the header.
 _SKIPPED = re.compile(r"Skipping line (\d+): expected (\d+) fields, saw (\d+)")
@@ -186,14 +187,30 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
 def _read_frame(path: Path, record: RecordTable) -> tuple[pd.DataFrame, list[RejectedLine]]:
     """Return the whole table as text and numbers, whatever the file's kind, and the lines that do not fit its header."""
     left_out: list[RejectedLine] = []
-    try:
-        if path.suffix.lower() in {".xlsx", ".xlsm"}:
-            frame = pd.read_excel(path, sheet_name=record.sheet or 0, engine="openpyxl")
-        else:
+    if path.suffix.lower() in {".xlsx", ".xlsm"}:
+        frame = _read_sheet(path, record)
+    else:
+        try:
             frame, left_out = _read_text(path)
-    except (ValueError, OSError, pd.errors.ParserError) as error:
-        raise TableError(f"{path}: cannot be read as a table: {error}; save it as CSV in UTF-8 or as XLSX") from None
+        except (ValueError, OSError, pd.errors.ParserError) as error:
+            raise TableError(
+                f"{path}: cannot be read as a table: {error}; save it as CSV in UTF-8 or as XLSX"
+            ) from None
     return frame.rename(columns=lambda name: str(name).strip()), left_out
+
+
+def _read_sheet(path: Path, record: RecordTable) -> pd.DataFrame:
+    """Read one sheet of a spreadsheet."""
+    with path.open("rb") as file:
+        refuse_bomb(path, file)
+        try:
+            return pd.read_excel(file, sheet_name=record.sheet or 0, engine="openpyxl")
+        # A sheet that is not there is a ValueError; a damaged archive raises what the reader is made of: errors of zipfile, zlib, XML.
+        except Exception as error:
+            raise TableError(
+                f"{path}: cannot be read as a table: {error}; name an existing sheet, remove a password if the file has one, and save it "
+                "again as XLSX, or as CSV in UTF-8"
+            ) from error
 
 
 def _read_text(path: Path) -> tuple[pd.DataFrame, list[RejectedLine]]:

@@ -7,13 +7,12 @@ entry-point group ``thermofuse.effects``.
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
-
 from fusion.effects.camera import CAMERA_OFFSET, REFLECTED_SOURCE
 from fusion.effects.effect import Effect
 from fusion.effects.events import PERIODIC_DISTURBANCE, STEP_EVENT
 from fusion.effects.geometry import ANGULAR_GROWTH, PITCH_ERROR, REVERSAL_DRIFT
 from fusion.effects.laser import AIR_INDEX, DEAD_PATH, LASER_WARM_UP, MATERIAL_COMPENSATION, SENSOR_FAULT
+from fusion.effects.plugins import load_plugin, plugins
 from fusion.effects.thermal import AXIS_EXPANSION, QUASI_STATIC_RESPONSE, TABLE_OFFSET, THERMAL_LAG, UNSEEN_HEAT_SOURCE
 
 LIBRARY: tuple[Effect, ...] = (
@@ -39,8 +38,8 @@ LIBRARY: tuple[Effect, ...] = (
 def library() -> dict[str, Effect]:
     """All effects of a campaign by name: the built-in ones, then those that users registered as ``thermofuse.effects``."""
     effects = {effect.name: effect for effect in LIBRARY}
-    for point in entry_points(group="thermofuse.effects"):
-        effect = point.load()
+    for plugin, point in plugins().items():
+        effect = load_plugin(plugin, point)
         effects[effect.name] = effect
     return effects
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import compensate_by_camera, read_source
 from fusion.campaign.sources import CameraInputs, LaserInputs, Source
 from fusion.consistency.checks import Check, doubt_notices, inputs_part, refuse_contradictions
+from fusion.effects.plugins import plugins
 from fusion.pipeline import attribution, drift_model, interferometry, thermal
 from fusion.pipeline import record as record_stage
 from fusion.pipeline.camera import camera_corrected
@@ -138,7 +139,10 @@ class Run:
         asked = self.campaign.model_dump(mode="json", include=set(tables))
         files = {file: self.inputs[file] for table in tables for file in self.campaign.files_of(table)}
         zone = self.campaign.campaign.time_zone
-        return digest(name, PRODUCT_LAYOUT, versions(), zone, asked, files, [self.keys[earlier] for earlier in after])
+        added = [asdict(plugin) for plugin in plugins()]
+        return digest(
+            name, PRODUCT_LAYOUT, versions(), added, zone, asked, files, [self.keys[earlier] for earlier in after]
+        )
 
     def checkpoint(self, key: str) -> Path:
         """Return the folder that keeps the finished cycles of a long recording; folders of other inputs are removed."""
@@ -353,6 +357,7 @@ def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
     """Write results, provenance and report from what the stages found."""
     from fusion.report.html import render_report  # its charts take half a second to import, which a run needs last
 
+    run.parts["plugins"] = [asdict(plugin) for plugin in plugins()]
     run.notices.extend(note_changes(run.seen, input_states(run.campaign)))
     results = assemble(run.campaign.campaign.title, run.parts, run.notices)
     provenance = describe_run(run.campaign, run.inputs, started=run.started, seconds=run.seconds)

@@ -88,6 +88,19 @@ class Notice:
     effect_um: Annotated[Number, Field(description="Size of the effect on the drift, um; null where not known.")] = None
 
 
+class PluginPart(ResultPart):
+    """An effect that another installed distribution added."""
+
+    name: str
+    """Name of its entry point."""
+    origin: str
+    """Module and object."""
+    distribution: str
+    """Installed distribution that brought it."""
+    version: str
+    """Version of that distribution."""
+
+
 def _loop_tag(loop: Any) -> str:
     """Return which loop a value is, so that a fault is reported against that one model: only a record has channels."""
     keys = loop if isinstance(loop, Mapping) else type(loop).model_fields if isinstance(loop, ResultPart) else ()
@@ -105,6 +118,8 @@ class Results(ResultPart):
     """Title of the campaign."""
     warnings: tuple[Notice, ...]
     """Everything that was left out, is doubtful, or was not possible."""
+    plugins: tuple[PluginPart, ...] = ()
+    """Effects of other distributions that took part in the run."""
     inputs: InputsPart | None = None
     """Consistency of the inputs."""
     time: TimePart | None = None

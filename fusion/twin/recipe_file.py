@@ -54,6 +54,8 @@ def read_recipe(path: Path) -> Recipe:
         content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise RecipeError(f"{path}: cannot be read ({error.strerror}); name an existing RECIPE.toml") from error
+    except UnicodeDecodeError as error:
+        raise RecipeError(f"{path}: byte {error.start} is not UTF-8; save the recipe as UTF-8 text") from error
     except tomllib.TOMLDecodeError as error:
         raise RecipeError(f"{path}: is not TOML ({error}); correct the line that the message names") from error
     try:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import datetime
 import io
+import zipfile
 from pathlib import Path
+from typing import BinaryIO
 
 import python_calamine
 
@@ -14,6 +16,8 @@ from interferometry.io.faults import LaserFormatError
 _MAGIC = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
 #: A damaged file may claim millions of cells; no laser test has that many.
 _MOST_CELLS = 20_000_000
+#: Bytes that the parts of a spreadsheet may unpack to: that many cells take about 50 to 100 bytes of XML each.
+_MOST_BYTES = 2_000_000_000
 
 Rows = list[tuple[int, list[str]]]
 
@@ -51,6 +55,7 @@ def read_sheets(path: Path, content: bytes) -> dict[str, Rows]:
     LaserFormatError
         The file is damaged, locked with a password, or holds no sheet with a table.
     """
+    refuse_bomb(path, io.BytesIO(content))
     try:
         workbook = python_calamine.CalamineWorkbook.from_filelike(io.BytesIO(content))
         visible = [
@@ -73,6 +78,34 @@ def read_sheets(path: Path, content: bytes) -> dict[str, Rows]:
     if not filled:
         raise LaserFormatError(f"{path}: no visible sheet holds a value; export the measured values again")
     return filled
+
+
+def refuse_bomb(path: Path, archive: BinaryIO) -> None:
+    """Refuse a spreadsheet whose parts would unpack to more than memory holds, by the sizes that the archive states.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        For the message.
+    archive : file
+        The spreadsheet, open for reading; its position is left at the beginning. What is no ZIP archive passes.
+
+    Raises
+    ------
+    LaserFormatError
+        The parts state more than 2 GB in all.
+    """
+    try:
+        with zipfile.ZipFile(archive) as parts:
+            total = sum(part.file_size for part in parts.infolist())
+    except zipfile.BadZipFile:
+        total = 0
+    archive.seek(0)
+    if total > _MOST_BYTES:
+        raise LaserFormatError(
+            f"{path}: unpacks to {total / 1e9:.1f} GB, at most {_MOST_BYTES / 1e9:g} GB are read; "
+            "save the sheet with the measured values alone"
+        )
 
 
 def _rows(path: Path, name: str, sheet: python_calamine.CalamineSheet) -> Rows:

@@ -198,17 +198,12 @@ def read_fiducials(path: str | Path) -> list[Fiducial]:
     Fiducial(name='F2', x_mm=660.0, y_mm=20.0, diameter_mm=16.0, column_px=None, row_px=None, marker=None)
     """
     path = Path(path)
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        reader = csv.DictReader(file)
-        header = [column.strip() for column in reader.fieldnames or []]
-        missing = [column for column in _REQUIRED_COLUMNS if column not in header]
-        if missing:
-            raise FiducialError(
-                f"{path}:1: no column {', '.join(missing)}; "
-                f"the first line must read {','.join(_REQUIRED_COLUMNS + _HINT_COLUMNS)} (the last two may be left out)"
-            )
-        reader.fieldnames = header
-        fiducials = [_parse(path, reader.line_num, row) for row in reader if any(row.values())]
+    try:
+        fiducials = _read_rows(path)
+    except UnicodeDecodeError as error:
+        raise FiducialError(f"{path}: byte {error.start} is not UTF-8; save the file as CSV in UTF-8") from None
+    except csv.Error as error:
+        raise FiducialError(f"{path}: is not CSV ({error}); save the file as CSV in UTF-8") from None
     discs = sum(fiducial.marker is None for fiducial in fiducials)
     points = sum(fiducial.is_point for fiducial in fiducials)
     if discs < 4:
@@ -219,6 +214,21 @@ def read_fiducials(path: str | Path) -> list[Fiducial]:
             "not by both: give every disc its diameter, or leave it empty everywhere and give column_px,row_px"
         )
     return fiducials
+
+
+def _read_rows(path: Path) -> list[Fiducial]:
+    """Return the fiducials of every line that is not empty."""
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        reader = csv.DictReader(file)
+        header = [column.strip() for column in reader.fieldnames or []]
+        missing = [column for column in _REQUIRED_COLUMNS if column not in header]
+        if missing:
+            raise FiducialError(
+                f"{path}:1: no column {', '.join(missing)}; "
+                f"the first line must read {','.join(_REQUIRED_COLUMNS + _HINT_COLUMNS)} (the last two may be left out)"
+            )
+        reader.fieldnames = header
+        return [_parse(path, reader.line_num, row) for row in reader if any(row.values())]
 
 
 def mask_discs(points_mm: Array, fiducials: Sequence[Fiducial], *, margin_mm: Array | float) -> NDArray[np.bool_]:

@@ -126,3 +126,18 @@ def test_two_places_on_one_heat_source_form_one_cluster(rng):
     assert len(np.unique(clusters[:, 6:])) == 1
     assert clusters[0, 0] != clusters[0, 8]
     assert float(cluster_cells(field)["condition"]) < 10
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"name,x_mm,y_mm\nm\xfftor,1,2\n", "byte 16 is not UTF-8; save the file as CSV in UTF-8"),
+        (b'name,x_mm,y_mm\n"' + b"x" * 140_000 + b'",1,2\n', "is not CSV (field larger than field limit"),
+    ],
+)
+def test_a_damaged_file_of_regions_is_named(tmp_path, content, message):
+    path = tmp_path / "regions.csv"
+    path.write_bytes(content)
+    with pytest.raises(RegionError) as error:
+        read_regions(path)
+    assert str(error.value).startswith(f"{path}: {message}")

@@ -8,11 +8,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from fusion.campaign.config import load_campaign
 from fusion.campaign.logged_tables import TableError, read_drivers, split_heading
 from fusion.campaign.record_runs import read_record
+from fusion.errors import FusionError
+from interferometry.io.faults import LaserFormatError
 
 RECORD = """\
 [campaign]
@@ -141,3 +144,32 @@ def test_a_published_record_is_read_whole(tmp_path: Path, real_file: Callable[[s
     assert dict(data.sizes) == {"time": 11115, "sensor": 16, "channel": 5, "driver_name": 1}
     assert (data["time"].values[-1] - data["time"].values[0]) / np.timedelta64(1, "h") == pytest.approx(46.3, abs=0.05)
     assert data.attrs["left_out"] == "[]"
+
+
+def test_damaged_spreadsheets_are_named_whatever_their_reader_raises(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Flipped bits and cut ends: the reader raises errors of zipfile, zlib, XML and missing keys, which are none of the package's."""
+    pd.DataFrame({"time [s]": [0, 1], "t1 [degC]": [20.0, 20.5], "ch1 [um]": [0.0, 0.1]}).to_excel(
+        tmp_path / "whole.xlsx", index=False
+    )
+    whole = np.frombuffer((tmp_path / "whole.xlsx").read_bytes(), np.uint8)
+    (tmp_path / "campaign.toml").write_text(
+        RECORD.format(file="damaged.xlsx", time="time [s]", more="").replace('drivers = ["spindle*"]', "")
+    )
+    refused = 0
+    for number in range(40):
+        damaged = whole.copy()
+        damaged[rng.integers(0, whole.size, 6)] ^= 1 << rng.integers(0, 8, 6, dtype=np.uint8)
+        (tmp_path / "damaged.xlsx").write_bytes(damaged[: None if number % 2 else rng.integers(whole.size)].tobytes())
+        campaign = load_campaign(tmp_path / "campaign.toml")
+        try:
+            read_record(campaign)
+        except FusionError as error:
+            assert "damaged.xlsx" in str(error)
+            refused += 1
+    assert refused > 20
+    monkeypatch.setattr("interferometry.io.workbook._MOST_BYTES", 1000)
+    (tmp_path / "damaged.xlsx").write_bytes(whole.tobytes())
+    with pytest.raises(LaserFormatError, match=r"damaged\.xlsx: unpacks to 0\.0 GB, at most 1e-06 GB are read"):
+        read_record(load_campaign(tmp_path / "campaign.toml"))

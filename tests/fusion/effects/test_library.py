@@ -107,21 +107,10 @@ def test_a_users_effect_is_added_or_replaces_one_of_the_same_name(monkeypatch):
         return iter(())
 
     own, other = Effect("own", "", "", none), Effect("dead_path", "", "", none)
-
-    class Point:
-        def __init__(self, effect: Effect) -> None:
-            self.load = lambda: effect
-
-    asked = []
-
-    def entry_points(*, group: str) -> list[Point]:
-        asked.append(group)
-        return [Point(own), Point(other)]
-
-    monkeypatch.setattr(module, "entry_points", entry_points)
+    monkeypatch.setattr(module, "plugins", lambda: {"first": own, "second": other})
+    monkeypatch.setattr(module, "load_plugin", lambda plugin, point: point)
     effects = library()
     assert list(effects)[-1] == "own" and effects["dead_path"] is other
-    assert asked == ["thermofuse.effects"]
     assert describe_effect("own") is own
 
 

@@ -159,3 +159,10 @@ def test_all_faults_of_a_recipe_are_named_together(tmp_path):
     with pytest.raises(RecipeError) as refused:
         read_recipe(write(tmp_path, text))
     assert all(key in str(refused.value) for key in ("test.cycles = 0", "test.feed_mm_per_min = '300'", "duty.kind"))
+
+
+def test_a_recipe_that_is_no_text_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "RECIPE.toml"
+    path.write_bytes(b'title = "\xe9"')
+    with pytest.raises(RecipeError, match=r"RECIPE\.toml: byte 9 is not UTF-8; save the recipe as UTF-8 text"):
+        read_recipe(path)

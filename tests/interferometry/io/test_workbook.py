@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import zipfile
 from datetime import datetime, time
 from pathlib import Path
@@ -84,3 +85,41 @@ def test_a_workbook_without_a_value_is_refused(tmp_path: Path) -> None:
     openpyxl.Workbook().save(path)
     with pytest.raises(LaserFormatError, match="no visible sheet holds a value"):
         read_sheets(path, path.read_bytes())
+
+
+def test_a_bomb_is_refused_by_the_size_that_it_states(tmp_path: Path) -> None:
+    """The size is read from the table of contents of the archive; nothing is unpacked."""
+    path = tmp_path / "laser.xlsx"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("xl/sharedStrings.xml", b"0" * 1000)
+    content = bytearray(path.read_bytes())
+    entry = content.index(b"PK\x01\x02")
+    struct.pack_into("<I", content, entry + 24, 3_000_000_000)
+    with pytest.raises(LaserFormatError) as error:
+        read_sheets(path, bytes(content))
+    assert (
+        str(error.value)
+        == f"{path}: unpacks to 3.0 GB, at most 2 GB are read; save the sheet with the measured values alone"
+    )
+
+
+def test_entities_of_xml_are_not_expanded(tmp_path: Path) -> None:
+    """Ten levels of ten would be ten thousand million characters; a file outside must not be read either."""
+    levels = "".join(f'<!ENTITY l{k + 1} "{f"&l{k};" * 10}">' for k in range(10))
+    kinds = (
+        f'<!DOCTYPE x [<!ENTITY l0 "lol">{levels}]>',
+        f'<!DOCTYPE x [<!ENTITY l10 SYSTEM "{Path(__file__).as_uri()}">]>',
+    )
+    for kind in kinds:
+        path = write_ods(tmp_path / "laser.ods", [["value"]])
+        with zipfile.ZipFile(path) as archive:
+            parts = {name: archive.read(name).decode() for name in archive.namelist()}
+        parts["content.xml"] = parts["content.xml"].replace("?><", f"?>{kind}<", 1).replace(">value<", ">&l10;<")
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, text in parts.items():
+                archive.writestr(name, text)
+        try:
+            sheets = read_sheets(path, path.read_bytes())
+        except LaserFormatError:
+            continue
+        assert len(str(sheets)) < 200 and "Spreadsheets:" not in str(sheets)

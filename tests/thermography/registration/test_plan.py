@@ -91,3 +91,21 @@ def test_a_missing_file_is_named_by_the_error(tmp_path):
     with pytest.raises(FileNotFoundError) as caught:
         read_fiducials(tmp_path / "fiducials.csv")
     assert Path(caught.value.filename) == tmp_path / "fiducials.csv"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"name,x_mm,y_mm,diameter_mm\nF\xff1,1,2,16\n", "byte 28 is not UTF-8; save the file as CSV in UTF-8"),
+        (
+            b'name,x_mm,y_mm,diameter_mm\n"' + b"x" * 140_000 + b'",1,2,16\n',
+            "is not CSV (field larger than field limit",
+        ),
+    ],
+)
+def test_a_damaged_fiducial_file_is_named(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "fiducials.csv"
+    path.write_bytes(content)
+    with pytest.raises(FiducialError) as error:
+        read_fiducials(path)
+    assert str(error.value).startswith(f"{path}: {message}")

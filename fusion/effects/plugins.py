@@ -1,0 +1,88 @@
+"""Effects that other installed distributions add: which ones there are, who brought them, and how to leave them out."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+
+from fusion.effects.effect import Effect
+from fusion.errors import FusionError
+
+#: Entry-point group of effects.
+GROUP = "thermofuse.effects"
+_LEFT_OUT = "THERMOFUSE_NO_PLUGINS"
+
+
+class PluginError(FusionError):
+    """An effect of another distribution that cannot be used; the message names the distribution and how to leave it out."""
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """An effect that another installed distribution adds.
+
+    Attributes
+    ----------
+    name : str
+        Name of the entry point.
+    origin : str
+        Module and object, ``"package.module:object"``.
+    distribution, version : str
+        Installed distribution that brought it; "unknown" where it states none.
+    """
+
+    name: str
+    origin: str
+    distribution: str
+    version: str
+
+
+def leave_plugins_out() -> None:
+    """Run with the built-in effects alone, here and in every process that this one starts."""
+    os.environ[_LEFT_OUT] = "1"
+
+
+def plugins() -> dict[Plugin, EntryPoint]:
+    """Return the effects that other distributions add, none of them loaded yet; none where they are left out."""
+    if os.environ.get(_LEFT_OUT):
+        return {}
+    return {_describe(point): point for point in entry_points(group=GROUP)}
+
+
+def load_plugin(plugin: Plugin, point: EntryPoint) -> Effect:
+    """Load an effect of another distribution.
+
+    Parameters
+    ----------
+    plugin : Plugin
+        Whose effect it is.
+    point : EntryPoint
+        Where it is.
+
+    Raises
+    ------
+    PluginError
+        If it cannot be imported, or is no `Effect`.
+    """
+    try:
+        effect = point.load()
+    # Code of others may raise anything.
+    except Exception as error:
+        raise _unusable(plugin, f"cannot be loaded ({type(error).__name__}: {error})") from error
+    if not isinstance(effect, Effect):
+        raise _unusable(plugin, f"is a {type(effect).__name__}, not a fusion.Effect")
+    return effect
+
+
+def _unusable(plugin: Plugin, why: str) -> PluginError:
+    return PluginError(
+        f"the effect {plugin.name} ({plugin.origin}) of {plugin.distribution} {plugin.version} {why}; "
+        "correct or uninstall that distribution, or add --no-plugins"
+    )
+
+
+def _describe(point: EntryPoint) -> Plugin:
+    distribution = point.dist
+    known = ("unknown", "unknown") if distribution is None else (distribution.name, distribution.version)
+    return Plugin(point.name, point.value, *known)
