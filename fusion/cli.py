@@ -17,7 +17,7 @@ from fusion.endings import ExitCode, answering
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -202,18 +202,34 @@ def simulate(
 
 @app.command()
 def inspect(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="FLIR, laser or environment files.")],
+    paths: Annotated[
+        list[Path], typer.Argument(metavar="FILE|FOLDER...", help="Any file that a run reads, or folders of them.")
+    ],
     thumbnails: Annotated[Path | None, typer.Option(help="Folder for a small PNG of every thermal file.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print faults and warnings only.")] = False,
 ) -> None:
-    """Print what files hold, with warnings about implausible content."""
-    from fusion.report.terminal import describe_file, write_thumbnail
+    """Print what files hold, with warnings about implausible content.
+
+    A series of frames is summed up. A file that cannot be used is named and does not stop the others; the exit code is then 2.
+    """
+    from fusion.starting.inspection import inspect_paths, write_thumbnails
 
     with _answering():
-        for path in files:
-            for line in describe_file(path):
+        looked_into = []
+        for one in inspect_paths(paths):
+            looked_into.append(one)
+            for line in [] if as_json else one.shown(quiet=quiet):
                 console.print(line, soft_wrap=True, highlight=False, markup=False)
-            if thumbnails is not None and (picture := write_thumbnail(path, thumbnails)) is not None:
-                console.print(f"  thumbnail: {picture}", soft_wrap=True, highlight=False, markup=False)
+        if thumbnails is not None:
+            for picture in write_thumbnails(paths, thumbnails):
+                if not (quiet or as_json):
+                    console.print(f"  thumbnail: {picture}", soft_wrap=True, highlight=False, markup=False)
+        if as_json:
+            files = [one.as_json() for one in looked_into]
+            sys.stdout.write(json.dumps({"files": files}, indent=1, ensure_ascii=False) + "\n")
+        if any(one.fails for one in looked_into):
+            raise typer.Exit(ExitCode.BAD_INPUT)
 
 
 @app.command()

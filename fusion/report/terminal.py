@@ -7,20 +7,18 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import rich.table
 import xarray as xr
 from rich.markup import escape
 
 from fusion.attribution.duty_plan import DutyPlanError, Machine, plan_duty, switchings
 from fusion.campaign.config import CampaignError
-from fusion.campaign.inputs import counted, left_out_notices
+from fusion.campaign.inputs import left_out_notices
 from fusion.campaign.quantities import read_quantity
 from fusion.products.results import Results
 from fusion.products.results_axis import RegistrationPart
 from fusion.products.results_inputs import Figures
 from fusion.products.results_loop import Loop, RecordLoop
-from fusion.products.store import write_atomically
 from fusion.report.findings import (
     anomaly_cause,
     anomaly_figures,
@@ -41,16 +39,14 @@ from fusion.report.wording import (
     conditional_headline,
     duration,
     join,
-    moment,
     number,
     p_value,
     print_unit,
     untouched,
 )
 from interferometry import iso230
-from interferometry.inspection import describe_notes, describe_test
-from interferometry.io.readers import is_environment_log, read_deviations, read_environment
-from thermography.inspection import inspect_file, is_flir_file, thumbnail
+from interferometry.inspection import describe_notes
+from interferometry.io.readers import read_deviations
 
 
 def summary_table(results: Results) -> rich.table.Table:
@@ -321,79 +317,6 @@ def read_window(text: str, deviations: xr.Dataset) -> list[int]:
             f'--cycles "{text}" asks for cycles that were not measured; there are {cycles[0]} to {cycles[-1]}'
         )
     return window
-
-
-def describe_file(path: Path) -> list[str]:
-    """Return what a file holds, with warnings about implausible content.
-
-    Parameters
-    ----------
-    path : Path
-        FLIR file, deviations, or environment log.
-
-    Returns
-    -------
-    list of str
-        Lines for the terminal.
-
-    Raises
-    ------
-    FlirFormatError, LaserFormatError
-        If the file is of no known kind, or cannot be used.
-    """
-    if is_flir_file(path):
-        return inspect_file(path).lines()
-    if is_environment_log(path):
-        return _describe_log(path, read_environment(path))
-    return _describe_deviations(path, read_deviations(path, rotary=True))
-
-
-def write_thumbnail(path: Path, folder: Path) -> Path | None:
-    """Write a small picture of the first frame of a thermal file as ``<file>.png`` and return its path.
-
-    Parameters
-    ----------
-    path : Path
-        FLIR file; any other file has no picture and gives None.
-    folder : Path
-        Where the picture goes; created where it is absent.
-    """
-    if not is_flir_file(path):
-        return None
-    folder.mkdir(parents=True, exist_ok=True)
-    target = folder / f"{path.name}.png"
-    write_atomically(target, lambda part: part.write_bytes(thumbnail(path)))
-    return target
-
-
-def _describe_deviations(path: Path, deviations: xr.Dataset) -> list[str]:
-    """Return size, range and times of a file of deviations as lines."""
-    time, position = deviations["time"].values, deviations["position"].values
-    timed = time[~np.isnat(time)]
-    readings = int(np.isfinite(deviations["deviation"]).sum())
-    lines = [
-        f"{path}: deviations, {counted(deviations.sizes['cycle'], 'cycle')}, {counted(deviations.sizes['target'], 'target')} "
-        f"from {position.min():g} to {position.max():g} {deviations['position'].attrs['units']}, "
-        f"{readings} of {deviations['deviation'].size} readings",
-        f"  deviation {float(deviations['deviation'].min()):.3f} to {float(deviations['deviation'].max()):.3f} "
-        f"{print_unit(deviations['deviation'].attrs['units'])}",
-    ]
-    if timed.size:
-        lines.append(f"  {moment(timed.min())} to {moment(timed.max())}, times {deviations['time'].attrs['origin']}")
-    else:
-        lines.append("  no times: thermofuse run needs one per reading")
-    return [*lines, *(f"  {line}" for line in describe_test(deviations)), *_warnings(deviations)]
-
-
-def _describe_log(path: Path, log: xr.Dataset) -> list[str]:
-    """Return times and range of every series of an environment log as lines."""
-    lines = [
-        f"{path}: environment, {log.sizes['time']} rows, {moment(log['time'].values[0])} to {moment(log['time'].values[-1])}"
-    ]
-    for name, values in log.data_vars.items():
-        unit = print_unit(values.attrs["units"])
-        lines.append(f"  {name} {float(values.min()):.2f} to {float(values.max()):.2f} {unit}")
-    return lines + _warnings(log)
 
 
 def _warnings(dataset: xr.Dataset) -> list[str]:

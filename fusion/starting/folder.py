@@ -60,7 +60,7 @@ def scan_folder(folder: Path) -> FolderContent:
     -------
     FolderContent
     """
-    paths = list(_inputs(folder))
+    paths = list(input_files(folder))
     thermal = [path for path in paths if path.suffix.lower() != ".toml" and is_flir_file(path)]
     series: dict[tuple[Path, str], list[Path]] = {}
     for path in thermal:
@@ -83,13 +83,19 @@ def scan_folder(folder: Path) -> FolderContent:
     return FolderContent(folder, tuple(patterns), tuple(frames), files, tuple(unknown))
 
 
-def _inputs(folder: Path) -> Iterator[Path]:
-    """Yield the files of a folder and its subfolders, without hidden ones and without results."""
+def input_files(folder: Path) -> Iterator[Path]:
+    """Yield the files of a folder and its subfolders, sorted, without hidden ones and without results of a run.
+
+    Parameters
+    ----------
+    folder : Path
+        An existing folder.
+    """
     for path in sorted(folder.iterdir()):
         if path.name.startswith("."):
             continue
         if path.is_dir():
             if not (path / _RESULTS).is_file():
-                yield from _inputs(path)
+                yield from input_files(path)
         elif path.is_file():
             yield path

@@ -11,7 +11,11 @@ from pathlib import Path
 
 from fusion.campaign.quantities import unit_name
 from interferometry.errors import InterferometryError
+from interferometry.io.delimited import read_grids
+from interferometry.io.ecmc import is_ecmc_log
+from interferometry.io.long_table import find_long_table
 from interferometry.io.readers import is_environment_log, read_deviations
+from interferometry.io.wide_table import find_wide_table
 from interferometry.io.workbook import is_workbook, read_sheets
 from thermography.inspection import is_flir_file
 from thermography.io.flir import index_frames
@@ -42,6 +46,7 @@ class Kind(StrEnum):
     DRIVERS = "log of drivers"
     RECORD = "record of temperatures and displacements"
     UNKNOWN = "not understood"
+    UNREADABLE = "cannot be opened"
 
 
 @dataclass(frozen=True)
@@ -92,7 +97,7 @@ def recognise(path: Path) -> Recognised:
         kind = _by_headings(headings)
         if kind is None:
             kind = Kind.ENVIRONMENT if is_environment_log(path) else Kind.DEVIATIONS
-        if kind is Kind.DEVIATIONS:
+        if kind is Kind.DEVIATIONS and not _holds_deviations(path):
             read_deviations(path, rotary=True)
     except InterferometryError as error:
         return Recognised(path, Kind.UNKNOWN, _shortened(str(error).removeprefix(f"{path}").lstrip(":, ")))
@@ -142,6 +147,15 @@ def is_time(heading: str) -> bool:
         Heading of a column.
     """
     return heading.strip().lower() == "time" or column_unit(heading) in _TIME_UNITS
+
+
+def _holds_deviations(path: Path) -> bool:
+    """Whether a file has the columns of deviations, whatever is in them; where not, its reader says what is missing."""
+    with path.open("rb") as stream:
+        start = stream.read(4096)
+    if b"HEADER::" in start or is_ecmc_log(start):
+        return True
+    return any(find_long_table(grid) is not None or find_wide_table(grid) is not None for grid in read_grids(path))
 
 
 def _shortened(reason: str) -> str:

@@ -107,10 +107,13 @@ def test_inspect_tells_what_files_hold(campaign_folder: Path, tmp_path: Path) ->
     assert "FLIR, 1 frame of 640 x 480" in result.output
     assert "deviations, 24 cycles, 6 targets from 0 to 250 mm, 288 of 288 readings" in result.output
     assert "air_pressure" in result.output
-    assert (
-        invoke("inspect", tmp_path / "absent.jpg").stderr
-        == f"thermofuse: {tmp_path / 'absent.jpg'}: No such file or directory\n"
-    )
+    faulty = invoke("inspect", tmp_path / "absent.jpg", campaign_folder / "laser.csv")
+    assert faulty.exit_code == 2
+    assert faulty.output.startswith(f"{tmp_path / 'absent.jpg'}: cannot be opened: No such file or directory\n")
+    assert "deviations, 24 cycles" in faulty.output
+    told = json.loads(invoke("inspect", campaign_folder, "--json").output)["files"]
+    assert len(told) == 6 and not any(one["fault"] for one in told)
+    assert invoke("inspect", campaign_folder, "--quiet").output == ""
 
 
 def test_init_asks_at_a_terminal_only(campaign_folder: Path, tmp_path: Path) -> None:

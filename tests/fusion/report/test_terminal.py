@@ -1,8 +1,6 @@
-"""What the command prints: findings of a run, windows of cycles, the content of files."""
+"""What the command prints: findings of a run, windows of cycles."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ import pytest
 from fusion.campaign.config import CampaignError
 from fusion.consistency.checks import Check, inputs_part
 from fusion.products.results import Notice, assemble
-from fusion.report.terminal import describe_file, read_window, summary_rows
+from fusion.report.terminal import read_window, summary_rows
 from interferometry.deviations import build_deviations
 from tests.fusion.results_sample import PARTS
 
@@ -60,13 +58,3 @@ def test_a_window_names_cycles_that_were_measured() -> None:
     assert read_window("8", deviations) == [8]
     with pytest.raises(CampaignError, match="there are 1 to 8"):
         read_window("4-2", deviations)
-
-
-def test_a_log_is_described_with_its_range(tmp_path: Path) -> None:
-    path = tmp_path / "environment.csv"
-    head = "time,air_temperature_degC,air_pressure_hPa,relative_humidity_percent,material_temperature_degC"
-    rows = [f"2026-03-09T06:{minute:02d}:00Z,{20 + minute / 10},1000,45,21" for minute in range(10)]
-    path.write_text("\n".join([head, *rows]) + "\n")
-    lines = describe_file(path)
-    assert lines[0] == f"{path}: environment, 10 rows, 2026-03-09 06:00 UTC to 2026-03-09 06:09 UTC"
-    assert "  air_temperature 20.00 to 20.90 °C" in lines
