@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import base64
-import json
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from fusion.attribution.family_wise import LEVEL
@@ -18,13 +15,9 @@ from fusion.report.attribution_section import leading_region
 from fusion.report.charts import attribution, drift, neighbours, plan, readings, timeline
 from fusion.report.charts import loop as closed_loop
 from fusion.report.charts.style import Chart
+from fusion.report.charts.thermal_map import plot_thermal_map
 from fusion.report.page import render_page
 from interferometry.figures import evaluate_common_start
-
-#: Largest number of map values in the file; above it cycles are thinned and cells are averaged, and the report says so.
-_MAP_BUDGET = 2_000_000
-_MISSING = -32768
-_LAYERS = (("rise", "temperature_rise", "K"), ("temperature", "temperature", "°C"))
 
 
 def render_report(
@@ -61,8 +54,8 @@ def render_report(
 
     Notes
     -----
-    Charts are SVG, fields are 16-bit maps. Recordings whose maps exceed two million values are thinned in cycles and averaged in cells,
-    and the page says so. Terms of ISO 230-2:2014; expanded uncertainties with k = 2 (GUM 6.2).
+    Maps that exceed three million values are thinned in cycles and averaged in cells, and the page says so. Terms of
+    ISO 230-2:2014; expanded uncertainties with k = 2 (GUM 6.2).
 
     Examples
     --------
@@ -77,13 +70,18 @@ def render_report(
             provenance=provenance,
             summary=record_section.describe_record(results, provenance, datasets["record"]),
         )
+    charts, thermal_map = _draw_charts(results, datasets), None
+    if "fields" in datasets:
+        position = datasets["deviations"]["position"] if "deviations" in datasets else None
+        thermal_map = plot_thermal_map(datasets["fields"], results.hotspots or (), position)
+        charts["thermal_map"] = thermal_map.chart
     return render_page(
         "report.html.j2",
-        _draw_charts(results, datasets),
+        charts,
         results=results,
         provenance=provenance,
         summary=summary_section.describe_campaign(results, provenance, datasets, joint),
-        maps=_embed_maps(datasets["fields"], results) if "fields" in datasets else None,
+        thermal_map=thermal_map,
     )
 
 
@@ -167,59 +165,3 @@ def _loop_charts(loop: xr.Dataset, deviations: xr.Dataset) -> dict[str, Chart]:
         charts["held_out_positions"] = closed_loop.plot_held_out_positions(loop, deviations)
         charts["predicted_measured"] = closed_loop.plot_predicted_measured(loop, deviations)
     return charts
-
-
-def _embed_maps(fields: xr.Dataset, results: Results) -> dict[str, Any]:
-    """Return the interactive map of the table: per-cycle fields as 16-bit numbers with offset and step, in JSON."""
-    kept, note = _thin(fields[[variable for _, variable, _ in _LAYERS]])
-    x, y = kept["x"].values, kept["y"].values
-    half = float(np.median(np.diff(x))) / 2
-    layers = {name: _layer(name, kept[variable].values, unit) for name, variable, unit in _LAYERS}
-    content = {
-        "nx": x.size, "ny": y.size,
-        "x0": x[0] - half, "x1": x[-1] + half, "y0": y[0] - half, "y1": y[-1] + half,
-        "cycles": [f"cycle {cycle}" for cycle in kept["cycle"].values],
-        "layers": layers,
-        "line": _line(fields),
-        "hotspots": [{"x_mm": spot.x_mm, "y_mm": spot.y_mm} for spot in results.hotspots or ()],
-    }  # fmt: skip
-    text = json.dumps(content, default=float).replace("</", "<\\/")
-    return {"entries": [{"json": text, "layers": list(layers), "count": kept.sizes["cycle"]}], "note": note}
-
-
-def _thin(fields: xr.Dataset) -> tuple[xr.Dataset, str]:
-    """Return the fields within the budget: every n-th cycle, then averages of blocks of cells; and the sentence that says so."""
-    cells, cycles = fields.sizes["x"] * fields.sizes["y"], fields.sizes["cycle"]
-    note = []
-    block = int(np.ceil(np.sqrt(max(1.0, cells * len(_LAYERS) * min(cycles, 25) / _MAP_BUDGET))))
-    if block > 1:
-        fields = fields.coarsen(x=block, y=block, boundary="trim").mean()
-        note.append(f"The map shows means of {block} × {block} cells")
-    every = int(np.ceil(fields.sizes["x"] * fields.sizes["y"] * len(_LAYERS) * cycles / _MAP_BUDGET))
-    if every > 1:
-        chosen = sorted({*range(0, cycles, every), cycles - 1})
-        fields = fields.isel(cycle=chosen)
-        note.append(f"{len(chosen)} of {cycles} cycles")
-    return fields, f"{', '.join(note)}; fields.nc holds all." if note else ""
-
-
-def _layer(name: str, values: np.ndarray, unit: str) -> dict[str, Any]:
-    """Return one quantity as 16-bit numbers in base64, with the range and palette that show it."""
-    import matplotlib as mpl
-
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    step = max((high - low) / 60000.0, 1e-6)
-    stored = np.where(np.isfinite(values), np.round((values - low) / step) - 30000, _MISSING).astype("<i2")
-    palette = np.round(mpl.colormaps["inferno"](np.arange(256))[:, :3] * 255).astype(int)
-    return {
-        "name": name, "unit": unit, "offset": low + 30000 * step, "step": step,
-        "low": float(np.nanpercentile(values, 0.1)), "high": float(np.nanpercentile(values, 99.9)),
-        "palette": palette.tolist(), "values": base64.b64encode(stored.tobytes()).decode(),
-    }  # fmt: skip
-
-
-def _line(fields: xr.Dataset) -> list[list[float]]:
-    """Return the plan points of the targets along the measured line; none where no laser measured."""
-    if "target_x" not in fields:
-        return []
-    return np.stack([fields["target_x"].values, fields["target_y"].values], axis=1).tolist()

@@ -55,15 +55,15 @@ def embed(charts: Mapping[str, Chart]) -> dict[str, EmbeddedChart]:
 
     Notes
     -----
-    The columns for download travel in the Bokeh document (as its tag), compressed like every array in it; text in them is protected
-    against being read as a formula when the file is written.
+    The columns for download travel in the Bokeh document, as the first tag of the figure, compressed like every array in it; text in
+    them is protected against being read as a formula when the file is written.
     """
     return {name: _embedded(name, chart) for name, chart in charts.items()}
 
 
 def _embedded(name: str, chart: Chart) -> EmbeddedChart:
     columns = {heading: _compact(np.asarray(values)) for heading, values in chart.columns.items()}
-    chart.figure.tags = [ColumnDataSource(columns)]
+    chart.figure.tags = [ColumnDataSource(columns), *chart.figure.tags]
     text = json.dumps(json_item(chart.figure, f"drawing-{name}"), separators=(",", ":"))
     return EmbeddedChart(name, chart.seen, _height(chart), _in_script(text, "</"))
 

@@ -7,8 +7,10 @@
     if (!started.has(figure)) {
       const item = JSON.parse(figure.querySelector("script").textContent);
       started.set(figure, Bokeh.embed.embed_item(item).then((views) => {
-        roots.set(figure, [...views.roots][0]);
-        return roots.get(figure);
+        const view = [...views.roots][0];
+        roots.set(figure, view);
+        if (figure.querySelector(".controls")) steer(figure, view);
+        return view;
       }));
     }
     return started.get(figure);
@@ -63,7 +65,57 @@
     if (button) actions[button.dataset.do](figure, await draw(figure), button);
   });
 
+  function steer(figure, view) {  // the thermal map: quantity, cycle, play
+    const plot = view.model, [, source, about] = plot.tags;
+    const { scales, cycles } = about instanceof Map ? Object.fromEntries(about) : about;
+    const property = (scale, name) => scale instanceof Map ? scale.get(name) : scale[name];
+    const cells = plot.renderers.find((part) => part.name === "cells");
+    const image = cells.data_source.data.image[0], bar = plot.below.find((part) => part.name === "bar");
+    const reading = plot.toolbar.tools.find((tool) => tool.name === "reading"), columns = source.data;
+    const layers = scales.map((scale) => {  // each cycle is kept as its difference to the one before, in 16 bits
+      const name = property(scale, "name"), steps = (columns instanceof Map ? columns.get(name) : columns[name]).slice();
+      for (let at = image.length; at < steps.length; at++) steps[at] += steps[at - image.length];
+      return steps;
+    });
+    const controls = figure.querySelector(".controls"), drawing = figure.querySelector(".drawing");
+    const menu = controls.querySelector("select"), slider = controls.querySelector("input"), play = controls.querySelector("button");
+    function show() {
+      const scale = (name) => property(scales[menu.selectedIndex], name), steps = layers[menu.selectedIndex];
+      const start = Number(slider.value) * image.length;
+      let least = Infinity, most = -Infinity;
+      for (let at = 0; at < image.length; at++) {
+        const step = steps[start + at];
+        image[at] = step === -32768 ? NaN : step * scale("step");
+        if (step !== -32768) { least = Math.min(least, image[at]); most = Math.max(most, image[at]); }
+      }
+      cells.glyph.color_mapper.setv({ low: scale("low"), high: scale("high"), palette: scale("palette") });
+      cells.data_source.change.emit();
+      const format = scale("decimals") ? `0.${"0".repeat(scale("decimals"))}` : "0", unit = scale("unit");
+      bar.title = unit ? `${scale("name")} / ${unit}` : scale("name");
+      reading.tooltips = [["x", "$x{0} mm"], ["y", "$y{0} mm"], [scale("name"), `@image{${format}} ${unit}`]];
+      controls.querySelector("output").textContent = cycles[slider.value];
+      const range = least <= most ? `${least.toFixed(scale("decimals"))} to ${most.toFixed(scale("decimals"))} ${unit}` : "not seen";
+      drawing.setAttribute("aria-label", `Plan of the table in cycle ${cycles[slider.value]}: ${scale("name")} ${range}.`);
+    }
+    let running = 0;
+    play.addEventListener("click", () => {
+      if (running) { clearInterval(running); running = 0; } else {
+        if (slider.value === slider.max) slider.value = 0;
+        show();
+        running = setInterval(() => {
+          if (slider.value === slider.max) { play.click(); return; }
+          slider.stepUp(); show();
+        }, 250);
+      }
+      play.textContent = running ? "Stop" : "Play";
+      play.setAttribute("aria-pressed", Boolean(running));
+    });
+    slider.addEventListener("input", show);
+    menu.addEventListener("change", show);
+  }
+
   window.addEventListener("beforeprint", () => {
+    document.querySelectorAll("details:not(.unprinted)").forEach((part) => { part.open = true; });
     for (const [figure, view] of roots) {
       const drawing = view.export("svg", false).ctx.get_svg();
       const [width, height] = [view.bbox.width, view.bbox.height];

@@ -97,27 +97,24 @@ def test_nothing_scrolls_sideways(opened: tuple[Page, list[str]], width: int) ->
     page.set_viewport_size({"width": 1280, "height": 900})
 
 
-def test_the_map_follows_slider_and_pointer(opened: tuple[Page, list[str]]) -> None:
+def test_the_map_follows_slider_menu_and_play(opened: tuple[Page, list[str]]) -> None:
     page, faults = opened
-    root = page.locator(".map").first
-    canvas = root.locator("canvas.field")
-    pixels = "c => c.getContext('2d').getImageData(0, 0, c.width, c.height).data.reduce((a, b) => a + b, 0)"
-    last = canvas.evaluate(pixels)
-    assert root.locator(".cycle-label").inner_text() == "cycle 24"
-    root.locator("input[type=range]").focus()
+    figure = page.locator("#figure-thermal_map")
+    figure.scroll_into_view_if_needed()
+    page.wait_for_function("document.documentElement.dataset.charts == 'drawn'")
+    slider, shown = figure.locator("input[type=range]"), figure.locator("output")
+    assert shown.inner_text() == "24"
+    slider.focus()
     page.keyboard.press("Home")
-    assert root.locator(".cycle-label").inner_text() == "cycle 1"
-    assert canvas.evaluate(pixels) != last
-    root.locator("select").select_option("temperature")
-    box = canvas.bounding_box()
-    assert box is not None
-    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    shown = re.fullmatch(
-        r"x (\d+) mm, y (\d+) mm: rise (-?[\d.]+) K, temperature ([\d.]+) °C", root.locator(".readout").inner_text()
-    )
-    assert shown is not None
-    assert abs(float(shown[1]) - 350) <= 20 and abs(float(shown[2]) - 90) <= 20
-    assert float(shown[3]) == 0.0 and 15 < float(shown[4]) < 40
+    assert shown.inner_text() == "1"
+    figure.locator("select").select_option("temperature")
+    said = figure.locator(".drawing").get_attribute("aria-label") or ""
+    found = re.fullmatch(r"Plan of the table in cycle 1: temperature ([\d.]+) to ([\d.]+) °C\.", said)
+    assert found is not None and 15 < float(found[1]) < float(found[2]) < 40
+    play = figure.get_by_role("button", name="Play")
+    play.click()
+    page.wait_for_function("document.querySelector('#figure-thermal_map output').textContent == '3'")
+    figure.get_by_role("button", name="Stop").click()
     assert faults == []
 
 
