@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from interferometry import anomalies as anomalies_module
 from interferometry.anomalies import (
     Anomaly,
     _moving_apart,
@@ -168,3 +169,35 @@ def test_a_direction_without_any_scatter_leaves_the_excess_to_the_other() -> Non
         coords={"direction": ["positive", "negative"]},
     )
     assert _scatter_direction(estimated, 2, np.array([0, 1, 3, 4, 5, 6, 7])) == "positive"
+
+
+@pytest.mark.parametrize(("share_above", "flagged"), [(0.03, True), (0.04, False)])
+def test_scatter_has_seven_tenths_of_the_error_probability(
+    share_above: float, flagged: bool, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    """At a level of 0.05, excess scatter is found up to p = 0.035, and its p-value is given on the scale of the whole family."""
+    deviations, permutations = simulate(rng)[0], 999
+    largest = np.zeros(permutations)
+    largest[: int(share_above * (permutations + 1)) - 1] = 9.0
+    excess = np.zeros(16)
+    excess[4] = 5.0
+    pools: list[int] = []
+
+    def tested(z: np.ndarray, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        pools.append(z.shape[2])
+        return (excess, largest) if len(pools) == 1 else (np.zeros(z.shape[2]), np.full(count, 9.0))
+
+    monkeypatch.setattr(anomalies_module, "_scatter_test", tested)
+    found = anomalies_module._scatter_anomalies(estimate_drift(deviations), 0.05, permutations, rng)
+    assert [one.target for one in found] == ([5] if flagged else [])
+    assert not flagged or found[0].p_value == pytest.approx(share_above / 0.7)
+
+
+def test_one_wild_reading_counts_as_three_standard_deviations(rng: np.random.Generator) -> None:
+    """The excess of a target does not depend on how far beyond three standard deviations one of its readings lies."""
+    z = rng.standard_normal((60, 2, 8))
+    excess = []
+    for wild in (3.0, 30.0):
+        z[20, 0, 5] = wild
+        excess.append(anomalies_module._scatter_test(z, 1, np.random.default_rng(1))[0])
+    np.testing.assert_array_equal(excess[0], excess[1])

@@ -127,3 +127,12 @@ def test_inputs_stay_as_they_were():
     align(readings, field, AXIS)
     xr.testing.assert_identical(readings, kept[0])
     xr.testing.assert_identical(field, kept[1])
+
+
+def test_the_measured_line_is_three_cells_wide():
+    """A strip 10 mm (two cells) beside the line warms alone: a mean over 7.5 mm to either side does not see it."""
+    strip = align(deviations(), fields(lambda x, y, s: 0.01 * s * (np.abs(y - 105.0) < 3.0) + 0 * x), AXIS)
+    inside = strip["inside_frames"].values
+    np.testing.assert_allclose(strip["axis_integral"].values[inside], 0.0, atol=1e-9)
+    on_it = align(deviations(), fields(lambda x, y, s: 0.01 * s * (np.abs(y - 90.0) < 3.0) + 0 * x), AXIS)
+    assert float(abs(on_it["axis_integral"].values[inside]).max()) > 1.0

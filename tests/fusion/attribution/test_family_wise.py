@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from fusion.alignment.first_order_lag import lag_operators
+from fusion.attribution import family_wise as module
 from fusion.attribution.drift_channels import DriftSeries
-from fusion.attribution.family_wise import FieldSeries, evaluate_candidates
+from fusion.attribution.family_wise import LAGS_S, FieldSeries, evaluate_candidates
 from fusion.attribution.warm_up import Excitation
 
 VARIED = Excitation(0.5, False, 3)
@@ -66,3 +68,37 @@ def test_favour_lowers_the_threshold_of_a_set_at_the_cost_of_the_others(rng):
     favoured = evaluate(np.random.default_rng(5), values, candidates, favour={"modes": 0.5}).sets
     assert favoured["modes"].threshold[0] < plain["modes"].threshold[0]
     assert favoured["cells"].threshold[0] >= plain["cells"].threshold[0]
+
+
+def test_a_body_of_forty_minutes_is_found_with_its_lag_among_the_usual_ones(rng):
+    """Lags reach from none to an hour and a half; a grid of seconds would not tell a slow body from its surface."""
+    cells = walks(rng, 4)
+    (slow,) = lag_operators(SECONDS, [2400.0])
+    values = (slow @ cells.values)[:, 1] + 0.02 * rng.standard_normal(60)
+    result = evaluate_candidates([drift("common", values)], {"cells": cells}, VARIED, draws=19, checks=0, rng=rng)
+    assert LAGS_S[int(result.sets["cells"].lag_index[0, 1])] == 2400.0
+
+
+def test_a_family_wise_p_value_is_the_rank_among_the_simulated_maxima():
+    """One row: its unit and centre cancel, and the p-value is (1 + number of maxima at least as large) / (draws + 1)."""
+    maxima = np.arange(1.0, 20.0)[None, :]
+    (p,), threshold = module._family_wise([np.array([0.5, 10.0, 18.5, 25.0])], maxima, np.zeros(1))
+    np.testing.assert_allclose(p, [20 / 20, 11 / 20, 2 / 20, 1 / 20])
+    assert threshold[0] == pytest.approx(19.0)
+
+
+def test_every_row_is_ranked_among_the_largest_maxima_of_all_rows():
+    """Two rows whose maxima run against each other: in every draw one of them is at least 10, so that 9.5 is nothing special."""
+    maxima = np.stack([np.arange(1.0, 20.0), np.arange(19.0, 0.0, -1.0)])
+    p_values, _ = module._family_wise([np.array([9.5]), np.array([9.5])], maxima, np.zeros(2))
+    assert [float(p[0]) for p in p_values] == [1.0, 1.0]
+
+
+def test_permuted_residuals_stay_in_blocks_of_a_tenth_of_the_series(rng):
+    """About ten cuts in a series of any length; a reading keeps its neighbour everywhere else."""
+    for length in (60, 200):
+        orders = [module._shuffle_blocks(length, rng) for _ in range(300)]
+        assert all(sorted(order) == list(range(length)) for order in orders[:5])
+        broken = np.mean([np.count_nonzero(np.diff(order) % length != 1) for order in orders])
+        # Poisson with mean 10, less the cut at the start and blocks that meet again: 9 to 10; the mean of 300 is known within 0.2.
+        assert 8.0 < broken < 10.6

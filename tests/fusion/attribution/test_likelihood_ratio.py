@@ -1,5 +1,7 @@
 """The fast likelihood ratio against dense algebra."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import linalg
@@ -101,3 +103,41 @@ def test_tiles_cover_all_columns_once_in_whole_groups():
         covered[tile] += 1
         assert tile.start % 6 == 0
     assert (covered == 1).all()
+
+
+def null_of_a_walk(rng):
+    """Null models of a random walk of 40 values beside a mean and a trend, and the identical permutation 400 times."""
+    seconds = np.arange(40) * 300.0
+    nuisance = np.column_stack([np.ones(40), seconds / seconds[-1]])
+    bank = null_bank(np.cumsum(rng.standard_normal(40)), seconds, np.ones(40), nuisance)
+    return bank, np.tile(np.arange(40), (400, 1))
+
+
+def with_odds(bank, odds):
+    """The same null models, some grid points with the given odds and the others impossible."""
+    log_likelihood = np.full(len(bank.whitenings), -np.inf)
+    log_likelihood[list(odds)] = np.log(list(odds.values()))
+    return replace(bank, log_likelihood=log_likelihood)
+
+
+def test_simulated_series_are_coloured_by_drift_variances_drawn_by_their_likelihood(rng):
+    """Without regressors and permuted by the identity, a series is one of two that are known exactly."""
+    bank, orders = null_of_a_walk(rng)
+    bare = replace(bank, whitenings=tuple(replace(one, basis=np.empty((40, 0))) for one in bank.whitenings))
+    series = resample(with_odds(bare, {2: 3.0, 6: 1.0}), orders, rng=rng)
+    expected = [one.colour @ one.project @ bank.values for one in (bank.whitenings[2], bank.whitenings[6])]
+    is_first = np.isclose(series, expected[0]).all(axis=1)
+    assert (is_first | np.isclose(series, expected[1]).all(axis=1)).all()
+    # 300 of 400 in the mean; 4 standard deviations are 35.
+    assert is_first.sum() == pytest.approx(300, abs=35)
+
+
+def test_what_the_nuisance_regressors_took_out_is_put_back_at_random(rng):
+    """The part of a whitened simulated series along the regressors has the variance of its other parts."""
+    bank, orders = null_of_a_walk(rng)
+    point = bank.whitenings[4]
+    series = resample(with_odds(bank, {4: 1.0}), orders, rng=rng)
+    along = np.linalg.solve(point.colour, series.T).T @ point.basis
+    residual = point.project @ bank.values
+    # The mean square of 800 normal numbers is known to 5 %; 4 sigma.
+    assert np.mean(along**2) == pytest.approx(residual @ residual / bank.freedom, rel=0.2)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from fusion.attribution import randomised_duty as module
 from fusion.attribution.randomised_duty import (
     DutyLaw,
     RandomisationError,
@@ -98,3 +99,25 @@ def test_a_logged_load_that_was_never_switched_is_refused(rng):
 def test_a_log_that_the_law_cannot_have_made_is_refused(rng, names, law, message):
     with pytest.raises(RandomisationError, match=message):
         read_duty(logged(rng), names, law, source="drivers.csv")
+
+
+def test_a_schedule_starts_on_as_often_as_off(rng):
+    """200 schedules: 100 in the mean, 4 standard deviations are 28."""
+    law = DutyLaw(1800.0, 300.0)
+    starts = [law.course(FINE, rng)[0] for _ in range(200)]
+    assert sum(starts) == pytest.approx(100, abs=28)
+
+
+def test_every_source_is_ranked_among_the_largest_statistics_of_all_sources(rng, monkeypatch):
+    """Redrawn schedules reach 4 for the first source and 1 for the others: a statistic of 3 is nothing special for any of them."""
+    law = DutyLaw(1800.0)
+    duty = run_schedule(law, rng)
+    sources = duty.sizes["source"]
+    redrawn = np.ones((19, sources, 8))
+    redrawn[:, 0] = 4.0
+    measured = np.full((sources, 8), 3.0)
+    measured[0] = 5.0
+    answers = iter([measured, redrawn.reshape(-1, 8)])
+    monkeypatch.setattr(module, "_statistics", lambda series, banks, responses: next(answers))
+    found = randomisation_test(driven(duty, 1, rng, um=6.0), duty, law, draws=19)
+    assert found["p_value"].values.tolist() == [1 / 20, *[1.0] * (sources - 1)]

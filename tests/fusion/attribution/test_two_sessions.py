@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from fusion.attribution import two_sessions as module
 from fusion.attribution.attribute import correlate
 from fusion.attribution.two_sessions import SessionComparisonError, compare_sessions
 from tests.fusion import field_simulator as simulator
@@ -78,3 +79,24 @@ def test_other_plans_are_refused(first):
 def test_other_channels_are_refused(first):
     with pytest.raises(SessionComparisonError, match="share no drift channel"):
         compare_sessions(first.sel(channel=["common"]), first.sel(channel=["reversal"]))
+
+
+@pytest.mark.parametrize(
+    ("changed", "agrees"),
+    [
+        ({}, True),
+        ({"sensitivity": -2.0}, False),
+        ({"p_value": 0.06}, False),
+        ({"sensitivity": 2.0 + 2.9 * np.hypot(0.3, 0.4)}, True),
+        ({"sensitivity": 2.0 + 3.1 * np.hypot(0.3, 0.4)}, False),
+        ({"x": 100.0 + 49.0}, True),
+        ({"x": 100.0 + 40.0, "y": 50.0 + 40.0}, False),
+    ],
+)
+def test_sessions_agree_with_one_place_one_sign_one_size_and_both_p_values(changed, agrees):
+    """Sizes may differ by three standard uncertainties of their difference, places by 50 mm; the larger p-value counts."""
+    first = {"p_value": 0.01, "sensitivity": 2.0, "sensitivity_u": 0.3, "x": 100.0, "y": 50.0}
+    second = {**first, "p_value": 0.04, "sensitivity_u": 0.4, **changed}
+    pair = module._Pair(*({name: np.full((1, 1), value) for name, value in one.items()} for one in (first, second)))
+    assert bool(pair.agree[0, 0]) is agrees
+    assert float(pair.p_value[0, 0]) == second["p_value"]

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from fusion.diagnosis import causes
-from fusion.diagnosis.diagnose import THRESHOLDS, _directions_sentence, _serial_sentence, diagnose
+from fusion.diagnosis.diagnose import (
+    THRESHOLDS,
+    _directions_sentence,
+    _objections,
+    _probabilities,
+    _serial_sentence,
+    diagnose,
+)
 from fusion.diagnosis.explanations import DiagnosisError
 from tests.fusion import field_simulator as simulator
 from tests.fusion.residual_simulator import CAUSES, odd_position
@@ -151,3 +158,82 @@ def test_what_to_check_without_a_cause_ends_with_the_leading_candidate():
     )
     # A random walk is no cause, so there is nothing of its own to inspect.
     assert causes.undetermined_check("slow") == causes.undetermined_check("undetermined") == generic
+
+
+def fitted(**changes):
+    """A case of which nothing is wrong: a local temperature and a step that their tests accept and the other direction confirms."""
+    profile = SimpleNamespace(p_value=0.001, hold_out_gain=3.0, log_likelihood=0.0, by_direction=(0.3, 0.2))
+    temperature, step = (
+        SimpleNamespace(**{**vars(profile), **changes.pop(name, {})}) for name in ("temperature", "step")
+    )
+    return SimpleNamespace(
+        residual=SimpleNamespace(seconds=np.arange(100.0)),
+        random_walk=SimpleNamespace(white=0.0, shared=0.0, one_direction=-np.inf),
+        scatter=SimpleNamespace(
+            **{"both": 0.0, "one_direction": -np.inf, "along_approach": -np.inf, **changes.pop("scatter", {})}
+        ),
+        temperature=temperature,
+        step=step,
+        tested={"step": step, "local_temperature": temperature},
+        serial_p=0.5,
+        warm_up_share=0.5,
+    )
+
+
+@pytest.mark.parametrize(
+    ("leading", "probability", "changes", "reason"),
+    [
+        ("local_temperature", 0.80, {}, None),
+        ("local_temperature", 0.79, {}, "probability 0.79 of local temperature is below its threshold 0.80"),
+        (
+            "local_temperature",
+            0.95,
+            {"temperature": {"by_direction": (0.3, -0.1)}},
+            "the sign differs between directions",
+        ),
+        (
+            "local_temperature",
+            0.95,
+            {"temperature": {"hold_out_gain": 0.0}},
+            "the fit to one direction does not predict",
+        ),
+        ("step", 0.60, {}, None),
+        ("step", 0.59, {}, "is below its threshold 0.60"),
+        ("step", 0.95, {"step": {"hold_out_gain": -0.1}}, "the fit to one direction does not predict"),
+        ("structural", 0.29, {}, "is below its threshold 0.30"),
+        ("stick_slip", 0.39, {}, "is below its threshold 0.40"),
+    ],
+)
+def test_an_objection_takes_the_name_away(leading, probability, changes, reason):
+    reasons = _objections(fitted(**changes), leading, probability)
+    assert len(reasons) == (reason is not None)
+    assert reason is None or reason in reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "cause", "p_value", "possible"),
+    [
+        ("temperature", "local_temperature", 0.02, True),
+        ("temperature", "local_temperature", 0.021, False),
+        ("step", "step", 0.05, True),
+        ("step", "step", 0.051, False),
+    ],
+)
+def test_a_cause_that_its_own_test_does_not_accept_is_impossible(name, cause, p_value, possible):
+    assert (_probabilities(fitted(**{name: {"p_value": p_value}}))[cause] > 0) is possible
+
+
+@pytest.mark.parametrize(("kind", "bar"), [("one_direction", 4.0), ("along_approach", 2.1)])
+def test_scatter_by_direction_must_gain_its_bar_over_scatter_alike(kind, bar):
+    """At the bar both explanations are equally probable; every nat above it multiplies their ratio by e."""
+    for beyond in (0.0, 1.0):
+        probability = _probabilities(fitted(scatter={kind: bar + beyond}))
+        assert probability["stick_slip"] / probability["structural"] == pytest.approx(np.exp(beyond))
+
+
+def test_a_walk_in_one_direction_pays_for_its_parameter_and_its_bar():
+    """As likely as white noise by 2 nats and half the logarithm of 100 cycles more."""
+    case = fitted()
+    case.random_walk.one_direction = 2.0 + 0.5 * np.log(100) + 1.0
+    probability = _probabilities(case)
+    assert probability["stick_slip"] / probability["structural"] == pytest.approx(np.e)

@@ -64,3 +64,11 @@ def test_a_stack_is_refused():
 def test_what_is_no_data_array_is_refused(rise):
     with pytest.raises(ThermographyError, match=rf"rise is of type {type(rise).__name__}; give a DataArray \(y, x\)"):
         detect_hotspots(rise)
+
+
+def test_a_second_peak_within_six_standard_deviations_of_the_noise_is_none(rng):
+    """Smoothing by one cell leaves noise of 0.006 K: maxima of the noise beside the peak, and a bump of 0.01 K, are not told."""
+    noise = rng.normal(0, 0.02, (36, 140))
+    for height, found in ((0.01, 1), (0.3, 2)):
+        field = plane((500.0, 90.0, 1.0, 30.0), (200.0, 90.0, height, 15.0)) + noise
+        assert len(detect_hotspots(field, least_prominence_K=0.0)) == found, height

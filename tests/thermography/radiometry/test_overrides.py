@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.thermography.flir_mutations import PARAMETERS, TIME, frame
 from thermography.radiometry.overrides import Overrides, ParameterLog
-from thermography.radiometry.planck import RadiometryError
+from thermography.radiometry.planck import RadiometryError, override, transmission
 
 TIMES = TIME + np.array([0, 100, 300]).astype("timedelta64[s]")
 
@@ -52,3 +54,24 @@ def test_a_broken_log_is_refused(times: np.ndarray, values: list[float], message
 def test_an_unknown_parameter_is_refused() -> None:
     with pytest.raises(RadiometryError, match="parameter 'humidity' is unknown"):
         Overrides({"humidity": 0.4})(frame())
+
+
+@pytest.mark.parametrize(
+    ("changes", "stored"),
+    [
+        ({"relative_humidity": 0.9}, 0.0),
+        ({"object_distance_m": 5.0}, 0.0),
+        ({"atmospheric_temperature_K": 310.0}, 0.0),
+        ({"emissivity": 0.9}, 0.98),
+        ({"relative_humidity": 0.9, "stored_transmission": 0.95}, 0.95),
+    ],
+)
+def test_a_stored_transmission_goes_with_the_air_that_it_was_stored_for(
+    changes: dict[str, float], stored: float
+) -> None:
+    kept = replace(PARAMETERS, stored_transmission=0.98)
+    changed = override(kept, **changes)
+    assert changed.stored_transmission == stored
+    # Without a stored one, the transmission follows from the changed air.
+    recomputed = transmission(override(replace(kept, stored_transmission=0.0), **changes))
+    assert transmission(changed) == (recomputed if stored == 0.0 else stored)
