@@ -184,6 +184,27 @@ def check(
 
 
 @app.command()
+def reproduce(
+    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Results folder of a finished run; only read.")],
+    campaign: Annotated[Path | None, typer.Option(help="The campaign file; left out: where the run found it.")] = None,
+) -> None:
+    """Compute a run again and tell whether its results are equal, byte for byte.
+
+    Exit code 0 where they are, 1 where inputs or results differ.
+    """
+    from fusion.products.progress import Reporter
+    from fusion.reproduction import reproduce as compute_again
+
+    with _answering():
+        with Reporter(console) as report:
+            found = compute_again(results, campaign=campaign, report=report)
+        for line in found.lines:
+            console.print(line, soft_wrap=True, highlight=False, markup=False)
+        if not found.equal:
+            raise typer.Exit(ExitCode.DIFFERENT)
+
+
+@app.command()
 def simulate(
     recipe: Annotated[Path, typer.Argument(metavar="RECIPE.toml", help="What the machine of the twin does.")],
     out: Annotated[Path, typer.Option(help="Folder of the campaign; must be empty or absent.")],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import sys
 from collections.abc import Mapping, Sequence
@@ -116,7 +117,12 @@ def _some(names: Sequence[str]) -> str:
 
 
 def describe_run(
-    campaign: Campaign, inputs: Mapping[str, Mapping[str, Any]], *, started: datetime, seconds: Mapping[str, float]
+    campaign: Campaign,
+    inputs: Mapping[str, Mapping[str, Any]],
+    folder: Path,
+    *,
+    started: datetime,
+    seconds: Mapping[str, float],
 ) -> dict[str, Any]:
     """Return the provenance of a run, without names of machine or user.
 
@@ -126,6 +132,8 @@ def describe_run(
         Stored as it was understood, with units in the names.
     inputs : mapping
         Result of `hash_inputs`.
+    folder : Path
+        Results folder.
     started : datetime
         Start of the run, UTC.
     seconds : mapping
@@ -135,12 +143,22 @@ def describe_run(
         "software": "thermofuse",
         "versions": versions(),
         "command": [Path(sys.argv[0]).stem, *(_without_folder(argument) for argument in sys.argv[1:])],
+        "campaign_file": _place_from(folder, campaign.path),
         "started": started.isoformat(timespec="seconds"),
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "stage_seconds": {name: round(value, 2) for name, value in seconds.items()},
         "parameters": campaign.model_dump(mode="json", exclude={"path"}, exclude_none=True),
         "inputs": dict(inputs),
     }
+
+
+def _place_from(folder: Path, campaign: Path) -> str | None:
+    """Return the campaign file as seen from the results folder, or None where the way would name folders of the user."""
+    try:
+        way = Path(os.path.relpath(campaign, folder.resolve()))
+    except ValueError:  # another drive
+        return None
+    return way.as_posix() if way.parts.count("..") <= 1 and len(way.parts) <= 3 else None
 
 
 def _without_folder(argument: str) -> str:

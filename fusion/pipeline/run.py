@@ -360,7 +360,7 @@ def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
     run.parts["plugins"] = [asdict(plugin) for plugin in plugins()]
     run.notices.extend(note_changes(run.seen, input_states(run.campaign)))
     results = assemble(run.campaign.campaign.title, run.parts, run.notices)
-    provenance = describe_run(run.campaign, run.inputs, started=run.started, seconds=run.seconds)
+    provenance = describe_run(run.campaign, run.inputs, run.folder, started=run.started, seconds=run.seconds)
     run.report("report", 0, 1)
     write_json(run.folder / "results.json", results.as_json())
     write_json(run.folder / "provenance.json", provenance)

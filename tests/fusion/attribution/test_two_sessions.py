@@ -100,3 +100,15 @@ def test_sessions_agree_with_one_place_one_sign_one_size_and_both_p_values(chang
     pair = module._Pair(*({name: np.full((1, 1), value) for name, value in one.items()} for one in (first, second)))
     assert bool(pair.agree[0, 0]) is agrees
     assert float(pair.p_value[0, 0]) == second["p_value"]
+
+
+def test_small_sensitivities_of_opposite_sign_do_not_agree_though_their_sizes_do():
+    """0.6 and -0.6 um/K differ by less than three standard uncertainties of 0.5 um/K."""
+    common = {"p_value": 0.01, "sensitivity_u": 0.4, "x": 100.0, "y": 50.0}
+    pair = module._Pair(
+        *(
+            {name: np.full((1, 1), value) for name, value in {**common, "sensitivity": one}.items()}
+            for one in (0.6, -0.6)
+        )
+    )
+    assert not pair.agree[0, 0]

@@ -24,10 +24,28 @@ def test_inputs_are_hashed_by_name(tmp_path: Path) -> None:
 def test_a_run_is_described_without_a_folder(campaign_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     campaign = load_campaign(campaign_folder / "campaign.toml")
     monkeypatch.setattr(sys, "argv", ["/opt/bin/thermofuse", "run", str(campaign.path), "--resume"])
-    run = describe_run(campaign, {}, started=datetime(2026, 3, 9, 6, 30, tzinfo=UTC), seconds={"fields": 1.234})
+    folder = campaign.folder / "results"
+    run = describe_run(campaign, {}, folder, started=datetime(2026, 3, 9, 6, 30, tzinfo=UTC), seconds={"fields": 1.234})
     assert run["command"] == ["thermofuse", "run", "campaign.toml", "--resume"]
     assert run["started"] == "2026-03-09T06:30:00+00:00" and run["stage_seconds"] == {"fields": 1.23}
     assert run["parameters"]["plan"]["cell_size_mm"] == 20.0 and "path" not in run["parameters"]
+
+
+@pytest.mark.parametrize(
+    ("folder", "place"),
+    [
+        ("results", "../campaign.toml"),
+        ("", "campaign.toml"),
+        ("../results", "../{}/campaign.toml"),
+        ("../../x/results", None),
+    ],
+)
+def test_the_campaign_file_is_found_from_the_results_without_naming_folders_of_the_user(
+    campaign_folder: Path, folder: str, place: str | None
+) -> None:
+    campaign = load_campaign(campaign_folder / "campaign.toml")
+    run = describe_run(campaign, {}, campaign.folder / folder, started=datetime(2026, 3, 9, tzinfo=UTC), seconds={})
+    assert run["campaign_file"] == (None if place is None else place.format(campaign.folder.name))
 
 
 def test_every_version_is_known() -> None:

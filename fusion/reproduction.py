@@ -1,0 +1,144 @@
+"""Computes a finished run again from its provenance and tells what differs."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fusion.campaign.config import load_campaign
+from fusion.pipeline.provenance import hash_inputs, versions
+from fusion.pipeline.run import run_campaign
+from fusion.products.progress import Report, silent
+from fusion.products.results import ResultsError
+
+#: Differences of numbers that are told one by one; the others are counted.
+_MOST_TOLD = 12
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """What a second run of the same campaign gave.
+
+    Attributes
+    ----------
+    equal : bool
+        Whether ``results.json`` is the same, byte for byte.
+    lines : tuple of str
+        What was compared, or what differs.
+    """
+
+    equal: bool
+    lines: tuple[str, ...]
+
+
+def reproduce(results: Path, *, campaign: Path | None = None, report: Report = silent) -> Reproduction:
+    """Compute a run again and compare its ``results.json``, byte for byte.
+
+    Parameters
+    ----------
+    results : Path
+        Results folder of a finished run; it is only read.
+    campaign : Path, optional
+        The campaign file; left out: where the run found it, as seen from the results folder.
+    report : callable
+        ``report(label, done, total)``, for progress.
+
+    Returns
+    -------
+    Reproduction
+        Where inputs differ from those of the run, they are named and nothing is computed.
+
+    Raises
+    ------
+    ResultsError
+        If the folder holds no finished run, or the campaign file is not found.
+    FusionError, ThermographyError, InterferometryError
+        If the campaign cannot be run any more.
+
+    Notes
+    -----
+    The same input and the same versions give the same file on one machine, whatever the number of threads. ``results.json`` holds no wall
+    times; those are in ``provenance.json``.
+    """
+    provenance = _read_provenance(results)
+    path = campaign or _campaign_of(results, provenance)
+    loaded = load_campaign(path)
+    strange = tuple(_compare_inputs(provenance["inputs"], hash_inputs(loaded.input_files(), report=report)))
+    if strange:
+        return Reproduction(False, (*strange, "the inputs are not those of the run, so it was not computed again"))
+    remarks = tuple(_compare_versions(provenance["versions"], versions()))
+    before = (results / "results.json").read_bytes()
+    with tempfile.TemporaryDirectory(prefix="thermofuse-") as folder:
+        run_campaign(path, Path(folder) / "results", report=report)
+        after = (Path(folder) / "results" / "results.json").read_bytes()
+    if before == after:
+        count = f"{len(provenance['inputs'])} input files"
+        return Reproduction(True, (*remarks, f"equal: {count} give the same results.json, all {len(before)} bytes"))
+    differences = list(_differences(json.loads(before), json.loads(after), ""))
+    told = differences[:_MOST_TOLD]
+    rest = len(differences) - len(told)
+    more = (f"and {rest} more",) if rest else ()
+    return Reproduction(False, (*remarks, f"different: {len(differences)} values of results.json", *told, *more))
+
+
+def _read_provenance(results: Path) -> dict[str, Any]:
+    """Return the provenance of a finished run."""
+    path = results / "provenance.json"
+    if not path.is_file() or not (results / "results.json").is_file():
+        raise ResultsError(f"{results}: holds no finished run; name a folder with results.json and provenance.json")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ResultsError(f"{path}: is not JSON ({error}); run the campaign again") from None
+    if not isinstance(content, dict) or not all(isinstance(content.get(key), dict) for key in ("inputs", "versions")):
+        raise ResultsError(f"{path}: is not the provenance of a run; run the campaign again")
+    return content
+
+
+def _campaign_of(results: Path, provenance: Mapping[str, Any]) -> Path:
+    """Return the campaign file where the run found it."""
+    place = provenance.get("campaign_file")
+    if isinstance(place, str) and (path := results / place).is_file():
+        return path
+    raise ResultsError(
+        f"{results}: the campaign file is not where the run found it, seen from the results; name it with --campaign"
+    )
+
+
+def _compare_inputs(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line for every input that is missing, new or changed."""
+    for name in sorted({*before, *now}):
+        if name not in now:
+            yield f"{name}: was an input of the run and is none now"
+        elif name not in before:
+            yield f"{name}: is an input now and was none of the run"
+        elif before[name] != now[name]:
+            yield f"{name}: its content has changed (SHA-256 {now[name]['sha256'][:12]}, was {str(before[name].get('sha256'))[:12]})"
+
+
+def _compare_versions(before: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
+    """Yield a line for every package whose version differs."""
+    for name in sorted({*before, *now}):
+        if before.get(name) != now.get(name):
+            yield f"{name} {now.get(name, 'not used')}, was {before.get(name, 'not used')}"
+
+
+def _differences(before: Any, after: Any, place: str) -> Iterator[str]:
+    """Yield a line for every value of two JSON documents that differs."""
+    if isinstance(before, dict) and isinstance(after, dict):
+        for key in dict.fromkeys([*before, *after]):
+            yield from _differences(before.get(key), after.get(key), f"{place}.{key}" if place else key)
+    elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
+        for number, (one, other) in enumerate(zip(before, after, strict=True)):
+            yield from _differences(one, other, f"{place}[{number}]")
+    elif before != after:
+        yield f"{place}: {_short(after)}, was {_short(before)}"
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 60 else f"{text[:57]}..."
