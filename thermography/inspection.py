@@ -9,8 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from thermography.io.flir import FrameReference, RejectedFrame, index_frames, read_frame
-from thermography.io.frame import CameraParameters, FlirFormatError, Frame
+from thermography.io.flir import FlirFrameReference, index_frames, read_frame
+from thermography.io.frame import CameraParameters, FlirFormatError, Frame, FrameReference, RejectedFrame
+from thermography.io.temperature_frames import StackOptions, TemperatureReader
 from thermography.radiometry.planck import (
     ZERO_CELSIUS_K,
     RadiometryError,
@@ -90,8 +91,9 @@ class FlirInspection:
             for name, value in first.housekeeping.items()
             if abs(value - ZERO_CELSIUS_K) > 1e-3
         )
+        packing = f", samples {first.samples.encoding}" if isinstance(first, FlirFrameReference) else ""
         lines = [
-            f"{self.path}: FLIR, {count} of {columns} x {rows}, samples {first.samples.encoding}",
+            f"{self.path}: FLIR, {count} of {columns} x {rows}{packing}",
             f"  camera {camera.model or 'unknown'}{serial}{lens}",
             f"  time {times} (camera set to {zone})",
             f"  emissivity {p.emissivity:.3g}, distance {p.object_distance_m:.3g} m, reflected "
@@ -189,6 +191,45 @@ def inspect_file(path: Path) -> FlirInspection:
         *_warn_transmission(frames[:1]),
     ]
     return FlirInspection(path, tuple(references), tuple(rejected), lowest, highest, mean, len(frames), tuple(warnings))
+
+
+def describe_stack(path: Path, reader: TemperatureReader) -> list[str]:
+    """Return the content of a file of temperatures as lines of text, and what must be said beside it.
+
+    Parameters
+    ----------
+    path : Path
+    reader : TemperatureReader
+        Of its kind, from `thermography.io.frame_readers.find_reader`.
+
+    Returns
+    -------
+    list of str
+
+    Raises
+    ------
+    ThermographyError
+        Where the file is damaged.
+    """
+    # A scale of one and an offset of nothing would be asked for; the values are shown as they are stored.
+    stored = StackOptions(scale=np.nextafter(1.0, 2.0))
+    contents = reader.contents(path, stored)
+    rows, columns = contents.shape
+    count = f"{contents.frames} frames" if contents.frames > 1 else "1 frame"
+    values = np.asarray(reader.read_values(path, 0, stored), float)
+    finite = values[np.isfinite(values)]
+    span = f"{finite.min():.6g} to {finite.max():.6g}" if finite.size else "no number"
+    lines = [
+        f"{path}: {reader.name}, {count} of {columns} x {rows}",
+        f"  values of the first frame {span} {contents.unit}".rstrip(),
+    ]
+    if finite.size < values.size:
+        lines.append(f"  {values.size - finite.size} of {values.size} pixels of the first frame hold no number")
+    if contents.times is not None:
+        lines.append(f"  {contents.times[0]} to {contents.times[-1]} {'UTC' if contents.zoned else 'without zone'}")
+    missing = [] if contents.unit else ["unit"]
+    missing += [] if contents.times is not None else ["time_in_name, times, or start and interval"]
+    return lines + ([f"  state under [thermography.stack]: {'; '.join(missing)}"] if missing else [])
 
 
 def thumbnail(path: Path) -> bytes:

@@ -50,6 +50,14 @@ from fusion.errors import FusionError
 RECORD_EFFECTS = (QUASI_STATIC,)
 #: Effects that need positions along an axis; a record that declares them is run without, and the results say so.
 _ALONG_AN_AXIS = ("axis_expansion", "table_offset")
+#: Attribute of ``[thermography]`` -> its key, of what files of temperatures are corrected for already.
+_CORRECTED_BY_THE_CAMERA = {
+    "atmospheric_temperature_degC": "atmospheric_temperature",
+    "relative_humidity": "relative_humidity",
+    "object_distance_m": "object_distance",
+    "window_transmission": "window_transmission",
+    "window_temperature_degC": "window_temperature",
+}
 
 
 class CampaignError(FusionError):
@@ -258,6 +266,30 @@ class SurfaceTable(_Measured):
         return ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
 
 
+class StackTable(_Table):
+    """``[thermography.stack]``: what files of temperatures of other cameras do not hold themselves."""
+
+    unit: Literal["degC", "K"] | None = None
+    scale: float = Field(default=1.0, gt=0.0)
+    offset: float = 0.0
+    variable: str | None = None
+    time_in_name: str | None = None
+    times: ExistingFile | None = None
+    start: str | None = None
+    interval_s: PositiveSeconds | None = Field(default=None, alias="interval")
+    time_zone: TimeZone = "UTC"
+    emissivity: Fraction | None = None
+    reflected_temperature_degC: Celsius | None = Field(default=None, alias="reflected_temperature")
+
+    @model_validator(mode="after")
+    def _says_times_once(self) -> StackTable:
+        given = [name for name in ("time_in_name", "times", "start") if getattr(self, name) is not None]
+        if len(given) > 1:
+            text = f"{' and '.join(given)} each say when the frames were taken; keep one"
+            raise PydanticCustomError("times", "{text}", {"text": text})
+        return self
+
+
 class ThermographyTable(_Measured):
     """``[thermography]``: the frames, the camera parameters that override the stored ones, and standard uncertainties."""
 
@@ -285,6 +317,23 @@ class ThermographyTable(_Measured):
     table: Literal["still", "moving"] = "still"
     reference_patch_px: PixelPatch | None = Field(default=None, alias="reference_patch")
     lens: ExistingFile | None = None
+    stack: StackTable | None = None
+
+    @model_validator(mode="after")
+    def _recalculates_what_is_known(self) -> ThermographyTable:
+        if self.stack is None:
+            return self
+        corrected = [name for name in _CORRECTED_BY_THE_CAMERA if getattr(self, name) is not None]
+        if corrected:
+            text = f"{_CORRECTED_BY_THE_CAMERA[corrected[0]]} is corrected in temperatures already; set it in the camera's program"
+            raise PydanticCustomError("stack", "{text}", {"text": text})
+        if self.emissivity is not None and self.stack.emissivity is None:
+            text = (
+                "another emissivity can only be calculated from the one that the camera's program used: write that as emissivity under "
+                "[thermography.stack]"
+            )
+            raise PydanticCustomError("stack", "{text}", {"text": text})
+        return self
 
 
 class AxisTable(_Table):
@@ -515,7 +564,7 @@ class Campaign(_Table):
         elif table == "drivers" and self.drivers is not None:
             names = [self.drivers.file]
         elif table == "thermography" and self.thermography is not None:
-            names = [self.thermography.lens]
+            names = [self.thermography.lens, self.thermography.stack and self.thermography.stack.times]
         paths = list({"thermography": self.frame_paths, "record": self.record_paths}.get(table, tuple)())
         paths += [self.resolve(name) for name in names if name is not None]
         return {relative_name(path, self.folder): path for path in paths}

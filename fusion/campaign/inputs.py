@@ -19,6 +19,7 @@ from fusion.alignment.zone_shift import covered_share, likely_zone_shift
 from fusion.attribution.randomised_duty import DutyLaw, read_duty
 from fusion.attribution.thermal_modes import read_regions
 from fusion.campaign.config import Campaign, relative_name
+from fusion.campaign.frame_stacks import camera_accuracy_notices, stack_options
 from fusion.campaign.logged_tables import read_drivers, split_heading
 from fusion.campaign.recompensation import RecompensationError, compensate_readings, see_material
 from fusion.campaign.sources import (
@@ -37,7 +38,8 @@ from fusion.products.contracts import check
 from fusion.products.results import Notice
 from interferometry.contract import DEVIATIONS
 from interferometry.io.readers import read_deviations, read_environment
-from thermography.io.flir import FrameReference, index_frames
+from thermography.io.frame import FrameReference
+from thermography.io.frame_readers import index_recordings
 from thermography.registration.lens import read_lens
 from thermography.registration.plan import PlanGrid, read_fiducials
 from thermography.registration.polygon import Polygon, PolygonError
@@ -188,7 +190,7 @@ def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
 
 def _read_frames(campaign: Campaign) -> tuple[list[FrameReference], list[dict[str, Any]]]:
     """Return the usable frames sorted by time, and file, index and reason of the others."""
-    frames, rejected = index_frames(campaign.frame_paths())
+    frames, rejected = index_recordings(campaign.frame_paths(), stack_options(campaign))
     timed = [frame for frame in frames if not np.isnat(frame.time)]
     timed, odd = _of_one_size(timed)
     left_out = [(frame, frame.reason.replace(f"{campaign.folder}/", "")) for frame in rejected]
@@ -249,7 +251,11 @@ def _camera_notices(source: CameraInputs) -> list[Notice]:
     """Return a notice for every kind of frame that is left out, and refuse what cannot be used."""
     _raise_if_patch_outside(source)
     _raise_if_regions_unusable(source)
-    return [*frames_notices(source.frames_rejected), *_remark_notices(source.frames)]
+    return [
+        *frames_notices(source.frames_rejected),
+        *_remark_notices(source.frames),
+        *camera_accuracy_notices(source.thermography, source.frames),
+    ]
 
 
 def _window_notice(source: CameraInputs) -> Notice:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fusion._typing import Array
 from fusion.consistency.checks import Check
-from thermography.io.flir import FrameReference
+from thermography.io.frame import FrameReference
 
 #: Frames nearer to each other than this share of a cycle are one burst.
 _BURST_SHARE = 0.25

@@ -7,9 +7,9 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from fusion.consistency.checks import Check, Severity
+from thermography.errors import ThermographyError
 from thermography.inspection import FileWarning, check_series, share_outside_range
-from thermography.io.flir import FrameReference
-from thermography.io.frame import FlirFormatError, Frame
+from thermography.io.frame import Frame, FrameReference
 
 #: Largest share of the pixels of a frame outside the range in which the camera is calibrated.
 _OUTSIDE_SHARE = 0.01
@@ -78,7 +78,7 @@ def _spread(frames: Sequence[FrameReference]) -> list[Frame]:
     for index in sorted({0, len(frames) // 2, len(frames) - 1}):
         try:
             read.append(frames[index].read())
-        except FlirFormatError:
+        except ThermographyError:
             # A damaged frame is counted where the frames are reduced.
             continue
     return read

@@ -19,7 +19,7 @@ from fusion.products.progress import Report
 from fusion.products.results import Notice
 from thermography.errors import ThermographyError
 from thermography.fields.survey import LEAST_BESIDE, Blocks, Survey, disturbed_frames, locate_blocks, survey_frames
-from thermography.io.flir import FrameReference, RejectedFrame
+from thermography.io.frame import FrameReference, RejectedFrame
 from thermography.radiometry.camera_artefacts import find_repeats
 from thermography.radiometry.camera_correction import (
     CameraCorrection,

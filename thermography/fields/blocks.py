@@ -13,8 +13,7 @@ from thermography._typing import Array
 from thermography.fields.cycle_fields import noise_of_differences
 from thermography.fields.inputs import FrameSeries
 from thermography.fields.resampling import PlanWeights
-from thermography.io.flir import FrameReference
-from thermography.io.frame import CameraParameters
+from thermography.io.frame import CameraParameters, FrameReference
 from thermography.io.window_reader import WindowReader
 from thermography.radiometry.averaging import (
     AVERAGING_LIMIT_K,

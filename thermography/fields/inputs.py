@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from thermography._typing import Array
 from thermography.errors import ThermographyError
-from thermography.io.flir import FrameReference
-from thermography.io.frame import CameraParameters
+from thermography.io.frame import CameraParameters, FrameReference
 from thermography.radiometry.planck import calibrate
 
 Override = Callable[[FrameReference], CameraParameters]

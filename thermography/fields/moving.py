@@ -20,8 +20,7 @@ from thermography.fields.inputs import NO_CYCLE, FrameSeries, Override, Reductio
 from thermography.fields.moving_sampling import CellSums, Samples, add_frame, on_plan, sample_points
 from thermography.fields.scheduling import in_order, open_pool
 from thermography.fields.still import BLOCK_S
-from thermography.io.flir import FrameReference
-from thermography.io.frame import CameraParameters
+from thermography.io.frame import CameraParameters, FrameReference
 from thermography.io.window_reader import WindowReader
 from thermography.radiometry.averaging import CHUNK_FRAMES
 from thermography.radiometry.planck import temperature_from_counts

@@ -25,7 +25,7 @@ from thermography.fields.cycle_fields import CyclePart, assemble_fields
 from thermography.fields.following import Displacements, Knock, Obstructions, Registrations
 from thermography.fields.inputs import NO_CYCLE, FrameSeries, Override, ReductionError, make_frame_series
 from thermography.fields.scheduling import Pool, in_order, open_pool
-from thermography.io.flir import FrameReference
+from thermography.io.frame import FrameReference
 from thermography.registration.displacement import RegistrationSpan, zoom_and_turn
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from thermography._constants import MAD_TO_SIGMA
 from thermography._typing import Array
+from thermography.errors import ThermographyError
 from thermography.fields.scheduling import in_order, open_pool
-from thermography.io.flir import FrameReference, RejectedFrame
-from thermography.io.frame import CameraParameters, FlirFormatError
+from thermography.io.frame import CameraParameters, FrameReference, RejectedFrame
 from thermography.radiometry.planck import temperature_from_counts
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration
@@ -159,7 +159,7 @@ def _read(references: Sequence[FrameReference]) -> Iterator[tuple[FrameReference
 def _read_counts(reference: FrameReference) -> NDArray[np.uint16] | str:
     try:
         return reference.read_counts()
-    except (FlirFormatError, OSError) as error:
+    except (ThermographyError, OSError) as error:
         return str(error)
 
 

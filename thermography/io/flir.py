@@ -1,7 +1,7 @@
 """Reads radiometric FLIR files: radiometric JPEG, SEQ, CSQ and FFF to frames of counts.
 
 `read_frame` reads the first frame of a file with its pixels; `index_frames` lists the frames of any number of files from their
-headers only, and each `FrameReference` reads its pixels on demand.
+headers only, and each `FlirFrameReference` reads its pixels on demand.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,19 +29,26 @@ from thermography.io.fff_record import (
     read_directory,
     read_header,
 )
-from thermography.io.frame import FlirFormatError, Frame, FrameHeader, SampleLocation, Segments
+from thermography.io.frame import (
+    FlirFormatError,
+    Frame,
+    FrameHeader,
+    FrameReference,
+    PlainSamples,
+    RejectedFrame,
+    SampleLocation,
+    Segments,
+)
+
+F = TypeVar("F", bound=FrameReference)
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameReference(FrameHeader):
-    """A frame in a file: its header, and where its pixels are; further attributes are those of `FrameHeader`.
+class FlirFrameReference(FrameReference):
+    """A frame in a FLIR file; further attributes are those of `FrameReference`.
 
     Attributes
     ----------
-    path : Path
-        Path of the file.
-    index : int
-        Index of the frame in the file, from 0.
     segments : tuple of (offset, length)
         Segments of the FFF record in the file, bytes.
     camera_info_place : (offset, length)
@@ -50,8 +57,6 @@ class FrameReference(FrameHeader):
         Place and packing of the pixels in the record.
     """
 
-    path: Path
-    index: int
     segments: Segments
     camera_info_place: tuple[int, int]
     samples: SampleLocation
@@ -61,8 +66,15 @@ class FrameReference(FrameHeader):
         """Number of rows and columns."""
         return self.samples.shape
 
+    @property
+    def plain_samples(self) -> PlainSamples | None:
+        """Place of the pixels; None where they are packed, or parted into the segments of a JPEG."""
+        if self.samples.encoding != "raw" or len(self.segments) != 1:
+            return None
+        return PlainSamples(self.segments[0][0] + self.samples.offset, self.samples.little_endian)
+
     def read(self) -> Frame:
-        """Read the frame with its pixels; raise FlirFormatError where they are damaged."""
+        """Read the frame with its pixels and camera information; raise FlirFormatError where they are damaged."""
         with self.path.open("rb", buffering=0) as file:
             return self._read_from(file)
 
@@ -85,23 +97,33 @@ class FrameReference(FrameHeader):
             return read_counts(FffSource(file, self.path, self.segments), self.samples)
 
 
-@dataclass(frozen=True)
-class RejectedFrame:
-    """A frame or a file that was not used.
+class FlirReader:
+    """Reader of radiometric JPEG, FFF, SEQ and CSQ files, see `thermography.io.frame_readers.FrameReader`."""
 
-    Attributes
-    ----------
-    path : Path
-        Path of the file.
-    index : int
-        Index of the frame in its file, from 0; 0 where the whole file is rejected.
-    reason : str
-        Why it was rejected, with file and offset.
-    """
+    name = "FLIR radiometric JPEG, FFF, SEQ or CSQ"
 
-    path: Path
-    index: int
-    reason: str
+    def recognises(self, path: Path, start: bytes) -> bool:
+        """Return whether a file starts as a JPEG or an FFF record.
+
+        Parameters
+        ----------
+        path : Path
+        start : bytes
+            Its first bytes.
+        """
+        return start[:2] == b"\xff\xd8" or start[:4] == MAGIC
+
+    def index(self, path: Path, options: object) -> Iterator[FrameReference | RejectedFrame]:
+        """Yield the frames of a file in its order; damaged ones as `RejectedFrame`.
+
+        Parameters
+        ----------
+        path : Path
+        options : object
+            Not used: the files hold everything.
+        """
+        with path.open("rb", buffering=0) as file:
+            yield from _walk(file, path)
 
 
 def read_frame(path: str | os.PathLike[str]) -> Frame:
@@ -193,18 +215,36 @@ def index_frames(
                     (rejected if isinstance(result, RejectedFrame) else frames).append(result)  # type: ignore[arg-type]
         except (OSError, FlirFormatError) as error:
             rejected.append(RejectedFrame(path, 0, str(error)))
-    frames.sort(key=lambda frame: (np.isnat(frame.time), frame.time, str(frame.path), frame.index))
-    kept: list[FrameReference] = []
-    for frame in frames:
+    kept, repeated = order_by_time(frames)
+    return kept, rejected + repeated
+
+
+def order_by_time(frames: Iterable[F]) -> tuple[list[F], list[RejectedFrame]]:
+    """Sort frames by time, and take out those whose time occurs twice.
+
+    Parameters
+    ----------
+    frames : iterable of FrameReference
+
+    Returns
+    -------
+    kept : list of FrameReference
+        By time (UTC), frames without a time last.
+    repeated : list of RejectedFrame
+        Every second frame of one time.
+    """
+    kept: list[F] = []
+    repeated: list[RejectedFrame] = []
+    for frame in sorted(frames, key=lambda frame: (np.isnat(frame.time), frame.time, str(frame.path), frame.index)):
         if kept and frame.time == kept[-1].time:
             reason = f"{frame.path}: frame {frame.index} has the same time {frame.time} as frame {kept[-1].index} of {kept[-1].path}"
-            rejected.append(RejectedFrame(frame.path, frame.index, reason))
+            repeated.append(RejectedFrame(frame.path, frame.index, reason))
         else:
             kept.append(frame)
-    return kept, rejected
+    return kept, repeated
 
 
-def _walk(file: BinaryIO, path: Path) -> Iterator[FrameReference | RejectedFrame]:
+def _walk(file: BinaryIO, path: Path) -> Iterator[FlirFrameReference | RejectedFrame]:
     """Yield the frames of one file in file order; damaged ones as `RejectedFrame`."""
     start = file.read(4)
     if start[:2] == b"\xff\xd8":
@@ -223,7 +263,7 @@ def _walk(file: BinaryIO, path: Path) -> Iterator[FrameReference | RejectedFrame
     yield from _walk_sequence(file, path, first, size, index=1 if first else 0)
 
 
-def _reference(source: FffSource, directory: Directory, index: int) -> FrameReference:
+def _reference(source: FffSource, directory: Directory, index: int) -> FlirFrameReference:
     """Read the headers of one FFF record."""
     place = find_camera_info(source, directory)
     header = read_header(source, place)
@@ -236,7 +276,7 @@ def _reference(source: FffSource, directory: Directory, index: int) -> FrameRefe
         )
     if missing > 0:
         notes += (f"the last {missing} padding bytes of the samples are missing",)
-    return FrameReference(
+    return FlirFrameReference(
         **{**vars(header), "notes": notes},
         path=source.path,
         index=index,
@@ -248,7 +288,7 @@ def _reference(source: FffSource, directory: Directory, index: int) -> FrameRefe
 
 def _walk_sequence(
     file: BinaryIO, path: Path, start: int, size: int, *, index: int
-) -> Iterator[FrameReference | RejectedFrame]:
+) -> Iterator[FlirFrameReference | RejectedFrame]:
     """Yield the frames of consecutive FFF records from `start` on; padding and damaged frames are skipped and reported."""
     notes: tuple[str, ...] = ()
     while start < size:

@@ -1,8 +1,10 @@
-"""The FLIR frame in memory: camera parameters, camera identity, calibrated range, header and counts."""
+"""A frame: camera parameters, camera identity, calibrated range, header and counts; and where a frame is stored."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -237,3 +239,77 @@ class Frame(FrameHeader):
     source: str = ""
     index: int = 0
     camera_info: bytes = b""
+
+
+@dataclass(frozen=True)
+class PlainSamples:
+    """Place of pixels that stand in a file as they are: 16 bits each, row by row.
+
+    Attributes
+    ----------
+    offset : int
+        First byte in the file.
+    little_endian : bool
+        Byte order.
+    """
+
+    offset: int
+    little_endian: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameReference(FrameHeader, ABC):
+    """A frame in a file: its header, and how its pixels are read; further attributes are those of `FrameHeader`.
+
+    Attributes
+    ----------
+    path : Path
+        Path of the file.
+    index : int
+        Index of the frame in the file, from 0.
+    """
+
+    path: Path
+    index: int
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, int]:
+        """Number of rows and columns."""
+
+    @abstractmethod
+    def read_counts(self) -> NDArray[np.uint16]:
+        """Read the pixels, (row, column) uint16; raise a ThermographyError or OSError where they cannot be read."""
+
+    @property
+    def plain_samples(self) -> PlainSamples | None:
+        """Where the pixels stand as they are, so that a part of them can be read; None where they must be read as a whole."""
+        return None
+
+    def damaged_records(self) -> list[int]:
+        """Return the types of all records that differ from their checksums; empty where the file holds none."""
+        return []
+
+    def read(self) -> Frame:
+        """Read the frame with its pixels; raise as `read_counts` does."""
+        header = {each.name: getattr(self, each.name) for each in fields(FrameHeader)}
+        return Frame(**header, counts=self.read_counts(), source=str(self.path), index=self.index)
+
+
+@dataclass(frozen=True)
+class RejectedFrame:
+    """A frame or a file that was not used.
+
+    Attributes
+    ----------
+    path : Path
+        Path of the file.
+    index : int
+        Index of the frame in its file, from 0; 0 where the whole file is rejected.
+    reason : str
+        Why it was rejected, with file and offset.
+    """
+
+    path: Path
+    index: int
+    reason: str

@@ -14,7 +14,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography.io.flir import FrameReference
+from thermography.io.frame import FrameReference
 
 #: Offsets, lengths and buffers of direct disk reads must be multiples of this, bytes.
 _PAGE = mmap.PAGESIZE
@@ -67,19 +67,19 @@ class WindowReader:
         ------
         OSError
             Where a file has become shorter since it was indexed.
-        FlirFormatError
+        ThermographyError
             Where packed samples are damaged.
         """
         rows, columns = self.window
         counts = counts[: len(frames)]
         checked = None
         for target, frame in zip(counts, frames, strict=True):
-            samples = frame.samples
-            if samples.encoding != "raw" or len(frame.segments) != 1:
-                target[...] = frame.read().counts[self.window]
+            samples = frame.plain_samples
+            if samples is None:
+                target[...] = frame.read_counts()[self.window]
                 continue
-            width = samples.shape[1]
-            place = frame.segments[0][0] + samples.offset + rows.start * width * 2
+            width = frame.shape[1]
+            place = samples.offset + rows.start * width * 2
             whole = width == target.shape[1]
             rows_read = target.reshape(-1) if whole else np.empty(target.shape[0] * width, np.uint16)
             file = self._open(frame.path)

@@ -18,8 +18,8 @@ import xarray as xr
 from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
-from thermography.io.flir import FrameReference, RejectedFrame, index_frames
-from thermography.io.frame import FlirFormatError
+from thermography.io.flir import index_frames
+from thermography.io.frame import FlirFormatError, FrameReference, RejectedFrame
 
 #: Camera parameter -> (name in a Dataset, units, units_metadata).
 _PARAMETERS: dict[str, tuple[str, str, str]] = {

@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 
 from tests.thermography.flir_mutations import PARAMETERS, TIME, frame, jpeg, sequence
-from thermography.io.flir import FrameReference, read_frame
+from thermography.io.flir import FlirFrameReference, read_frame
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import FlirFormatError
 from thermography.io.xarray_backend import FlirBackendEntrypoint
@@ -26,8 +26,8 @@ def _open(path, **options) -> xr.Dataset:
 def test_no_pixel_is_read_at_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written = sequence(tmp_path / "a.seq", frames=6)
     read: list[int] = []
-    original = FrameReference.read_counts
-    monkeypatch.setattr(FrameReference, "read_counts", lambda self: read.append(self.index) or original(self))
+    original = FlirFrameReference.read_counts
+    monkeypatch.setattr(FlirFrameReference, "read_counts", lambda self: read.append(self.index) or original(self))
     dataset = _open(tmp_path / "a.seq")
     chosen = dataset["counts"].isel(time=slice(1, 5, 2), row=slice(2, 9, 3), column=[0, 5])
     assert read == []

@@ -1,0 +1,255 @@
+"""Frames of temperatures as arrays: TIFF, NumPy, NetCDF and Zarr."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+import xarray as xr
+from numpy.typing import NDArray
+
+from thermography.errors import ThermographyError
+from thermography.io.temperature_frames import StackContents, StackError, StackOptions, TemperatureReader
+
+#: Units of temperature as CF and common programs write them.
+_UNITS = {
+    **dict.fromkeys(("degC", "deg_C", "celsius", "Celsius", "degree_Celsius", "degrees_Celsius", "degrees_C", "°C", "C"), "degC"),
+    **dict.fromkeys(("K", "kelvin", "Kelvin", "degK"), "K"),
+}  # fmt: skip
+#: Files that a Zarr store of version 3 or 2 begins with; each stands for the whole store.
+_ZARR_METADATA = ("zarr.json", ".zgroup")
+
+
+class TiffReader(TemperatureReader):
+    """Reader of TIFF with one grey value per pixel and one page per frame: float temperatures, or 16 bits with a stated scale."""
+
+    name = "TIFF of temperatures"
+
+    def recognises(self, path: Path, start: bytes) -> bool:
+        """Return whether a file is a TIFF, or a BigTIFF.
+
+        Parameters
+        ----------
+        path : Path
+        start : bytes
+            Its first bytes.
+        """
+        return start[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+    def contents(self, path: Path, options: StackOptions) -> StackContents:
+        """Return what a file holds.
+
+        Parameters
+        ----------
+        path : Path
+        options : StackOptions
+
+        Raises
+        ------
+        StackError
+            The values are whole numbers and no scale is stated.
+        ThermographyError
+            The file is damaged, or its pixels are colours.
+        """
+        try:
+            with tifffile.TiffFile(path) as file:
+                first: Any = file.pages[0]
+                shape, kind = first.shape, first.dtype
+                count = len(file.pages)
+                stamp = str(first.tags["DateTime"].value) if "DateTime" in first.tags else ""
+        except Exception as error:
+            raise ThermographyError(f"{path}: damaged TIFF ({error}); export it again") from None
+        if len(shape) != 2 or kind is None:
+            raise ThermographyError(
+                f"{path}: pixels of shape {shape}: a picture in colours holds no temperatures; export the radiometric TIFF"
+            )
+        _require_scale(path, kind, options)
+        return StackContents(count, (shape[0], shape[1]), times=_stamp(stamp) if count == 1 else None)
+
+    def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
+        """Return the values of a page, (row, column).
+
+        Parameters
+        ----------
+        path : Path
+        index : int
+            Of the page, from 0.
+        options : StackOptions
+
+        Raises
+        ------
+        ThermographyError
+            The page is damaged.
+        """
+        try:
+            return np.asarray(tifffile.imread(path, key=index))
+        except Exception as error:
+            raise ThermographyError(f"{path}: page {index} is damaged ({error}); export it again") from None
+
+
+class NumpyReader(TemperatureReader):
+    """Reader of .npy: one frame (row, column), or frames (frame, row, column)."""
+
+    name = "NumPy array"
+
+    def recognises(self, path: Path, start: bytes) -> bool:
+        """Return whether a file is a NumPy array.
+
+        Parameters
+        ----------
+        path : Path
+        start : bytes
+            Its first bytes.
+        """
+        return start[:6] == b"\x93NUMPY"
+
+    def _open(self, path: Path) -> NDArray[np.floating]:
+        try:
+            array = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (ValueError, EOFError, OSError, SyntaxError) as error:
+            raise ThermographyError(f"{path}: damaged NumPy file ({error}); save it again with numpy.save") from None
+        if array.ndim not in (2, 3) or array.dtype.kind not in "fiu":
+            raise ThermographyError(
+                f"{path}: an array of shape {array.shape} and type {array.dtype}; save numbers as (row, column) or (frame, row, column)"
+            )
+        return array if array.ndim == 3 else array[np.newaxis]
+
+    def contents(self, path: Path, options: StackOptions) -> StackContents:
+        """Return what a file holds.
+
+        Parameters
+        ----------
+        path : Path
+        options : StackOptions
+
+        Raises
+        ------
+        StackError
+            The values are whole numbers and no scale is stated.
+        ThermographyError
+            The file is damaged, or no array of frames.
+        """
+        array = self._open(path)
+        _require_scale(path, array.dtype, options)
+        return StackContents(array.shape[0], (array.shape[1], array.shape[2]))
+
+    def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
+        """Return the values of a frame, (row, column).
+
+        Parameters
+        ----------
+        path : Path
+        index : int
+            From 0.
+        options : StackOptions
+
+        Raises
+        ------
+        ThermographyError
+            The file is damaged.
+        """
+        return np.array(self._open(path)[index])
+
+
+class NetcdfReader(TemperatureReader):
+    """Reader of a variable (time, row, column) of a NetCDF 4 or Zarr store; its units and times are those of the CF conventions."""
+
+    name = "NetCDF or Zarr"
+
+    def recognises(self, path: Path, start: bytes) -> bool:
+        """Return whether a file is HDF5, or a folder of Zarr or its metadata.
+
+        Parameters
+        ----------
+        path : Path
+        start : bytes
+            Its first bytes.
+        """
+        return start[:4] == b"\x89HDF" or (
+            path.is_dir() and any((path / name).exists() for name in ("zarr.json", ".zgroup"))
+        )
+
+    def _variable(self, path: Path, options: StackOptions) -> xr.DataArray:
+        try:
+            store = path.parent if path.name in _ZARR_METADATA else path
+            zarr = store.is_dir()
+            dataset = (
+                xr.open_zarr(store, consolidated=False, chunks=None)
+                if zarr
+                else xr.open_dataset(store, engine="h5netcdf")
+            )
+        except Exception as error:
+            raise ThermographyError(f"{path}: cannot be opened ({error}); write it again") from None
+        stacks = [name for name, values in dataset.data_vars.items() if values.ndim == 3]
+        name = options.variable if options.variable is not None else stacks[0] if len(stacks) == 1 else None
+        if name not in dataset.data_vars or dataset[name].ndim != 3:
+            dataset.close()
+            raise StackError(
+                f'{path}: holds the variables {", ".join(map(str, stacks)) or "none"} over three dimensions; write variable = "..." '
+                "for the one with the temperatures (time, row, column)"
+            )
+        return dataset[name]
+
+    def contents(self, path: Path, options: StackOptions) -> StackContents:
+        """Return what a store holds.
+
+        Parameters
+        ----------
+        path : Path
+        options : StackOptions
+
+        Raises
+        ------
+        StackError
+            The variable is not known.
+        ThermographyError
+            The store is damaged.
+        """
+        values = self._variable(path, options)
+        first = values.dims[0]
+        stamps = values[first].values if first in values.coords else np.empty(0)
+        times = tuple(stamps.astype("datetime64[ns]")) if stamps.dtype.kind == "M" else None
+        unit = _UNITS.get(str(values.attrs.get("units", "")), "")
+        return StackContents(values.shape[0], (values.shape[1], values.shape[2]), unit, times, zoned=True)
+
+    def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
+        """Return the values of a time, (row, column).
+
+        Parameters
+        ----------
+        path : Path
+        index : int
+            From 0.
+        options : StackOptions
+
+        Raises
+        ------
+        ThermographyError
+            The store is damaged.
+        """
+        values = self._variable(path, options)
+        try:
+            return np.asarray(values[index].values)
+        except Exception as error:
+            raise ThermographyError(f"{path}: frame {index} is damaged ({error}); write it again") from None
+        finally:
+            values.close()
+
+
+def _require_scale(path: Path, kind: np.dtype[Any], options: StackOptions) -> None:
+    if kind.kind in "iu" and options.scale == 1.0 and options.offset == 0.0:
+        raise StackError(
+            f"{path}: its values are whole numbers of {kind.itemsize * 8} bits; write the scale of a count and the offset, for example "
+            'scale = 0.04 and unit = "K" (scale = 0.1, offset = -273.15, unit = "degC")'
+        )
+
+
+def _stamp(text: str) -> tuple[np.datetime64, ...] | None:
+    """Return the time of the tag DateTime of a TIFF, None where it holds none."""
+    try:
+        return (np.datetime64(datetime.strptime(text, "%Y:%m:%d %H:%M:%S"), "ns"),)
+    except ValueError:
+        return None
