@@ -564,7 +564,8 @@ class Campaign(_Table):
         elif table == "drivers" and self.drivers is not None:
             names = [self.drivers.file]
         elif table == "thermography" and self.thermography is not None:
-            names = [self.thermography.lens, self.thermography.stack and self.thermography.stack.times]
+            stack = self.thermography.stack
+            names = [self.thermography.lens, None if stack is None else stack.times]
         paths = list({"thermography": self.frame_paths, "record": self.record_paths}.get(table, tuple)())
         paths += [self.resolve(name) for name in names if name is not None]
         return {relative_name(path, self.folder): path for path in paths}

@@ -168,9 +168,8 @@ class NetcdfReader(TemperatureReader):
         start : bytes
             Its first bytes.
         """
-        return start[:4] == b"\x89HDF" or (
-            path.is_dir() and any((path / name).exists() for name in ("zarr.json", ".zgroup"))
-        )
+        zarr = path.name in _ZARR_METADATA or (path.is_dir() and any((path / name).exists() for name in _ZARR_METADATA))
+        return zarr or start[:4] == b"\x89HDF"
 
     def _variable(self, path: Path, options: StackOptions) -> xr.DataArray:
         try:

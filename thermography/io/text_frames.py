@@ -85,7 +85,7 @@ class TextReader(TemperatureReader):
             )
         content = path.read_bytes()
         utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-        lines = content.decode("utf-16" if utf16 else "latin-1", errors="replace").splitlines()
+        lines = content.decode("utf-16" if utf16 else "utf-8-sig", errors="replace").splitlines()
         for delimiter in _DELIMITERS:
             block = _longest_block(lines, delimiter)
             if len(block) >= _FEWEST:

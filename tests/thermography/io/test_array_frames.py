@@ -1,0 +1,101 @@
+"""TIFF, NumPy, NetCDF and Zarr: shapes, units, times, and what they lack."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import xarray as xr
+
+from thermography.errors import ThermographyError
+from thermography.io.array_frames import NetcdfReader, NumpyReader, TiffReader
+from thermography.io.frame_readers import index_recordings
+from thermography.io.temperature_frames import StackError, StackOptions
+
+STACK = (20.0 + np.arange(3 * 10 * 12).reshape(3, 10, 12) / 50.0).astype(np.float32)
+TIMES = np.array(["2026-03-09T06:30:00", "2026-03-09T06:30:10", "2026-03-09T06:30:20"], "datetime64[ns]")
+EVERY_10_S = StackOptions(unit="degC", start=TIMES[0], interval_s=10.0)
+
+
+def store(folder: Path, kind: str, *, units: str = "degC") -> Path:
+    path = folder / f"stack.{kind}"
+    if kind == "npy":
+        np.save(path, STACK)
+    elif kind == "tif":
+        tifffile.imwrite(path, STACK, photometric="minisblack")
+    else:
+        attrs = {"units": units, "units_metadata": "temperature: on_scale"}
+        dataset = xr.Dataset({"surface": (("time", "row", "column"), STACK, attrs)}, coords={"time": TIMES})
+        if kind == "nc":
+            dataset.to_netcdf(path, engine="h5netcdf")
+        else:
+            dataset.to_zarr(path, consolidated=False, zarr_format=3)
+            path = path / "zarr.json"
+    return path
+
+
+@pytest.mark.parametrize("kind", ["npy", "tif", "nc", "zarr"])
+def test_every_frame_comes_back_with_its_time(tmp_path: Path, kind: str) -> None:
+    path = store(tmp_path, kind)
+    frames, rejected = index_recordings([path], EVERY_10_S if kind in ("npy", "tif") else StackOptions())
+    assert rejected == []
+    assert [frame.time for frame in frames] == TIMES.astype("datetime64[ms]").tolist()
+    for frame, image in zip(frames, STACK, strict=True):
+        assert frame.shape == (10, 12)
+        assert pickle.loads(pickle.dumps(frame)).read_temperature() == pytest.approx(image, abs=1e-5)
+
+
+def test_kelvin_by_the_units_of_the_variable(tmp_path: Path) -> None:
+    frames, _ = index_recordings([store(tmp_path, "nc", units="K")])
+    assert frames[0].read_temperature()[0, 0] == pytest.approx(20.0 - 273.15)  # type: ignore[attr-defined]
+
+
+def test_a_folder_of_zarr_is_recognised(tmp_path: Path) -> None:
+    folder = store(tmp_path, "zarr").parent
+    assert len(index_recordings([folder])[0]) == 3
+
+
+def test_the_time_of_a_single_tiff_is_its_tag(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, STACK[0], datetime="2026:03:09 07:30:00")
+    (frame,), _ = index_recordings([path], StackOptions(unit="degC", time_zone="Europe/Vienna"))
+    assert frame.time == TIMES[0]
+
+
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [
+        ({}, r"holds the variables none over three dimensions; write variable = "),
+        (
+            {"a": (("time", "row", "column"), STACK), "b": (("time", "row", "column"), STACK)},
+            "holds the variables a, b over",
+        ),
+    ],
+)
+def test_the_variable_must_be_known(tmp_path: Path, variables: dict, message: str) -> None:
+    path = tmp_path / "a.nc"
+    xr.Dataset(variables).to_netcdf(path, engine="h5netcdf")
+    with pytest.raises(StackError, match=message):
+        index_recordings([path])
+    if variables:
+        options = StackOptions(unit="degC", variable="b", start=TIMES[0], interval_s=1.0)
+        assert len(index_recordings([path], options)[0]) == 3
+
+
+def test_what_is_no_stack_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.zeros(3))
+    with pytest.raises(
+        ThermographyError, match=r"an array of shape \(3,\) and type float64; save numbers as \(row, column\)"
+    ):
+        NumpyReader().contents(tmp_path / "a.npy", EVERY_10_S)
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((8, 8, 3), np.uint8), photometric="rgb")
+    with pytest.raises(
+        ThermographyError, match="a picture in colours holds no temperatures; export the radiometric TIFF"
+    ):
+        TiffReader().contents(tmp_path / "a.tif", EVERY_10_S)
+    (tmp_path / "a.nc").write_bytes(b"\x89HDF\r\n\x1a\n")
+    with pytest.raises(ThermographyError, match=r"cannot be opened .* write it again"):
+        NetcdfReader().contents(tmp_path / "a.nc", EVERY_10_S)
