@@ -109,7 +109,7 @@ BAD = [
      ", line 7: unknown key thermography.emisivity; did you mean emissivity? known here: atmospheric_temperature, "
      "atmospheric_temperature_u, camera_drift_u, camera_offset_u, camera_scale_u, clock_offset, emissivity, emissivity_u, frames, lens, "
      "object_distance, object_distance_u, reference_patch, reflected_temperature, reflected_temperature_u, region, relative_humidity, "
-     "relative_humidity_u, table, window, window_temperature, window_temperature_u, window_transmission, window_transmission_u"),
+     "relative_humidity_u, stack, table, window, window_temperature, window_temperature_u, window_transmission, window_transmission_u"),
     ("emissivity = 0.97", 'emissivity = "0.97 +- much"',
      ', line 7: thermography.emissivity = "0.97 +- much": this is a number without quotes'),
     ("emissivity = 0.97", 'emissivity = "0.97 +- 2"',
