@@ -9,8 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from thermography.errors import ThermographyError
 from thermography.io.flir import FlirFrameReference, index_frames, read_frame
 from thermography.io.frame import CameraParameters, FlirFormatError, Frame, FrameReference, RejectedFrame
+from thermography.io.frame_readers import find_reader
 from thermography.io.temperature_frames import StackOptions, TemperatureReader
 from thermography.radiometry.planck import (
     ZERO_CELSIUS_K,
@@ -193,14 +195,13 @@ def inspect_file(path: Path) -> FlirInspection:
     return FlirInspection(path, tuple(references), tuple(rejected), lowest, highest, mean, len(frames), tuple(warnings))
 
 
-def describe_stack(path: Path, reader: TemperatureReader) -> list[str]:
+def describe_stack(path: Path) -> list[str]:
     """Return the content of a file of temperatures as lines of text, and what must be said beside it.
 
     Parameters
     ----------
     path : Path
-    reader : TemperatureReader
-        Of its kind, from `thermography.io.frame_readers.find_reader`.
+        File that a reader of temperatures recognises.
 
     Returns
     -------
@@ -209,8 +210,11 @@ def describe_stack(path: Path, reader: TemperatureReader) -> list[str]:
     Raises
     ------
     ThermographyError
-        Where the file is damaged.
+        Where the file is damaged, or holds no temperatures.
     """
+    reader = find_reader(path)
+    if not isinstance(reader, TemperatureReader):
+        raise ThermographyError(f"{path}: no file of temperatures that is read; docs/formats.md lists them")
     # A scale of one and an offset of nothing would be asked for; the values are shown as they are stored.
     stored = StackOptions(scale=np.nextafter(1.0, 2.0))
     contents = reader.contents(path, stored)

@@ -18,7 +18,7 @@ from fusion.starting.kinds import Kind, Recognised, is_displacement, is_temperat
 from interferometry.inspection import describe_test
 from interferometry.io.delimited import read_grids
 from interferometry.io.readers import read_deviations, read_environment
-from thermography.inspection import inspect_file
+from thermography.inspection import describe_stack, inspect_file
 from thermography.registration.lens import read_lens
 from thermography.registration.plan import read_fiducials
 
@@ -44,6 +44,8 @@ def describe_file(found: Recognised) -> list[str]:
     path = found.path
     if found.kind is Kind.FRAMES:
         return inspect_file(path).lines()
+    if found.kind is Kind.STACK:
+        return describe_stack(path)
     if found.kind is Kind.DEVIATIONS:
         return _describe_deviations(path, read_deviations(path, rotary=True))
     if found.kind is Kind.ENVIRONMENT:

@@ -19,6 +19,9 @@ from interferometry.io.wide_table import find_wide_table
 from interferometry.io.workbook import is_workbook, read_sheets
 from thermography.inspection import is_flir_file
 from thermography.io.flir import index_frames
+from thermography.io.frame_readers import find_reader
+from thermography.io.temperature_frames import TemperatureReader
+from thermography.io.text_frames import TextReader
 
 #: Bytes that are read to tell the kind of a text.
 _START = 65_536
@@ -37,6 +40,7 @@ class Kind(StrEnum):
     CAMPAIGN = "campaign file"
     RECIPE = "recipe of a simulation"
     FRAMES = "thermal frames"
+    STACK = "frames of temperatures"
     DEVIATIONS = "deviations"
     ENVIRONMENT = "environment log"
     FIDUCIALS = "fiducials"
@@ -89,6 +93,9 @@ def recognise(path: Path) -> Recognised:
     if is_flir_file(path):
         references, rejected = index_frames([path])
         return Recognised(path, Kind.FRAMES) if references else Recognised(path, Kind.UNKNOWN, rejected[0].reason)
+    reader = find_reader(path)
+    if isinstance(reader, TemperatureReader) and not isinstance(reader, TextReader):
+        return Recognised(path, Kind.STACK)
     text = _text_start(path)
     if text is not None and ("camera_matrix" in text or "cameraMatrix" in text):
         return Recognised(path, Kind.LENS)
@@ -100,6 +107,9 @@ def recognise(path: Path) -> Recognised:
         if kind is Kind.DEVIATIONS and not _holds_deviations(path):
             read_deviations(path, rotary=True)
     except InterferometryError as error:
+        # Text may be one frame of temperatures; what is neither is refused as the table that it is not.
+        if isinstance(reader, TextReader) and reader.holds_a_frame(path):
+            return Recognised(path, Kind.STACK)
         return Recognised(path, Kind.UNKNOWN, _shortened(str(error).removeprefix(f"{path}").lstrip(":, ")))
     return Recognised(path, kind, headings=headings)
 

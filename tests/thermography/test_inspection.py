@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from tests.thermography.flir_mutations import CAMERA, HOUSEKEEPING, LIMITS, PARAMETERS, TIME, frame, jpeg, sequence
-from thermography.inspection import inspect_file, is_flir_file, thumbnail
+from thermography.errors import ThermographyError
+from thermography.inspection import describe_stack, inspect_file, is_flir_file, thumbnail
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import CalibratedRange, FlirFormatError
 from thermography.radiometry.planck import override
@@ -189,3 +190,15 @@ def test_real_files_give_the_warnings_of_their_known_faults(real_file) -> None:
         "SanNianYiSi__thermal_parser/images/DJI_XT2.jpg": {"stored_transmission", "emissivity"},
     }
     assert {name: _codes(real_file(name)) for name in expected} == expected
+
+
+def test_a_file_of_temperatures_is_described_with_what_must_be_stated(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.full((3, 8, 9), 7329, np.uint16))
+    assert describe_stack(tmp_path / "a.npy") == [
+        f"{tmp_path / 'a.npy'}: NumPy array, 3 frames of 9 x 8",
+        "  values of the first frame 7329 to 7329",
+        "  state under [thermography.stack]: unit; time_in_name, times, or start and interval",
+    ]
+    (tmp_path / "b.npy").write_bytes(b"nothing\0")
+    with pytest.raises(ThermographyError, match="no file of temperatures that is read"):
+        describe_stack(tmp_path / "b.npy")

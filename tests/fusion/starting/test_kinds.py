@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
+from fusion.starting.describe import describe_file
 from fusion.starting.kinds import Kind, column_unit, is_displacement, is_temperature, is_time, recognise
 
 
@@ -74,3 +76,10 @@ def test_headings_say_what_a_column_is() -> None:
     assert is_temperature("t1(K)") and not is_temperature("rise")
     assert is_displacement("ch1 [µm]") and not is_displacement("length [m2]")
     assert is_time("time") and is_time("時間(s)") and not is_time("speed [1/min]")
+
+
+def test_frames_of_temperatures_are_recognised_as_arrays_and_as_text(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.dat", np.full((8, 9), 20.0))
+    (tmp_path / "b.csv").write_text("\n".join(";".join(["20,1"] * 9) for _ in range(8)))
+    assert [recognise(tmp_path / name).kind for name in ("a.dat", "b.csv")] == [Kind.STACK, Kind.STACK]
+    assert "NumPy array, 1 frame of 9 x 8" in describe_file(recognise(tmp_path / "a.dat"))[0]
