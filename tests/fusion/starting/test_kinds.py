@@ -79,7 +79,7 @@ def test_headings_say_what_a_column_is() -> None:
 
 
 def test_frames_of_temperatures_are_recognised_as_arrays_and_as_text(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.dat", np.full((8, 9), 20.0))
+    np.save(tmp_path / "a.npy", np.full((8, 9), 20.0))
     (tmp_path / "b.csv").write_text("\n".join(";".join(["20,1"] * 9) for _ in range(8)))
-    assert [recognise(tmp_path / name).kind for name in ("a.dat", "b.csv")] == [Kind.STACK, Kind.STACK]
-    assert "NumPy array, 1 frame of 9 x 8" in describe_file(recognise(tmp_path / "a.dat"))[0]
+    assert [recognise(tmp_path / name).kind for name in ("a.npy", "b.csv")] == [Kind.STACK, Kind.STACK]
+    assert "NumPy array, 1 frame of 9 x 8" in describe_file(recognise(tmp_path / "a.npy"))[0]
