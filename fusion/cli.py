@@ -255,22 +255,50 @@ def inspect(
 
 @app.command()
 def iso230(
-    file: Annotated[
+    test: Annotated[
         Path,
         typer.Argument(
-            metavar="FILE", help="Deviations: .rtl, a table (text, XLSX, ODS), or a log of a positioning test."
+            metavar="FILE|CAMPAIGN.toml|RESULTS",
+            help="Deviations (.rtl, a table as text, XLSX or ODS, a log of a positioning test), a campaign file, or a results folder.",
         ),
     ],
-    cycles: Annotated[str | None, typer.Option(help="Window, for example 1-5; left out: all cycles.")] = None,
+    cycles: Annotated[
+        str | None, typer.Option(help="Window, for example 1-5; left out: the most settled five cycles.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the test sheet as a page, for example sheet.html.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print the values per target as CSV.")] = False,
 ) -> None:
-    """Evaluate a file by ISO 230-2."""
-    from fusion.report.terminal import iso230_remarks, iso230_tables
+    """Evaluate a test by ISO 230-2.
+
+    A campaign file adds uncertainties, tolerances and the conditions of the test.
+    """
+    from fusion.pipeline.iso230.files import read_test
+    from fusion.pipeline.provenance import versions
+    from fusion.report.iso230_page import (
+        NO_SCATTER,
+        iso230_csv,
+        iso230_json,
+        iso230_tables,
+        render_iso230,
+        write_iso230,
+    )
 
     with _answering():
-        for table in iso230_tables(file, cycles):
-            console.print(table)
-        for line in iso230_remarks(file):
-            console.print(line, soft_wrap=True, highlight=False, markup=False)
+        found = read_test(test, cycles)
+        if as_json:
+            sys.stdout.write(json.dumps(iso230_json(found.part, found.dataset), indent=1) + "\n")
+        elif as_csv:
+            sys.stdout.write(iso230_csv(found.part, found.dataset))
+        else:
+            for table in iso230_tables(found.part, found.dataset, title=found.title):
+                console.print(table)
+            for line in (*(() if found.part else (NO_SCATTER,)), *found.remarks):
+                console.print(line, soft_wrap=True, highlight=False, markup=False)
+        if out is not None:
+            page = render_iso230(found.title, found.part, found.dataset, remarks=found.remarks, versions=versions())
+            write_iso230(out, page)
+            errors.print(f"page: {out.resolve()}", highlight=False, markup=False)
 
 
 @app.command()

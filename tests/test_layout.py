@@ -19,6 +19,7 @@ TESTED_TOGETHER = {
     "results_attribution",
     "results_axis",
     "results_inputs",
+    "results_iso230",
     "results_loop",
     "results_part",
     "results_radiometry",

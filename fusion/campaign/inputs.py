@@ -71,7 +71,7 @@ def read_source(campaign: Campaign) -> LaserInputs | CameraInputs | Source:
     common: dict[str, Any] = {"campaign": campaign, "drivers": _read_drivers(campaign)}
     common["duty"] = _randomised(campaign, common["drivers"])
     if campaign.interferometry is not None:
-        common |= _read_laser(campaign)
+        common |= read_laser(campaign)
     _refuse_mixed_zones(campaign, common)
     if campaign.thermography is None:
         laser = LaserInputs(**common)
@@ -112,8 +112,24 @@ def _read_drivers(campaign: Campaign) -> xr.Dataset | None:
     return bring_to_utc(drivers, campaign.zone_of("drivers"), file=campaign.drivers.file)
 
 
-def _read_laser(campaign: Campaign) -> dict[str, Any]:
-    """Read what `LaserInputs` holds: readings, compensated where the campaign asks for it, and the environment log."""
+def read_laser(campaign: Campaign) -> dict[str, Any]:
+    """Read what `LaserInputs` holds: readings, compensated where the campaign asks for it, and the environment log.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        With ``[interferometry]``.
+
+    Returns
+    -------
+    dict
+        ``interferometry``, ``deviations``, ``environment``, ``iso_budget`` and ``notices``, as in `LaserInputs`.
+
+    Raises
+    ------
+    ValueError
+        A subclass of the instruments' packages or of this one: a file that cannot be used.
+    """
     interferometry = campaign.interferometry
     assert interferometry is not None
     laser = campaign.resolve(interferometry.deviations)

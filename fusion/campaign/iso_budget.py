@@ -12,7 +12,7 @@ import xarray as xr
 from fusion.campaign.config import InterferometryTable
 from interferometry.iso230 import Iso230Budget
 
-Origin = Literal["stated", "assumed", "from the camera"]
+Origin = Literal["stated", "assumed", "from the camera", "not of a rotary axis"]
 
 
 @dataclass(frozen=True)

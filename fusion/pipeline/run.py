@@ -21,6 +21,7 @@ from fusion.pipeline import attribution, drift_model, interferometry, thermal
 from fusion.pipeline import record as record_stage
 from fusion.pipeline.camera import camera_corrected
 from fusion.pipeline.consistency import check_fields, check_fields_alone, check_loop, check_plan, check_source
+from fusion.pipeline.iso230.sheet import complete_sheet
 from fusion.pipeline.provenance import FileState, describe_run, hash_inputs, input_states, note_changes, versions
 from fusion.pipeline.sizes import lacks_for_correlation, lacks_for_model
 from fusion.products.folder import claim, open_folder
@@ -308,9 +309,14 @@ def _reduce(run: Run, source: CameraInputs, tables: tuple[str, ...], *, schedule
 
 def _evaluate(run: Run, source: LaserInputs, *, after: tuple[str, ...]) -> xr.Dataset:
     """The stage of the deviations."""
-    return run.stage(
+    deviations = run.stage(
         "deviations", ("interferometry",), after, lambda: interferometry.evaluate_interferometry(source), read_dataset
     )
+    # What is stated of the test is no input of the stage: a corrected serial number computes nothing again.
+    run.parts["iso230"] = complete_sheet(
+        run.parts["iso230"], deviations, campaign=run.campaign, environment=source.environment
+    )
+    return deviations
 
 
 def _model(

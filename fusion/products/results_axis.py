@@ -7,6 +7,7 @@ from typing import Literal, get_args
 
 from pydantic import Field
 
+from fusion.products.results_iso230 import Iso230Check, Iso230Condition, Iso230Tolerance, OtherEvaluation
 from fusion.products.results_part import AreaPart, ByDirection, Number, Quantity, ResultPart
 
 Cause = Literal["structural", "local_temperature", "stick_slip", "step", "undetermined"]
@@ -188,6 +189,14 @@ class Iso230Part(ResultPart):
     """The first window, with its budget."""
     range_um: Mapping[str, Iso230Range] = Field(default_factory=dict)
     """Range of A, R, E, M and B over all windows of the standard's number of cycles, um."""
+    tolerances: tuple[Iso230Tolerance, ...] = ()
+    """The settled window against the tolerances that the campaign states."""
+    checks: tuple[Iso230Check, ...] = ()
+    """Conditions that the standard asks of a test."""
+    conditions: tuple[Iso230Condition, ...] = ()
+    """Conditions of the test as they were stated or logged."""
+    other_standards: tuple[OtherEvaluation, ...] = ()
+    """The settled window by other standards."""
 
 
 class NeighboursPart(ResultPart):

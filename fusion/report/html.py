@@ -12,7 +12,7 @@ from fusion.products.grouped import group, has
 from fusion.products.results import Results
 from fusion.report import record_section, summary_section
 from fusion.report.attribution_section import leading_region
-from fusion.report.charts import attribution, drift, neighbours, plan, readings, timeline
+from fusion.report.charts import attribution, drift, iso230, neighbours, plan, readings, timeline
 from fusion.report.charts import loop as closed_loop
 from fusion.report.charts.style import Chart
 from fusion.report.charts.thermal_map import plot_thermal_map
@@ -129,6 +129,7 @@ def _drift_charts(results: Results, deviations: xr.Dataset) -> dict[str, Chart]:
         "scatter": neighbours.plot_scatter_comparison(group(deviations, "comparison"), position),
         "mean_differences": neighbours.plot_mean_differences(group(deviations, "neighbours"), position),
         "chart": neighbours.plot_reference_chart(group(deviations, "chart"), position),
+        "iso230": iso230.plot_test(group(deviations, "settled"), position),
         "windows": readings.plot_windows(group(deviations, "iso")),
         "anomalies": drift.plot_position_scatter(joint, position, flagged),
     }

@@ -1,13 +1,19 @@
-"""The evaluation by ISO 230-2 in the report: axis values of the settled and of the first window, uncertainty budget, what it contains."""
+"""The test by ISO 230-2 in the report: values of the axis and of every target, budget, tolerances, conditions, other standards."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+import xarray as xr
+
+from fusion.products.grouped import group, has
 from fusion.products.results_axis import Iso230Contribution, Iso230Part, Iso230Window
 from fusion.report.findings import ISO230_TERMS, reversal_note
 from fusion.report.tables import Row, Table, Words, table
-from fusion.report.wording import join, measured, number, quantity
+from fusion.report.wording import decimals_of, join, measured, number, print_unit, quantity
+from interferometry.deviations import REGISTRY
 
 _CONTRIBUTORS = {
     "device": "laser with its air compensation",
@@ -27,46 +33,157 @@ _ONE_WAY = {
     "E": "Unidirectional systematic positioning error E",
 }
 _ARROWS = {"positive": "↑", "negative": "↓"}
+#: Missing readings that are listed one by one.
+_NAMED = 8
 
 
-def describe_iso230(part: Iso230Part) -> dict[str, Any]:
+def describe_iso230(part: Iso230Part, dataset: xr.Dataset | None = None, *, unit: str = "µm") -> dict[str, Any]:
     """Return the section on ISO 230-2, as the template reads it.
 
     Parameters
     ----------
     part : Iso230Part
         The part ``iso230`` of the results.
+    dataset : Dataset, optional
+        Readings with the group ``settled``; None: the section has no table of the targets.
+    unit : str
+        Of deviations, as it is printed.
 
     Returns
     -------
     dict
-        ``axis`` and ``budget`` (Table or None), ``window``, ``first_window``, ``rule``, ``contained`` and ``reversal`` (text).
+        ``axis``, ``positions``, ``budget``, ``tolerances``, ``checks`` and ``others`` (Table or None), ``conditions`` (rows of name and
+        text), ``window``, ``rule``, ``contained``, ``missing`` and ``reversal`` (text).
     """
     shown = part.settled
+    told: dict[str, Any] = dict.fromkeys(("positions", "budget", "tolerances", "checks", "others", "conditions"))
     if shown is None:
-        rows = [[term, quantity(getattr(part, f"{symbol}_um"), "µm")] for symbol, term in ISO230_TERMS.items()]
-        values = table([Words("Quantity of the axis"), f"{part.window} (k = 2)"], rows)
-        return {
-            "axis": values,
-            "budget": None,
-            "window": part.window,
-            "first_window": part.window,
-            "rule": "",
-            "contained": "",
-            "reversal": reversal_note(part),
-        }
+        rows = [[term, quantity(getattr(part, f"{symbol}_um"), unit)] for symbol, term in ISO230_TERMS.items()]
+        axis = table([Words("Quantity of the axis"), f"{part.window} (k = 2)"], rows)
+        words = {"window": part.window, "rule": "", "contained": "", "missing": "", "reversal": reversal_note(part)}
+        return {**told, **words, "axis": axis}
+    if dataset is not None and has(dataset, "settled"):
+        told["positions"] = _positions_table(group(dataset, "settled"), dataset["position"], unit)
     return {
-        "axis": _values_table(part, shown),
-        "budget": _budget_table(shown),
+        **told,
+        "axis": _values_table(part, shown, unit),
+        "budget": _budget_table(shown, unit),
+        "tolerances": _tolerances_table(part, unit) if part.tolerances else None,
+        "checks": _checks_table(part) if part.checks else None,
+        "others": _others_table(part, unit) if part.other_standards else None,
+        "conditions": [(row.name, row.text or "not stated") for row in part.conditions],
         "window": shown.window,
-        "first_window": part.window,
         "rule": part.settled_rule,
         "contained": contained_sentence(shown),
+        "missing": "" if dataset is None else missing_sentence(dataset, shown.cycles),
         "reversal": reversal_note(shown),
     }
 
 
-def _values_table(part: Iso230Part, shown: Iso230Window) -> Table:
+def _positions_table(settled: xr.Dataset, position: xr.DataArray, unit: str) -> Table:
+    """Return the values of every target in the order of the axis; decimals by the uncertainty of a mean deviation."""
+    spread = settled["standard_deviation"].values / np.sqrt(np.where(settled["count"] > 0, settled["count"], np.nan))
+    places = decimals_of(float(np.nanmedian(spread)))
+
+    def shown(value: xr.DataArray) -> str:
+        return f"{float(value):.{places}f}".replace("-", "−") if np.isfinite(value) else "–"
+
+    rows = []
+    for target in _along(position):
+        row = settled.sel(target=target)
+        cells = [str(target), f"{float(position.sel(target=target)):g}"]
+        for name in ("mean_unidirectional", "standard_deviation", "repeatability"):
+            cells += [shown(row[name].sel(direction=direction)) for direction in _ARROWS]
+        cells += [shown(row[name]) for name in ("mean_bidirectional", "reversal", "repeatability_bidirectional")]
+        counts = [str(int(row["count"].sel(direction=direction))) for direction in _ARROWS]
+        rows.append([*cells, ", ".join(counts)])
+    titles = [f"{symbol}{arrow} / {unit}" for symbol in ("x̄", "s", "R") for arrow in _ARROWS.values()]
+    place = str(position.attrs.get("units", "mm"))
+    return table(
+        ["Target", f"Position / {place}", *titles, f"x̄ / {unit}", f"B_i / {unit}", f"R_i / {unit}", "n↑, n↓"], rows
+    )
+
+
+def _along(position: xr.DataArray) -> np.ndarray:
+    """Return the numbers of the targets in the order of the axis."""
+    return position["target"].values[np.argsort(position.values, kind="stable")]
+
+
+def missing_sentence(dataset: xr.Dataset, cycles: Sequence[int]) -> str:
+    """Return which readings of a window are missing, and why.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        Keeps ``interferometry.contract.DEVIATIONS``.
+    cycles : sequence of int
+        Cycles of the window.
+    """
+    within = dataset[["deviation", "quality_flag"]].sel(cycle=list(cycles))
+    missing = np.argwhere(np.isnan(within["deviation"].values))
+    if missing.size == 0:
+        return "No reading of the window is missing."
+    named = []
+    for cycle, direction, target in missing[:_NAMED]:
+        bits = int(within["quality_flag"].values[cycle, direction, target])
+        why = join([flag.name.replace("_", " ") for flag in REGISTRY if bits & flag.mask]) or "missing"
+        approach = _ARROWS[str(within["direction"].values[direction])]
+        named.append(
+            f"cycle {within['cycle'].values[cycle]}, target {within['target'].values[target]}{approach} ({why})"
+        )
+    more = len(missing) - len(named)
+    rest = f" and {more} more" if more else ""
+    return f"{len(missing)} of {within['deviation'].size} readings of the window are missing: {'; '.join(named)}{rest}."
+
+
+def single_run_table(dataset: xr.Dataset) -> Table:
+    """Return the deviations of a test of one cycle.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        Keeps ``interferometry.contract.DEVIATIONS``; its first cycle is shown.
+    """
+    unit, place = (print_unit(str(dataset[name].attrs["units"])) for name in ("deviation", "position"))
+    rows = []
+    for target in _along(dataset["position"]):
+        reading = dataset["deviation"].sel(target=target).isel(cycle=0)
+        cells = [number(float(reading.sel(direction=direction)), 4) for direction in _ARROWS]
+        rows.append([str(target), f"{float(dataset['position'].sel(target=target)):g}", *cells])
+    return table(["Target", place, *(f"deviation{arrow} / {unit}" for arrow in _ARROWS.values())], rows)
+
+
+def _tolerances_table(part: Iso230Part, unit: str) -> Table:
+    """Return every quantity that was judged."""
+    rows = [
+        Row(
+            [
+                row.quantity,
+                measured(row.value_um, None if row.expanded_u_um is None else row.expanded_u_um / 2),
+                f"{row.limit_um:g}",
+                row.decision,
+            ],
+            marked=row.decision != "pass",
+        )
+        for row in part.tolerances
+    ]
+    return table([Words("Quantity"), f"Value ± U / {unit}", f"Tolerance / {unit}", Words("Decision")], rows)
+
+
+def _checks_table(part: Iso230Part) -> Table:
+    """Return every condition of the standard, those that are not met marked."""
+    words = {True: "yes", False: "no", None: "not known"}
+    rows = [Row([row.name, words[row.met], row.evidence], marked=row.met is False) for row in part.checks]
+    return table([Words("Asked for"), Words("Met"), Words("Found")], rows, stacked=True)
+
+
+def _others_table(part: Iso230Part, unit: str) -> Table:
+    """Return the quantities of other standards with their definitions."""
+    rows = [[row.standard, row.name, number(row.value_um), row.definition] for row in part.other_standards]
+    return table([Words("Standard"), Words("Quantity"), f"Value / {unit}", Words("Definition")], rows)
+
+
+def _values_table(part: Iso230Part, shown: Iso230Window, unit: str) -> Table:
     """Return the axis values of the settled window beside those of the first one and their range over the windows."""
     several = part.first is not None and part.first.window != shown.window
     rows = []
@@ -84,13 +201,13 @@ def _values_table(part: Iso230Part, shown: Iso230Window) -> Table:
             rows.append(Row([f"{_ONE_WAY[symbol]}{arrow}", of_shown, *([of_first, ""] if several else [])]))
     mean = [quantity(shown.mean_reversal_um), *([quantity(part.mean_reversal_um), ""] if several else [])]
     rows.append(Row(["Mean reversal error, with its sign", *mean]))
-    columns = [f"{shown.window} / µm"]
+    columns = [f"{shown.window} / {unit}"]
     if several:
-        columns += [f"First window, {part.window} / µm", "Range over the windows / µm"]
+        columns += [f"First window, {part.window} / {unit}", f"Range over the windows / {unit}"]
     return table([Words("Quantity of the axis (± U, k = 2)"), *columns], rows)
 
 
-def _budget_table(shown: Iso230Window) -> Table:
+def _budget_table(shown: Iso230Window, unit: str) -> Table:
     """Return the budget: every input with its contributions, and the expanded uncertainty without and with the sampling."""
     rows: list[Row] = [
         Row(
@@ -108,7 +225,7 @@ def _budget_table(shown: Iso230Window) -> Table:
     for name, sums in (("U (k = 2) without the sampling of the cycles", without), ("U (k = 2)", with_it)):
         cells = (number(None if u is None else 2 * u, 2) for u in sums)
         rows.append(Row([name, "", "", *cells], marked=True))
-    columns = [f"{symbol.replace('_', ' ')} / µm" for symbol in _BUDGETED]
+    columns = [f"{symbol.replace('_', ' ')} / {unit}" for symbol in _BUDGETED]
     return table([Words("Contribution"), "Standard uncertainty u", Words("u is"), *columns], rows)
 
 

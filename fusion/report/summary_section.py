@@ -163,7 +163,7 @@ def describe_campaign(
         "positions": None if deviations is None else _positions_table(deviations),
         "neighbours": "" if results.neighbours is None else _neighbours_text(results.neighbours),
         "comparison": None if deviations is None else _comparison_table(deviations),
-        "iso230": None if results.iso230 is None else describe_iso230(results.iso230),
+        "iso230": None if results.iso230 is None else describe_iso230(results.iso230, deviations),
         "anomalies": _anomalies(results),
         "correlation": correlation,
         "joint": None if joint is None else {**joint, "table": _joint_table(joint)},

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
-from pathlib import Path
 
 import rich.table
-import xarray as xr
 from rich.markup import escape
 
 from fusion.attribution.duty_plan import DutyPlanError, Machine, plan_duty, switchings
-from fusion.campaign.config import CampaignError
-from fusion.campaign.inputs import left_out_notices
 from fusion.campaign.quantities import read_quantity
 from fusion.products.results import Results
 from fusion.products.results_axis import RegistrationPart
@@ -32,7 +27,6 @@ from fusion.report.findings import (
     scatter_range,
     step_errors,
 )
-from fusion.report.tables import Words, print_table, table
 from fusion.report.wording import (
     condition,
     conditional,
@@ -41,12 +35,8 @@ from fusion.report.wording import (
     join,
     number,
     p_value,
-    print_unit,
     untouched,
 )
-from interferometry import iso230
-from interferometry.inspection import describe_notes
-from interferometry.io.readers import read_deviations
 
 
 def summary_table(results: Results) -> rich.table.Table:
@@ -164,76 +154,6 @@ def _under(text: str, results: Results, *figures: Figures) -> str:
     return f"{text} {condition(results.inputs, *figures)}".rstrip()
 
 
-def iso230_tables(path: Path, cycles: str | None) -> list[rich.table.Table]:
-    """Evaluate a file of deviations by ISO 230-2:2014 and return the axis values and the values per target.
-
-    Parameters
-    ----------
-    path : Path
-        Deviations of a linear or rotary axis: .rtl, a table (text or spreadsheet), or a log of a positioning test.
-    cycles : str or None
-        Window such as ``"1-5"``; None for all cycles.
-
-    Raises
-    ------
-    CampaignError, LaserFormatError
-        If the window is not understood or the file cannot be used.
-    """
-    deviations = read_deviations(path, rotary=True)
-    unit = print_unit(deviations["deviation"].attrs["units"])
-    window = None if cycles is None else read_window(cycles, deviations)
-    try:
-        result = iso230.evaluate_iso230(deviations, cycles=window)
-    except ValueError as error:
-        raise CampaignError(f"{path}: {error}") from None
-    named: list[tuple[str, str, dict[str, str]]]
-    named = [(name.replace("_", " "), name, {}) for name in (*iso230.QUANTITIES, "mean_reversal")]
-    for direction, sign in (("positive", "+"), ("negative", "-")):
-        named += [(f"{name}{sign}", f"{name}_unidirectional", {"direction": direction}) for name in ("E", "R", "A")]
-    rows = [
-        [label, f"{float(result[name].sel(where)):.2f}", f"{2 * float(result[f'{name}_u'].sel(where)):.2f}"]
-        for label, name, where in named
-    ]
-    axis = table([Words("quantity"), f"value / {unit}", f"U (k = 2) / {unit}"], rows)
-    return [print_table(axis, f"{path.name}, {result.attrs['window']}"), _position_table(deviations, result)]
-
-
-def iso230_remarks(path: Path) -> list[str]:
-    """Return what the reader of a file left out or assumed, as lines for the terminal.
-
-    Parameters
-    ----------
-    path : Path
-        Deviations.
-
-    Raises
-    ------
-    LaserFormatError
-        If the file cannot be used.
-    """
-    deviations = read_deviations(path, rotary=True)
-    return [*describe_notes(deviations), *(line.strip() for line in _warnings(deviations))]
-
-
-def _position_table(deviations: xr.Dataset, result: xr.Dataset) -> rich.table.Table:
-    """Return mean, standard deviation, reversal error and repeatability of every target as a table for the terminal."""
-    rows = []
-    for target in result["target"].values:
-        row = result.sel(target=target)
-        values = [
-            *(row["mean_unidirectional"].sel(direction=name) for name in ("positive", "negative")),
-            *(row["standard_deviation"].sel(direction=name) for name in ("positive", "negative")),
-            row["reversal"],
-            row["repeatability_bidirectional"],
-        ]
-        position = float(deviations["position"].sel(target=target))
-        rows.append([str(target), f"{position:g}", *(f"{float(value):.2f}" for value in values)])
-    return print_table(
-        table(["i", deviations["position"].attrs["units"], "mean +", "mean -", "s +", "s -", "B_i", "R_i"], rows),
-        f"per target position / {print_unit(deviations['deviation'].attrs['units'])}",
-    )
-
-
 def duty_lines(
     sources: Sequence[str], *, effect: str, drift: str, noise: str, cycle: str, power: float, seed: int
 ) -> list[str]:
@@ -289,35 +209,3 @@ def _source(text: str) -> tuple[str, float]:
             f'--source "{text}" is no source; write its name and time constant, for example "spindle=40 min"'
         )
     return name.strip(), read_quantity(time_constant, "s")
-
-
-def read_window(text: str, deviations: xr.Dataset) -> list[int]:
-    """Return the cycle numbers of a window of cycles.
-
-    Parameters
-    ----------
-    text : str
-        Window such as ``"1-5"`` or ``"3"``.
-    deviations : Dataset
-        Keeps ``interferometry.contract.DEVIATIONS``.
-
-    Raises
-    ------
-    CampaignError
-        If the text is no window, or names a cycle that was not measured.
-    """
-    match = re.fullmatch(r"\s*(\d+)(?:\s*-\s*(\d+))?\s*", text)
-    if match is None:
-        raise CampaignError(f'--cycles "{text}" is not a window of cycles; write for example 1-5')
-    first, last = int(match.group(1)), int(match.group(2) or match.group(1))
-    cycles = deviations["cycle"].values.tolist()
-    window = [cycle for cycle in range(first, last + 1) if cycle in cycles]
-    if len(window) != last - first + 1 or not window:
-        raise CampaignError(
-            f'--cycles "{text}" asks for cycles that were not measured; there are {cycles[0]} to {cycles[-1]}'
-        )
-    return window
-
-
-def _warnings(dataset: xr.Dataset) -> list[str]:
-    return [f"  warning: {notice.message} {notice.remedy}" for notice in left_out_notices(dataset, "left_out")]

@@ -167,7 +167,7 @@ def spacing_warnings(position_mm: Array, *, lead_mm: float) -> list[str]:
     if is_whole.all() and np.all(np.round(leads) >= 1):
         return [
             f"every target spacing is a whole number of leads ({lead_mm:g} mm): a periodic screw error looks constant; "
-            "add a random part to each position (equation 1)"
+            "add a random part to each position"
         ]
     return []
 

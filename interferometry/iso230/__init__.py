@@ -14,6 +14,7 @@ from interferometry.iso230.evaluation import (
     evaluate_windows,
     settled_window,
 )
+from interferometry.iso230.standards import evaluate_other_standards
 
 __all__ = [
     "CONTRIBUTIONS",
@@ -22,6 +23,7 @@ __all__ = [
     "STANDARD_CYCLES",
     "Iso230Budget",
     "evaluate_iso230",
+    "evaluate_other_standards",
     "evaluate_windows",
     "settled_window",
 ]

@@ -76,6 +76,17 @@ class Iso230Budget:
             if field.name.split("_")[0] not in ("difference", "nominal") and value is not None and value < 0:
                 raise InterferometryError(f"{field.name}={value} is negative; a standard uncertainty is 0 or more")
 
+    @property
+    def is_scatter_alone(self) -> bool:
+        """Whether instrument, alignment and material contribute nothing."""
+        scales = (
+            self.device_ppm,
+            self.alignment_ppm,
+            self.material_temperature_K,
+            self.expansion_coefficient_ppm_per_K,
+        )
+        return not any(scales)
+
 
 #: No error of instrument, alignment or material, as for a rotary axis: the budget is one of lengths.
 SCATTER_ALONE = Iso230Budget(

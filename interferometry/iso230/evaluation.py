@@ -104,7 +104,7 @@ def evaluate_iso230(
     """
     check_dataset(deviations, "deviations")
     unit = deviations["deviation"].attrs.get("units", "um")
-    if budget is not None and unit == "arcsec":
+    if unit == "arcsec" and budget is not None and not budget.is_scatter_alone:
         raise InterferometryError(
             "budget: its contributions are parts per million of a length; leave it out for a rotary axis, where only the scatter enters"
         )

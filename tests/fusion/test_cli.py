@@ -140,6 +140,14 @@ def test_iso230_evaluates_a_window(campaign_folder: Path) -> None:
     result = invoke("iso230", campaign_folder / "laser.csv", "--cycles", "1-5")
     assert result.exit_code == 0, result.output
     assert "laser.csv, cycles 1 to 5" in result.output
+    out = campaign_folder / "sheet.html"
+    told = invoke("iso230", campaign_folder / "campaign.toml", "--json", "--out", out)
+    assert told.exit_code == 0 and json.loads(told.stdout)["settled"]["cycles"][-1] > 12
+    assert "Test by ISO 230-2" in out.read_text(encoding="utf-8")
+    assert invoke("iso230", campaign_folder / "laser.csv", "--csv").stdout.startswith(
+        "target,position_mm,mean_positive_um"
+    )
+    assert "exists already" in invoke("iso230", campaign_folder / "laser.csv", "--out", out).stderr
     for bad, message in (
         ("one", 'thermofuse: --cycles "one" is not a window of cycles; write for example 1-5\n'),
         ("20-30", 'thermofuse: --cycles "20-30" asks for cycles that were not measured; there are 1 to 24\n'),

@@ -38,7 +38,12 @@ class _Measured(NamedTuple):
 
 
 def evaluate_standard(
-    deviations: xr.Dataset, budget: StatedBudget, *, drift: xr.DataArray | None, material_degC: xr.DataArray | None
+    deviations: xr.Dataset,
+    budget: StatedBudget,
+    *,
+    drift: xr.DataArray | None,
+    material_degC: xr.DataArray | None,
+    cycles: list[int] | None = None,
 ) -> tuple[xr.Dataset, xr.Dataset, dict[str, Any]]:
     """Evaluate windows of a test by ISO 230-2, and say which of them shows the warmed-up axis.
 
@@ -52,6 +57,8 @@ def evaluate_standard(
         Drift of the joint estimate, um; None where there is none.
     material_degC : (cycle) DataArray or None
         Temperature of the material; None where it was not logged.
+    cycles : list of int, optional
+        Window to quote; None: the most settled one.
 
     Returns
     -------
@@ -63,30 +70,33 @@ def evaluate_standard(
         Part ``iso230`` of results.json.
     """
     windows = evaluate_windows(deviations, budget=budget.budget, drift=drift, material_degC=material_degC)
-    chosen = settled_window(windows)
     numbers = deviations["cycle"].values
-    cycles = [
+    blocks = [
         numbers[(numbers >= first) & (numbers <= last)].tolist()
         for first, last in zip(windows["first_cycle"].values, windows["last_cycle"].values, strict=True)
     ]
+    quoted = blocks[settled_window(windows)] if cycles is None else cycles
     measured = _Measured(drift is not None, material_degC is not None)
     first, settled = (
-        evaluate_iso230(
-            deviations, cycles=cycles[index], budget=budget.budget, drift=drift, material_degC=material_degC
-        )
-        for index in (0, chosen)
+        evaluate_iso230(deviations, cycles=window, budget=budget.budget, drift=drift, material_degC=material_degC)
+        for window in (blocks[0], quoted)
     )
     several = windows.sizes["window"] > 1
     of_standard = windows.isel(window=slice(0, -1)) if several else windows
-    rule = _RULE_ONE if of_standard.sizes["window"] == 1 else _RULE if drift is not None else _RULE_WITHOUT_DRIFT
+    if cycles is not None:
+        rule = ""
+    elif of_standard.sizes["window"] == 1:
+        rule = _RULE_ONE
+    else:
+        rule = _RULE_WITHOUT_DRIFT if drift is None else _RULE
     values = {f"{name}_um": _quantity(first, name) for name in _AXIS}
     part = {
         "window": first.attrs["window"],
         **values,
         "B_of_scatter_um": float(first["B_of_scatter"]),
-        "settled": _window_part(settled, cycles[chosen], budget, measured),
+        "settled": _window_part(settled, quoted, budget, measured),
         "settled_rule": rule,
-        "first": _window_part(first, cycles[0], budget, measured),
+        "first": _window_part(first, blocks[0], budget, measured),
         "range_um": {
             name: {"lowest": float(of_standard[name].min()), "highest": float(of_standard[name].max())}
             for name in QUANTITIES
@@ -123,11 +133,11 @@ def _contribution(result: xr.Dataset, name: str, budget: StatedBudget, measured:
     """Return one row of the budget."""
     parts = {f"{symbol}_um": float(result["contribution"].sel(quantity=symbol, contributor=name)) for symbol in _AXIS}
     u: float | None = None
-    unit, origin = "um", "from the scatter of the readings"
+    unit, origin = "um", "from the readings"
     if name in _INPUTS:
         field, unit = _INPUTS[name]
         u, origin = getattr(budget.budget, field), budget.origins[name]
-        if name == "expansion_coefficient":
+        if name == "expansion_coefficient" and not budget.budget.is_scatter_alone:
             logged = "" if measured.material else "an assumed "
             origin += f"; material at {logged}{float(result['temperature_difference']):.2g} K from 20 °C"
     elif name == "environmental_variation":
@@ -135,5 +145,5 @@ def _contribution(result: xr.Dataset, name: str, budget: StatedBudget, measured:
         found = "standard deviation of the drift within the window" if measured.drift else "not known, not contained"
         origin = budget.origins.get(name, found)
     elif name == "extremes":
-        origin = "largest of noisy values, by drawing such tests"
+        origin = "mean excess of tests drawn like this one"
     return {"contributor": name, "u": u, "unit": unit, "origin": origin, **parts}

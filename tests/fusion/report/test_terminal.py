@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pytest
-
-from fusion.campaign.config import CampaignError
 from fusion.consistency.checks import Check, inputs_part
 from fusion.products.results import Notice, assemble
-from fusion.report.terminal import read_window, summary_rows
-from interferometry.deviations import build_deviations
+from fusion.report.terminal import summary_rows
 from tests.fusion.results_sample import PARTS
 
 
@@ -48,13 +43,3 @@ def test_an_exact_fit_is_not_printed_as_accuracy() -> None:
     part = {**PARTS["registration"], "rms_mm": None, "position_u_mm": 0.87, "leave_one_out_mm": dict.fromkeys("ABCD")}
     rows = dict(summary_rows(assemble("four discs", {**PARTS, "registration": part}, [])))
     assert rows["registration"] == ("standard uncertainty 0.87 mm, not checked: 4 fiducials determine the plan exactly")
-
-
-def test_a_window_names_cycles_that_were_measured() -> None:
-    deviations = build_deviations(
-        range(1, 9), [1, 2], np.array([0.0, 10.0]), np.zeros((8, 2, 2)), np.full((8, 2, 2), "NaT", "M8[ns]")
-    )
-    assert read_window(" 2 - 4 ", deviations) == [2, 3, 4]
-    assert read_window("8", deviations) == [8]
-    with pytest.raises(CampaignError, match="there are 1 to 8"):
-        read_window("4-2", deviations)

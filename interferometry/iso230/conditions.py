@@ -1,0 +1,144 @@
+"""The conditions that ISO 230-2 asks of a test, checked on the readings: targets, travel, spacing, cycles, completeness, settling."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from interferometry.drift.planning import Settling, spacing_warnings
+from interferometry.iso230.evaluation import STANDARD_CYCLES
+
+#: Least number of target positions, and per metre of travel; travel in mm above which the standard has another test.
+LEAST_TARGETS, TARGETS_PER_METRE, LONGEST_TRAVEL_MM = 5, 5, 2000.0
+#: Spacings that differ by less than this share of their mean are equal.
+_EQUAL_SHARE = 1e-3
+
+
+@dataclass(frozen=True)
+class ConditionCheck:
+    """One condition of a test.
+
+    Attributes
+    ----------
+    name : str
+        What is asked for.
+    met : bool or None
+        None where the readings do not tell.
+    evidence : str
+        What was found, as a sentence.
+    """
+
+    name: str
+    met: bool | None
+    evidence: str
+
+
+def check_conditions(
+    deviations: xr.Dataset,
+    *,
+    cycles: Sequence[int],
+    lead_mm: float | None = None,
+    settling: Sequence[Settling] | None = None,
+) -> list[ConditionCheck]:
+    """Check what ISO 230-2 asks of a test of a linear axis.
+
+    Parameters
+    ----------
+    deviations : xarray.Dataset
+        Keeps ``contract.DEVIATIONS``.
+    cycles : sequence of int
+        Cycles of the window that is evaluated.
+    lead_mm : float, optional
+        Lead of the screw, mm; None: the spacing is not compared with it.
+    settling : sequence of Settling, optional
+        What `interferometry.drift.planning.estimate_settling` returns; None where the drift could not be estimated.
+
+    Returns
+    -------
+    list of ConditionCheck
+
+    Raises
+    ------
+    InterferometryError
+        ``lead_mm`` is not above 0.
+
+    Notes
+    -----
+    ISO 230-2:2014, clauses 3.1 and 5.3 (targets, spacing, cycles; axes up to 2 m) and the warm-up that it asks for.
+    """
+    position = np.sort(deviations["position"].values)
+    checks = [_targets(position), _travel(position), _spacing(position, lead_mm)]
+    return [*checks, _cycles(cycles), _completeness(deviations, cycles), _settled(deviations, cycles, settling)]
+
+
+def _targets(position: np.ndarray) -> ConditionCheck:
+    travel_m = 1e-3 * float(np.ptp(position))
+    asked = max(LEAST_TARGETS, int(np.ceil(TARGETS_PER_METRE * travel_m)))
+    name = f"at least {LEAST_TARGETS} targets, and {TARGETS_PER_METRE} per metre"
+    return ConditionCheck(
+        name, position.size >= asked, f"{position.size} targets over {1e3 * travel_m:g} mm; asked for: {asked}."
+    )
+
+
+def _travel(position: np.ndarray) -> ConditionCheck:
+    travel = float(np.ptp(position))
+    evidence = f"Measured travel {travel:g} mm."
+    if travel > LONGEST_TRAVEL_MM:
+        evidence += " Longer axes have a test of their own: one approach from each side to targets about 250 mm apart."
+    return ConditionCheck("travel up to 2 m", travel <= LONGEST_TRAVEL_MM, evidence)
+
+
+def _spacing(position: np.ndarray, lead_mm: float | None) -> ConditionCheck:
+    name = "target spacing that shows periodic errors"
+    spacing = np.diff(position)
+    if spacing.size < 2:
+        return ConditionCheck(name, None, "Fewer than two spacings.")
+    hidden = [] if lead_mm is None else spacing_warnings(position, lead_mm=lead_mm)
+    if hidden:
+        return ConditionCheck(name, False, f"{hidden[0][0].upper()}{hidden[0][1:]}.")
+    if np.ptp(spacing) < _EQUAL_SHARE * spacing.mean():
+        evidence = (
+            f"All spacings are {spacing.mean():g} mm: a periodic error of that length, or of a whole part of it, is not seen; the standard "
+            "adds a random part to each position."
+        )
+        return ConditionCheck(name, False, evidence)
+    return ConditionCheck(name, True, f"Spacings of {spacing.min():g} to {spacing.max():g} mm.")
+
+
+def _cycles(cycles: Sequence[int]) -> ConditionCheck:
+    return ConditionCheck(
+        f"{STANDARD_CYCLES} cycles", len(cycles) == STANDARD_CYCLES, f"{len(cycles)} cycles are evaluated."
+    )
+
+
+def _completeness(deviations: xr.Dataset, cycles: Sequence[int]) -> ConditionCheck:
+    within = deviations["deviation"].sel(cycle=list(cycles)).values
+    missing = int(np.isnan(within).sum())
+    evidence = "Every target was read from both sides in every cycle."
+    if missing:
+        evidence = f"{missing} of {within.size} readings of the window are missing."
+    return ConditionCheck("every target from both sides in every cycle", missing == 0, evidence)
+
+
+def _settled(deviations: xr.Dataset, cycles: Sequence[int], settling: Sequence[Settling] | None) -> ConditionCheck:
+    name = "warmed-up axis"
+    time = deviations["time"].values.astype("datetime64[ns]")
+    here = deviations["time"].sel(cycle=list(cycles)).values.astype("datetime64[ns]")
+    if settling is None or np.isnat(here).all():
+        return ConditionCheck(name, None, "The readings have no times, or are too few, to see a warm-up.")
+    start_s = float((here[~np.isnat(here)].min() - time[~np.isnat(time)].min()) / np.timedelta64(1, "s"))
+    if not settling:
+        return ConditionCheck(name, True, "No part of the drift settles during the test: none looks like a warm-up.")
+    last = max(settling, key=lambda part: part.t95_s)
+    evidence = (
+        f"The drift ({last.component}) takes {last.t95_s / 3600:.1f} h to reach 95 % of its end "
+        f"(95 % confidence: {last.t95_low_s / 3600:.1f} to {_hours(last.t95_high_s)}); the window begins after {start_s / 3600:.1f} h."
+    )
+    return ConditionCheck(name, start_s >= last.t95_s, evidence)
+
+
+def _hours(seconds: float) -> str:
+    return f"{seconds / 3600:.1f} h" if np.isfinite(seconds) else "longer than the test can show"

@@ -1,0 +1,70 @@
+"""Conditions that the standard asks of a test."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from interferometry.deviations import build_deviations
+from interferometry.drift.planning import Settling
+from interferometry.iso230.conditions import ConditionCheck, check_conditions
+
+CYCLES = [1, 2, 3, 4, 5]
+
+
+def test_at(position: list[float], cycles: int = 5) -> xr.Dataset:
+    """A test at these positions, one cycle in 10 min."""
+    shape = (cycles, 2, len(position))
+    seconds = 600.0 * np.arange(cycles)[:, None, None] + np.arange(2 * len(position)).reshape(1, 2, -1)
+    time = np.datetime64("2026-03-09T06:30") + (1e9 * seconds).astype("timedelta64[ns]")
+    return build_deviations(
+        range(1, cycles + 1), range(1, len(position) + 1), np.array(position), np.zeros(shape), time
+    )
+
+
+test_at.__test__ = False  # type: ignore[attr-defined]
+
+
+def found(deviations: xr.Dataset, **options: object) -> dict[str, ConditionCheck]:
+    checks = check_conditions(deviations, cycles=CYCLES, **options)  # type: ignore[arg-type]
+    names = ("targets", "travel", "spacing", "cycles", "completeness", "settled")
+    return dict(zip(names, checks, strict=True))
+
+
+def test_a_test_as_the_standard_asks_for_it() -> None:
+    checks = found(test_at([0.0, 107.0, 195.0, 310.0, 402.0]), lead_mm=10.0, settling=[])
+    assert all(check.met for check in checks.values())
+    assert checks["spacing"].evidence == "Spacings of 88 to 115 mm."
+
+
+def test_too_few_targets_for_the_travel() -> None:
+    checks = found(test_at(list(np.linspace(0.0, 2500.0, 7) + 3.0 * np.arange(7) ** 2)))
+    assert checks["targets"].met is False and "asked for: 14" in checks["targets"].evidence
+    assert checks["travel"].met is False and "targets about 250 mm apart" in checks["travel"].evidence
+    assert checks["settled"].met is None
+
+
+def test_equal_spacings_hide_periodic_errors_and_whole_leads_those_of_the_screw() -> None:
+    equal = test_at([0.0, 25.0, 50.0, 75.0, 100.0])
+    assert "All spacings are 25 mm" in found(equal)["spacing"].evidence
+    assert "whole number of leads (5 mm)" in found(equal, lead_mm=5.0)["spacing"].evidence
+    assert "All spacings" in found(equal, lead_mm=10.0)["spacing"].evidence
+    assert found(equal)["spacing"].met is False
+
+
+def test_missing_readings_and_other_numbers_of_cycles_are_counted() -> None:
+    deviations = test_at([0.0, 20.0, 45.0, 70.0, 100.0])
+    deviations["deviation"][2, 1, 3] = np.nan
+    assert found(deviations)["completeness"].evidence == "1 of 50 readings of the window are missing."
+    assert check_conditions(deviations, cycles=[1, 2, 3])[3].met is False
+
+
+@pytest.mark.parametrize(("t95_s", "met"), [(1000.0, True), (1400.0, False)])
+def test_the_window_must_begin_after_the_warm_up(t95_s: float, met: bool) -> None:
+    deviations = test_at([0.0, 20.0, 45.0, 70.0, 100.0], cycles=7)
+    settling = Settling("stretch", 500.0, 400.0, 600.0, t95_s, 900.0, np.inf, 4.0)
+    check = check_conditions(deviations, cycles=[3, 4, 5, 6, 7], settling=[settling])[-1]
+    # Cycle 3 begins 1200 s after the first reading.
+    assert check.met is met
+    assert "to longer than the test can show" in check.evidence and "begins after 0.3 h" in check.evidence
