@@ -109,7 +109,9 @@ def plot_thermal_map(
     drawn.select_one(HoverTool).name = "reading"
     add_colour_bar(drawn, mapper, f"{first.words} / {first.unit}")
     drawn.below[-1].name = "bar"
-    _draw_line(drawn, fields, position)
+    # Without readings there are no targets on the plan.
+    if "target" in fields:
+        _draw_line(drawn, fields, position)
     _draw_hotspots(drawn, hotspots)
     flat = {name: values.reshape(len(values), -1) for name, values in steps.items()}
     more = {name: np.diff(values, axis=0, prepend=np.int16(0)).ravel() for name, values in flat.items()}
