@@ -128,6 +128,7 @@ def check_and_assemble(given: Readings) -> xr.Dataset:
     if timed:
         readings = _drop_wrong_times(path, readings, left_out)
         _check_cycles(path, readings)
+        given.notes += _note_of_minutes(readings)
         reference = describe_time_zone(path, given.zones)
     deviations = _assemble(readings)
     deviations = _flag_cells(deviations, UNREADABLE, given.unreadable)
@@ -266,6 +267,17 @@ def _cycle_centres(readings: Sequence[Reading]) -> dict[int, float]:
     for reading in readings:
         times[reading.cycle].append(int(reading.time.astype("i8")))
     return {cycle: float(np.median(values)) for cycle, values in times.items()}
+
+
+def _note_of_minutes(readings: list[Reading]) -> list[str]:
+    """Tell that the times have no seconds, so that several readings seem to be taken at one instant."""
+    times = np.array([reading.time for reading in readings])
+    shared = len(times) - len(np.unique(times))
+    if not shared or np.any(times != times.astype("datetime64[m]")):
+        return []
+    return [
+        f"warning: the times have no seconds, and {shared} readings share theirs with others: export them with seconds"
+    ]
 
 
 def _check_cycles(path: Path, readings: list[Reading]) -> None:

@@ -1,6 +1,7 @@
 """Opens FLIR files with xarray: ``xarray.open_dataset(path_or_list, engine="flir")``, lazily and one frame at a time.
 
-Counts become temperature with `thermography.radiometry.planck.calibrate`; the variables of the Dataset hold its parameters.
+``temperature`` is calibrated from ``counts`` when it is accessed, with the parameters that the variables of the Dataset hold: those of the
+file, or those given as ``emissivity=0.95`` and so on. ``ds.flir.temperature(emissivity=0.9)`` calibrates an open Dataset anew.
 """
 
 from __future__ import annotations
@@ -8,8 +9,8 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Iterable
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,10 @@ import xarray as xr
 from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
-from thermography.io.flir import index_frames
-from thermography.io.frame import FlirFormatError, FrameReference, RejectedFrame
+from thermography.io.flir import FlirFrameReference, index_frames
+from thermography.io.flir_annotations import read_measurement_regions, read_visible_picture
+from thermography.io.frame import CameraParameters, FlirFormatError, FrameReference, RejectedFrame
+from thermography.radiometry.planck import ZERO_CELSIUS_K, RadiometryError, calibrate, override
 
 #: Camera parameter -> (name in a Dataset, units, units_metadata).
 _PARAMETERS: dict[str, tuple[str, str, str]] = {
@@ -42,15 +45,32 @@ _PARAMETERS: dict[str, tuple[str, str, str]] = {
     "atmosphere_beta2": ("atmosphere_beta2", "m-0.5", ""),
     "atmosphere_x": ("atmosphere_x", "1", ""),
 }
+#: Option -> camera parameter, and what is added to the option to give it.
+_OPTIONS: dict[str, tuple[str, float]] = {
+    "emissivity": ("emissivity", 0.0),
+    "object_distance_m": ("object_distance_m", 0.0),
+    "reflected_temperature_degC": ("reflected_temperature_K", ZERO_CELSIUS_K),
+    "atmospheric_temperature_degC": ("atmospheric_temperature_K", ZERO_CELSIUS_K),
+    "relative_humidity": ("relative_humidity", 0.0),
+    "window_transmission": ("window_transmission", 0.0),
+    "window_temperature_degC": ("window_temperature_K", ZERO_CELSIUS_K),
+}
+_TEMPERATURE = {
+    "long_name": "surface temperature",
+    "units": "degC",
+    "units_metadata": "temperature: on_scale",
+}
 
 
 class FlirBackendEntrypoint(BackendEntrypoint):
     """Entry point of xarray for radiometric JPEG, SEQ, CSQ and FFF files."""
 
     description = "FLIR radiometric JPEG, SEQ, CSQ and FFF files"
-    open_dataset_parameters = ("filename_or_obj", "drop_variables")
+    open_dataset_parameters = ("filename_or_obj", "drop_variables", *_OPTIONS)
 
-    def open_dataset(self, filename_or_obj: Any, *, drop_variables: str | Iterable[str] | None = None) -> xr.Dataset:
+    def open_dataset(
+        self, filename_or_obj: Any, *, drop_variables: str | Iterable[str] | None = None, **overrides: float | None
+    ) -> xr.Dataset:
         """List the frames of radiometric FLIR files and present them as one lazy Dataset.
 
         Parameters
@@ -59,18 +79,24 @@ class FlirBackendEntrypoint(BackendEntrypoint):
             Radiometric JPEG, SEQ, CSQ or FFF files of one camera.
         drop_variables : str or iterable of str, optional
             Variables to leave out.
+        **overrides : float, optional
+            Parameters in place of those of the files: ``emissivity``, ``relative_humidity``, ``window_transmission`` (fractions),
+            ``object_distance_m``, ``reflected_temperature_degC``, ``atmospheric_temperature_degC``, ``window_temperature_degC``.
 
         Returns
         -------
         Dataset
-            ``counts`` (time, row, column) uint16, read on access; one variable per camera parameter, along ``time`` where it varies;
+            ``counts`` (time, row, column) uint16 and ``temperature`` (degC, float32) of the same shape, both read on access; one variable
+            per camera parameter, along ``time`` where it varies;
             ``camera_temperature`` (time, sensor), K; coordinate ``time``, UTC. The attribute ``rejected`` lists as JSON the files and
-            frames that could not be used.
+            frames that could not be used, ``measurement_regions`` the spots and areas that the first frame stores.
 
         Raises
         ------
         FlirFormatError
             Where no frame can be read, or the frames differ in size.
+        RadiometryError
+            Where an override is unknown or has no meaning.
 
         Warns
         -----
@@ -78,22 +104,136 @@ class FlirBackendEntrypoint(BackendEntrypoint):
             Where files or frames could not be used.
         """
         several = isinstance(filename_or_obj, (list, tuple))
-        dataset = _open_frames(filename_or_obj if several else [filename_or_obj])
+        changes = _parameter_changes(overrides)
+        dataset = _open_frames(filename_or_obj if several else [filename_or_obj], changes)
         dropped = [drop_variables] if isinstance(drop_variables, str) else list(drop_variables or ())
         return dataset.drop_vars(dropped, errors="ignore")
 
     def guess_can_open(self, filename_or_obj: Any) -> bool:
-        """Return whether a file starts as an FFF record; not every JPEG is radiometric, so for these the engine must be named."""
+        """Return whether a file starts as an FFF record, or is a JPEG with a radiometric frame in it."""
         if not isinstance(filename_or_obj, (str, os.PathLike)):
             return False
         try:
             with Path(filename_or_obj).open("rb") as file:
-                return file.read(4) == b"FFF\0"
+                start = file.read(4)
         except OSError:
             return False
+        return start == b"FFF\0" or (start[:2] == b"\xff\xd8" and bool(index_frames([filename_or_obj])[0]))
 
 
-def _open_frames(paths: Iterable[str | os.PathLike[str]]) -> xr.Dataset:
+@xr.register_dataset_accessor("flir")
+class FlirAccessor:
+    """What a Dataset of the engine "flir" can be asked for: ``dataset.flir``.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        As the engine returns it, or a selection of it.
+    """
+
+    def __init__(self, dataset: xr.Dataset) -> None:
+        self._dataset = dataset
+
+    def temperature(self, **overrides: float | None) -> xr.DataArray:
+        """Calibrate the counts anew.
+
+        Parameters
+        ----------
+        **overrides : float, optional
+            As of `FlirBackendEntrypoint.open_dataset`, in place of the parameters that the Dataset holds.
+
+        Returns
+        -------
+        DataArray
+            Surface temperature, degC, of the shape of ``counts``; lazy where ``counts`` is in chunks.
+
+        Raises
+        ------
+        RadiometryError
+            An override is unknown or has no meaning, or the Dataset lacks counts or a parameter.
+        """
+        dataset, changes = self._dataset, _parameter_changes(overrides)
+        lacking = [name for name in ("counts", *(name for name, *_ in _PARAMETERS.values())) if name not in dataset]
+        if lacking:
+            raise RadiometryError(
+                f"the Dataset has no {', '.join(lacking)}; open the file with engine='flir' and keep them"
+            )
+        parameters = [override(each, **changes) if changes else each for each in _stored_parameters(dataset)]
+        index = xr.DataArray(np.arange(len(parameters)), dims="time") if len(parameters) > 1 else xr.DataArray(0)
+        temperature: xr.DataArray = xr.apply_ufunc(
+            lambda counts, which: _calibrate_each(counts, which, parameters),
+            dataset["counts"],
+            index,
+            dask="parallelized",
+            output_dtypes=[np.float32],
+        )
+        return temperature.rename("temperature").assign_attrs(_TEMPERATURE)
+
+    def visible_light(self, frame: int = 0) -> xr.DataArray | None:
+        """Read the visible-light picture that the camera took with a frame.
+
+        Parameters
+        ----------
+        frame : int, optional
+            Place along ``time``.
+
+        Returns
+        -------
+        DataArray or None
+            (visible_row, visible_column, channel) uint8, red, green and blue; the attributes ``scale`` (field of view over that of the
+            sensor, 0 where not stored) and ``offset_px`` say where the sensor looks. None where the file holds no picture.
+
+        Raises
+        ------
+        FlirFormatError
+            The picture is damaged, or the file is not there any more.
+        """
+        place = self._dataset.isel(time=frame) if "time" in self._dataset.dims else self._dataset
+        references, rejected = index_frames([str(place["source"].values)])
+        found = [
+            each for each in references if each.index == int(place["frame"]) and isinstance(each, FlirFrameReference)
+        ]
+        if not found:
+            raise FlirFormatError(rejected[0].reason if rejected else f"{place['source'].values}: the frame is gone")
+        picture = read_visible_picture(found[0])
+        if picture is None:
+            return None
+        return xr.DataArray(
+            picture.pixels,
+            dims=("visible_row", "visible_column", "channel"),
+            coords={"channel": ["red", "green", "blue"]},
+            name="visible_light",
+            attrs={"long_name": "visible-light picture", "scale": picture.scale, "offset_px": list(picture.offset_px)},
+        )
+
+
+def _parameter_changes(overrides: dict[str, float | None]) -> dict[str, float]:
+    """Return camera parameters by name from options; those that are None are left as the file stores them."""
+    unknown = sorted(set(overrides) - set(_OPTIONS))
+    if unknown:
+        raise RadiometryError(f"{', '.join(unknown)}: no such parameter; there are {', '.join(_OPTIONS)}")
+    return {
+        _OPTIONS[name][0]: float(value) + _OPTIONS[name][1] for name, value in overrides.items() if value is not None
+    }
+
+
+def _stored_parameters(dataset: xr.Dataset) -> list[CameraParameters]:
+    """Return the camera parameters that a Dataset holds: one set, or one per frame where any of them varies."""
+    values = {field: dataset[name].values for field, (name, *_) in _PARAMETERS.items()}
+    count = max((value.size for value in values.values() if value.ndim), default=1)
+    spread = {field: np.broadcast_to(value, count) for field, value in values.items()}
+    return [CameraParameters(**{field: float(value[i]) for field, value in spread.items()}) for i in range(count)]
+
+
+def _calibrate_each(counts: np.ndarray, which: np.ndarray, parameters: Sequence[CameraParameters]) -> np.ndarray:
+    """Calibrate frames, each with its own parameters where there are several sets."""
+    if which.ndim == 0:
+        return calibrate(np.asarray(counts), parameters[int(which)])
+    indices = np.broadcast_to(which.reshape(which.shape[0], -1)[:, 0], counts.shape[:1])
+    return np.stack([calibrate(np.asarray(frame), parameters[i]) for frame, i in zip(counts, indices, strict=True)])
+
+
+def _open_frames(paths: Iterable[str | os.PathLike[str]], changes: dict[str, float]) -> xr.Dataset:
     """Return the frames of all files as one lazy Dataset."""
     frames, rejected = index_frames(paths)
     if not frames:
@@ -108,15 +248,29 @@ def _open_frames(paths: Iterable[str | os.PathLike[str]]) -> xr.Dataset:
     if rejected:
         text = f"{len(rejected)} files or frames could not be used, the first: {rejected[0].reason}"
         warnings.warn(text, UserWarning, stacklevel=3)
-    counts = xr.Variable(
-        ("time", "row", "column"),
-        indexing.LazilyIndexedArray(_FrameStack(frames)),
-        {"long_name": "counts of the detector", "units": "1"},
+    regions = read_measurement_regions(frames[0]) if isinstance(frames[0], FlirFrameReference) else []
+    if changes:
+        frames = [replace(frame, parameters=override(frame.parameters, **changes)) for frame in frames]
+    chunks = {"preferred_chunks": {"time": 1}}
+    counts, temperature = (
+        xr.Variable(("time", "row", "column"), indexing.LazilyIndexedArray(stack), attrs, chunks)
+        for stack, attrs in (
+            (_FrameStack(frames, np.uint16, _counts), {"long_name": "counts of the detector", "units": "1"}),
+            (_FrameStack(frames, np.float32, _temperature), _TEMPERATURE),
+        )
     )
     dataset = xr.Dataset(
-        {"counts": counts, **_parameter_variables(frames), "camera_temperature": _camera_temperatures(frames)},
+        {
+            "counts": counts,
+            "temperature": temperature,
+            **_parameter_variables(frames),
+            "camera_temperature": _camera_temperatures(frames),
+        },
         coords=_coordinates(frames),
-        attrs=_attributes(frames, rejected),
+        attrs={
+            **_attributes(frames, rejected),
+            "measurement_regions": json.dumps([asdict(region) for region in regions]),
+        },
     )
     dataset["time"].encoding = {"units": "milliseconds since 1970-01-01", "calendar": "proleptic_gregorian"}
     return dataset
@@ -125,10 +279,12 @@ def _open_frames(paths: Iterable[str | os.PathLike[str]]) -> xr.Dataset:
 class _FrameStack(BackendArray):
     """Frames as one array (time, row, column); it holds only paths and offsets, so it can be pickled and keeps no file open."""
 
-    def __init__(self, frames: list[FrameReference]) -> None:
-        self.frames = frames
+    def __init__(
+        self, frames: list[FrameReference], kind: type[np.generic], read: Callable[[FrameReference], np.ndarray]
+    ) -> None:
+        self.frames, self.read = frames, read
         self.shape = (len(frames), *frames[0].shape)
-        self.dtype = np.dtype(np.uint16)
+        self.dtype = np.dtype(kind)
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._read)
@@ -136,13 +292,21 @@ class _FrameStack(BackendArray):
     def _read(self, key: tuple[Any, ...]) -> np.ndarray:
         time, row, column = key
         if isinstance(time, (int, np.integer)):
-            return self.frames[time].read_counts()[row][..., column]
+            return self.read(self.frames[time])[row][..., column]
         chosen = range(len(self.frames))[time] if isinstance(time, slice) else time
-        first = np.empty(self.shape[1:], np.uint16)[row][..., column]
-        stack = np.empty((len(chosen), *first.shape), np.uint16)
+        first = np.empty(self.shape[1:], self.dtype)[row][..., column]
+        stack = np.empty((len(chosen), *first.shape), self.dtype)
         for place, index in enumerate(chosen):
-            stack[place] = self.frames[index].read_counts()[row][..., column]
+            stack[place] = self.read(self.frames[index])[row][..., column]
         return stack
+
+
+def _counts(frame: FrameReference) -> np.ndarray:
+    return frame.read_counts()
+
+
+def _temperature(frame: FrameReference) -> np.ndarray:
+    return calibrate(frame.read_counts(), frame.parameters)
 
 
 def _parameter_variables(frames: list[FrameReference]) -> dict[str, xr.Variable]:

@@ -54,3 +54,16 @@ def test_without_times_forward_is_positive_and_this_is_told() -> None:
     assert json.loads(check_and_assemble(readings).attrs["notes"]) == [
         "forward was taken as the positive direction: the file gives no times that tell the travel"
     ]
+
+
+def test_times_without_seconds_are_told() -> None:
+    cells = ((1, "positive", 1, 0.0), (1, "positive", 2, 20.0), (1, "negative", 2, 20.0))
+    minutes = (0, 0, 1)
+    readings = [
+        Reading(2 + i, *cell, np.datetime64(f"2026-03-09T06:0{minute}", "ns"), 0.0)
+        for i, (cell, minute) in enumerate(zip(cells, minutes, strict=True))
+    ]
+    test = check_and_assemble(Readings(Path("t.csv"), "length", readings, zones={"+0000": 2}))
+    assert json.loads(test.attrs["notes"]) == [
+        "warning: the times have no seconds, and 1 readings share theirs with others: export them with seconds"
+    ]

@@ -16,7 +16,7 @@ from thermography.io.flir import FlirFrameReference, read_frame
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import FlirFormatError
 from thermography.io.xarray_backend import FlirBackendEntrypoint
-from thermography.radiometry.planck import override
+from thermography.radiometry.planck import RadiometryError, calibrate, override
 
 
 def _open(path, **options) -> xr.Dataset:
@@ -132,6 +132,53 @@ def test_files_are_recognised_by_their_start(tmp_path: Path) -> None:
     assert guess(tmp_path / "a.bin") and guess(str(tmp_path / "a.bin"))
     assert not guess(tmp_path / "b.bin") and not guess(tmp_path / "absent.seq") and not guess(3)
     assert not guess([tmp_path / "a.bin"])
+    jpeg(tmp_path / "c.jpg")
+    (tmp_path / "photo.jpg").write_bytes(b"\xff\xd8\xff\xe0" + bytes(40) + b"\xff\xd9")
+    assert guess(tmp_path / "c.jpg") and not guess(tmp_path / "photo.jpg")
+
+
+def test_temperature_is_calibrated_on_access_with_the_given_parameters(tmp_path: Path) -> None:
+    written = sequence(tmp_path / "a.seq", frames=3)
+    for options, parameters in (
+        ({}, PARAMETERS),
+        (
+            {"emissivity": 0.8, "reflected_temperature_degC": 22.0},
+            override(PARAMETERS, emissivity=0.8, reflected_temperature_K=295.15),
+        ),
+    ):
+        dataset = _open(tmp_path / "a.seq", **options)
+        assert dataset["temperature"].attrs["units"] == "degC" and dataset["temperature"].dtype == np.float32
+        np.testing.assert_array_equal(dataset["temperature"][1, 2:5], calibrate(written[1].counts, parameters)[2:5])
+        assert float(dataset["emissivity"]) == parameters.emissivity
+    with pytest.raises(RadiometryError, match="emisivity: no such parameter; there are emissivity, object_distance_m"):
+        FlirBackendEntrypoint().open_dataset(tmp_path / "a.seq", emisivity=0.9)
+
+
+@pytest.mark.parametrize("chunks", [None, {}, {"time": 2}])
+def test_the_accessor_calibrates_anew(tmp_path: Path, chunks: dict | None) -> None:
+    for second, emissivity in enumerate((0.5, 0.75, 0.9)):
+        each = frame(seconds=second)
+        write_jpeg(tmp_path / f"{second}.jpg", each.counts, override(PARAMETERS, emissivity=emissivity), each.time)
+    dataset = _open(sorted(tmp_path.iterdir()), chunks=chunks)
+    np.testing.assert_array_equal(dataset.flir.temperature(), dataset["temperature"])
+    anew = dataset.flir.temperature(emissivity=0.8)
+    assert (anew.chunks is None) is (chunks is None)
+    np.testing.assert_array_equal(anew, _open(sorted(tmp_path.iterdir()), emissivity=0.8)["temperature"])
+    np.testing.assert_array_equal(
+        dataset.isel(time=1, row=slice(2, 4)).flir.temperature(), dataset["temperature"][1, 2:4]
+    )
+    with pytest.raises(RadiometryError, match="the Dataset has no counts; open the file with engine='flir'"):
+        dataset.drop_vars("counts").flir.temperature()
+    assert dataset.flir.visible_light(2) is None
+
+
+@pytest.mark.real_data
+def test_regions_and_picture_of_real_files(real_file) -> None:
+    spots = _open(real_file("gpereyrairujo__IRimage/Windows/IRimage/test/test_image.jpg"))
+    assert [each["label"] for each in json.loads(spots.attrs["measurement_regions"])] == ["Sp1", "Sp2"]
+    picture = _open(real_file("frkatona__ThermalImageFitter/Nov19/FLIR2167.jpg")).flir.visible_light()
+    assert picture.dims == ("visible_row", "visible_column", "channel") and picture.shape == (480, 640, 3)
+    assert picture.attrs["offset_px"] == [10, -20]
 
 
 def test_variables_can_be_dropped(tmp_path: Path) -> None:
