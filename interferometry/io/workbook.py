@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import io
+import struct
 import zipfile
 from pathlib import Path
 from typing import BinaryIO
@@ -98,7 +99,8 @@ def refuse_bomb(path: Path, archive: BinaryIO) -> None:
     try:
         with zipfile.ZipFile(archive) as parts:
             total = sum(part.file_size for part in parts.infolist())
-    except zipfile.BadZipFile:
+    # A damaged directory of the archive is told by the reader itself, which takes it apart more carefully.
+    except (zipfile.BadZipFile, NotImplementedError, ValueError, OverflowError, OSError, struct.error):
         total = 0
     archive.seek(0)
     if total > _MOST_BYTES:
