@@ -12,7 +12,7 @@ from fusion.attribution.two_sessions import ChannelAgreement, SourceAgreement, c
 from fusion.products.results import read_results
 from fusion.products.store import read_dataset, read_tree, write_dataset, write_json, write_text
 from fusion.report.html import render_report
-from fusion.report.wording import CHANNELS, duration, measured, number, p_value
+from fusion.report.wording import CHANNELS, duration, measured, number, p_cell
 
 _READERS = {"fields": read_dataset, "deviations": read_dataset, "fusion": read_tree}
 
@@ -86,7 +86,7 @@ def source_row(source: SourceAgreement, titles: Sequence[str]) -> list[str]:
         Place (x, y in mm), part of the drift, result of the first and of the second session, and whether the source is a cause.
     """
     shown = [
-        f"p {p_value(p)}, {measured(value, u, 'µm/K')}, lag {duration(lag)}"
+        f"p {p_cell(p)}, {measured(value, u, 'µm/K')}, lag {duration(lag)}"
         for p, value, u, lag in zip(
             source.p_value,
             source.sensitivity_um_per_K,
@@ -109,5 +109,5 @@ def _channel_text(channel: ChannelAgreement) -> str:
     first, second = (number(value, 2) for value in channel.sensitivity_um_per_K)
     return (
         f"{channel.verdict}: {channel.reason}; x {channel.x_mm:.0f} mm, y {channel.y_mm:.0f} mm, larger p of both "
-        f"{p_value(channel.p_value)}, {first} and {second} µm/K"
+        f"{p_cell(channel.p_value)}, {first} and {second} µm/K"
     )

@@ -10,11 +10,13 @@ import numpy as np
 import xarray as xr
 
 from fusion.attribution.family_wise import LEVEL
+from fusion.products.results import Results
 from fusion.products.results_attribution import CorrelationPart, DutyPart, PlacePart, TestedPart
 from fusion.report.charts.attribution import caption_of, rate_text
-from fusion.report.findings import attribution_headline, randomised_causes
+from fusion.report.conclusions.answers import place_sentence
+from fusion.report.findings import area_words, randomised_causes, span_words
 from fusion.report.tables import Row, Table, Words, table
-from fusion.report.wording import CHANNELS, duration, join, measured, number, p_value, place, quantity
+from fusion.report.wording import CHANNELS, conditional, duration, join, measured, number, p_cell, place, quantity
 
 _SHORT = {"common": "common", "proportional": "growing", "reversal": "reversal", "joint": "common and growing"}
 _SENSITIVITY = "Sensitivity / (µm/K)"
@@ -41,7 +43,7 @@ class PlaceTables:
 
 
 def describe_correlation(
-    fused: xr.DataTree, correlation: CorrelationPart | None, joint: Mapping[str, Any] | None
+    fused: xr.DataTree, results: Results, joint: Mapping[str, Any] | None
 ) -> dict[str, Any] | None:
     """Return everything the section on drift and field says, as the template reads it; None where it was not tested.
 
@@ -49,11 +51,12 @@ def describe_correlation(
     ----------
     fused : DataTree
         fusion.nc of the run.
-    correlation : CorrelationPart or None
-        The part ``correlation`` of the results.
+    results : Results
+        Results of the run.
     joint : mapping or None
         What this campaign and another one of the machine agree on, see `fusion.report.html.render_report`.
     """
+    correlation = results.correlation
     if correlation is None or "correlation" not in fused.children:
         return None
     maps = fused.children["correlation"]
@@ -64,15 +67,19 @@ def describe_correlation(
     sentences = [_leading(correlation), *_beside(correlation), _worth(correlation, joint)]
     places = (
         ("Mode", "Thermal modes", correlation.modes),
-        ("Region", "Regions and hotspots", correlation.regions),
+        ("Region", "Regions, and discs about the middles of hotspots", correlation.regions),
     )
     return {
-        "headline": attribution_headline(correlation),
+        "headline": conditional(place_sentence(correlation), results.inputs, "attribution"),
         "sentences": [sentence for sentence in sentences if sentence],
         "tell": correlation.would_tell,
         "captions": captions,
-        "cells": _cells_table(maps.to_dataset()),
-        "places": [_place_tables(heading, title, listed, maps) for heading, title, listed in places if listed],
+        "cells": _cells_table(maps.to_dataset(), correlation.least_p),
+        "places": [
+            _place_tables(heading, title, listed, maps, correlation.least_p)
+            for heading, title, listed in places
+            if listed
+        ],
         "region": leading_region(maps) if "target_regions" in maps.children else "",
         "region_targets": _region_targets(maps) if "target_regions" in maps.children else "",
         "session": _session(maps),
@@ -83,19 +90,19 @@ def describe_correlation(
 
 
 def _leading(correlation: CorrelationPart) -> str:
-    """Size, lag and place of the leading candidate, and what cannot be told from it."""
+    """Size and lag of the leading candidate, and what cannot be told from it."""
     source = correlation.source
     attributable = correlation.verdict == "attributable"
     what = {"cell": "a cell", "mode": f"thermal mode {source.name}", "region": source.name}[source.kind]
-    behind = f"{duration(source.lag_s)} behind it" if source.lag_s else "without lag"
+    behind = f"with a lag of {duration(source.lag_s)}" if source.lag_s else "without lag"
     size = quantity(source.sensitivity_um_per_K, "µm/K")
-    text = (
-        f"{'Found in' if attributable else 'Closest was'} {what}, by {CHANNELS.get(source.part, source.part)}: {size} of its rise, "
-        f"{behind}."
-    )
+    part = CHANNELS.get(source.part, source.part)
+    text = f"It is {what}; the {part} goes with its rise by {size} (k = 2), {behind}."
+    if not attributable:
+        text = f"Closest is {what}: {part}, {size} of its rise (k = 2), {behind}."
     if not attributable or not source.equal_places_mm:
         return text
-    others = [place(x, y) for x, y in source.equal_places_mm[:4]]
+    others = [f"the place around {place(x, y)}" for x, y in source.equal_places_mm[:4]]
     more = f" and {len(source.equal_places_mm) - 4} more" if len(source.equal_places_mm) > 4 else ""
     return f"{text} These data cannot tell it from {join(others)}{more}, which explain the drift as well."
 
@@ -113,7 +120,7 @@ def _beside(correlation: CorrelationPart) -> list[str]:
     for mode in correlation.modes:
         if mode.name == f"mode {source.name}":
             continue
-        named = f"{mode.name} ({place(mode.x_mm, mode.y_mm)})"
+        named = f"{mode.name} ({area_words(mode.area, mode.x_mm, mode.y_mm)})"
         if any(_passes(tested.p_beside_leader) for tested in mode.parts.values()):
             adds.append(named)
         elif any(_passes(tested.p_value) for tested in mode.parts.values()):
@@ -125,7 +132,7 @@ def _beside(correlation: CorrelationPart) -> list[str]:
         )
     if alike:
         sentences.append(
-            f"By itself {alike[0]} passes too, but adds nothing to it: this place may only warm with it."
+            f"By itself {alike[0]} passes too, but adds nothing to it: that place may only warm with it."
             if len(alike) == 1
             else f"By themselves {join(alike)} pass too, but add nothing to it: these places may only warm with it."
         )
@@ -147,7 +154,7 @@ def _worth(correlation: CorrelationPart, joint: Mapping[str, Any] | None) -> str
     return "Causation is not shown yet: in one session two courses may agree by chance, and places that warm together cannot be told apart."
 
 
-def _cells_table(maps: xr.Dataset) -> Table:
+def _cells_table(maps: xr.Dataset, least_p: float | None) -> Table:
     """Return the strongest cell of every part of the drift, its detection limit, and the drift that nothing explains."""
     columns = [
         Words("Part of the drift"),
@@ -158,16 +165,16 @@ def _cells_table(maps: xr.Dataset) -> Table:
         _DETECTION_LIMIT,
         "Unexplained drift / µm in one hour",
     ]
-    return table(columns, [_cell_row(maps, str(channel)) for channel in maps["channel"].values])
+    return table(columns, [_cell_row(maps, str(channel), least_p) for channel in maps["channel"].values])
 
 
-def _cell_row(maps: xr.Dataset, channel: str) -> list[str]:
+def _cell_row(maps: xr.Dataset, channel: str, least_p: float | None) -> list[str]:
     chosen = maps[["p_value", "sensitivity", "sensitivity_u", "lag", "detectable_sensitivity"]].sel(channel=channel)
     flat = chosen.stack(cell=("y", "x"))
     best = flat.isel(cell=int(np.argmin(flat["p_value"].fillna(np.inf).values)))
     return [
         _SHORT.get(channel, channel),
-        p_value(float(best["p_value"])),
+        p_cell(float(best["p_value"]), least_p),
         f"{float(best['x']):.0f}, {float(best['y']):.0f}",
         measured(float(best["sensitivity"]), float(best["sensitivity_u"])),
         duration(float(best["lag"])),
@@ -176,10 +183,22 @@ def _cell_row(maps: xr.Dataset, channel: str) -> list[str]:
     ]
 
 
-def _place_tables(heading: str, title: str, listed: Iterable[PlacePart], maps: xr.DataTree) -> PlaceTables:
+def _place_tables(
+    heading: str, title: str, listed: Iterable[PlacePart], maps: xr.DataTree, least_p: float | None
+) -> PlaceTables:
     """Return modes or regions: the strongest part of the drift for each, and all parts."""
     modes = heading == "Mode"
-    columns = [Words(heading), "x, y / mm", Words("Part of the drift"), "p", _SENSITIVITY, "Lag", _DETECTION_LIMIT]
+    at = "Strongest at x, y / mm" if modes else "Middle x, y / mm"
+    columns = [
+        Words(heading),
+        Words("Area"),
+        at,
+        Words("Part of the drift"),
+        "p",
+        _SENSITIVITY,
+        "Lag",
+        _DETECTION_LIMIT,
+    ]
     if modes:
         columns.append("p given the leading mode")
     tested = maps.children["modes" if modes else "regions"].to_dataset()
@@ -187,26 +206,27 @@ def _place_tables(heading: str, title: str, listed: Iterable[PlacePart], maps: x
     strongest: list[Row] = []
     every: list[Row] = []
     for k, candidate in enumerate(listed):
-        rows = {part: _place_row(candidate, part, found, modes) for part, found in candidate.parts.items()}
+        rows = {part: _place_row(candidate, part, found, modes, least_p) for part, found in candidate.parts.items()}
         leading = ratio.isel({heading.lower(): k})
         strongest.append(rows[str(leading["channel"].values[int(leading.values.argmax())])])
         every += rows.values()
     return PlaceTables(title, table(columns, strongest), table(columns, every))
 
 
-def _place_row(candidate: PlacePart, part: str, tested: TestedPart, modes: bool) -> Row:
+def _place_row(candidate: PlacePart, part: str, tested: TestedPart, modes: bool, least_p: float | None) -> Row:
     x, y = ("–" if value is None else f"{value:.0f}" for value in (candidate.x_mm, candidate.y_mm))
     cells = [
         candidate.name,
+        span_words(candidate.area),
         f"{x}, {y}",
         _SHORT.get(part, part),
-        p_value(tested.p_value),
+        p_cell(tested.p_value, least_p),
         quantity(tested.sensitivity_um_per_K),
         duration(tested.lag_s),
         number(tested.detectable_um_per_K, 2),
     ]
     if modes:
-        cells.append(p_value(tested.p_beside_leader))
+        cells.append(p_cell(tested.p_beside_leader, least_p))
     return Row(cells, marked=_passes(tested.p_value))
 
 
@@ -264,7 +284,7 @@ def _duty_table(loads: Iterable[DutyPart]) -> Table:
         rows.append(
             [
                 load.name,
-                p_value(load.p_value),
+                p_cell(load.p_value),
                 quantity(load.drift_at_full_duty_um),
                 duration(first) + (f" behind {duration(second)}" if second else ""),
                 "a cause" if load.cause else "not shown",
@@ -280,18 +300,18 @@ def _sensors_text(sensors: xr.Dataset, verdict: str) -> str:
     gain, most = float(sensors["camera_gain"]), float(sensors["camera_gain_at_most"])
     if bool(sensors["camera_decided"]):
         text = (
-            f"Predicting cycles that it was not fitted to, the camera takes {number(gain, 2)} µm out of the drift "
-            f"(at most {number(most, 2)} µm)."
+            f"In cycles that it was not fitted to, what the camera sees lowers the error by {number(gain, 2)} µm "
+            f"(upper limit {number(most, 2)} µm)."
         )
     else:
         text = (
-            "Undecided: on cycles that it was not fitted to, the camera itself is not shown to take anything out of the drift "
-            f"(at most {number(most, 2)} µm), so a table of what sensors lose beside it says little."
+            "Undecided: in cycles that it was not fitted to, what the camera sees is not shown to lower the error "
+            f"(upper limit {number(most, 2)} µm), so a comparison of sensors with it says little."
         )
     if verdict == "not separable":
         text += " In a single warm-up many places do alike; which of them would do in another session these data cannot tell."
     within = duration(float(sensors["run_length"]))
-    return f"{text} Losses are root mean squares over all positions, within runs of {within} of left-out cycles."
+    return f"{text} Errors are root mean squares over all positions, within runs of {within} of left-out cycles."
 
 
 def _sensors_table(correlation: CorrelationPart) -> Table | None:
@@ -302,12 +322,13 @@ def _sensors_table(correlation: CorrelationPart) -> Table | None:
     least = np.inf
     for count, added in enumerate(correlation.sensors.sets, start=1):
         loss = np.inf if added.loss_um is None else added.loss_um
-        verdict = "loses" if added.decided else "as good as the camera, as far as these data show"
+        verdict = "worse than the camera" if added.decided else "as good as the camera, as far as these data show"
         if loss > least:
-            verdict += "; no better than fewer"
+            verdict += "; fewer sensors do as well"
         least = min(least, loss)
         where = place(added.x_mm, added.y_mm)
         rows.append([str(count), where, number(added.loss_um, 2), number(added.loss_at_most_um, 2), verdict])
     return table(
-        ["Sensors", Words("Added place"), "Lost beside the camera / µm", "at most / µm", Words("Verdict")], rows
+        ["Number of sensors", Words("Place of the last one"), "Error added / µm", "Upper limit / µm", Words("Verdict")],
+        rows,
     )

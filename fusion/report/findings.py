@@ -9,7 +9,8 @@ from fusion.products.results_attribution import CorrelationPart
 from fusion.products.results_axis import AnomalyPart, DriftPart, Iso230Part, Iso230Window
 from fusion.products.results_inputs import Figures
 from fusion.products.results_loop import Loop, StepPart
-from fusion.report.wording import BASELINES, join, number, p_value, place, quantity
+from fusion.products.results_part import AreaPart
+from fusion.report.wording import BASELINES, alike, number, place, quantity
 
 #: Axis values in the terms of ISO 230-2:2014, in the order of the report.
 ISO230_TERMS = {
@@ -106,23 +107,32 @@ def anomaly_figures(anomaly: AnomalyPart) -> tuple[Figures, ...]:
     return ("positions", "field") if anomaly.cause == "local_temperature" else ("positions",)
 
 
-def attribution_headline(correlation: CorrelationPart) -> str:
-    """Return one sentence that states whether a part of the field goes with the drift.
+def area_words(area: AreaPart | None, x_mm: float | None, y_mm: float | None) -> str:
+    """Return the name of a place on the plan: the area, and where it is strongest.
 
     Parameters
     ----------
-    correlation : CorrelationPart
-        The part ``correlation`` of the results.
+    area : AreaPart or None
+        None: only the point is named.
+    x_mm, y_mm : float or None
+        Its strongest cell, or the middle of a region, mm.
     """
-    source = correlation.source
-    where = place(source.x_mm, source.y_mm)
-    return {
-        "not separable": "These data cannot tell: the whole session is one warm-up, in which every temperature rises like every drift.",
-        "not attributable": "No part of the field goes with the drift more closely than chance allows; the closest is around "
-        f"{where} (p = {p_value(source.p_value)}).",
-        "attributable": f"The drift goes with the temperature around {where} more closely than chance and common warm-up allow "
-        f"(p = {p_value(source.p_value)}).",
-    }[correlation.verdict]
+    if area is None:
+        return f"the place around {place(x_mm, y_mm)}"
+    return f"the area {span_words(area)} (strongest at {place(x_mm, y_mm)})"
+
+
+def span_words(area: AreaPart | None) -> str:
+    """Return the edges of an area on the plan; a dash where there is none.
+
+    Parameters
+    ----------
+    area : AreaPart or None
+        mm.
+    """
+    if area is None:
+        return "–"
+    return f"x {area.x_low_mm:.0f} to {area.x_high_mm:.0f} mm, y {area.y_low_mm:.0f} to {area.y_high_mm:.0f} mm"
 
 
 def randomised_causes(correlation: CorrelationPart) -> list[str]:
@@ -144,11 +154,10 @@ def hold_out_errors(loop: Loop) -> str:
     loop : Loop
         The part ``loop`` of the results.
     """
-    declared, final = (
-        f"{number(error.rmse_um, 3)} [{number(error.low_um, 2)}, {number(error.high_um, 2)}]"
-        for error in (loop.errors.declared, loop.errors.final)
-    )
-    return f"{declared} -> {final} µm"
+    both = (loop.errors.declared, loop.errors.final)
+    errors, lows, highs = (alike([getattr(error, name) for error in both]) for name in ("rmse_um", "low_um", "high_um"))
+    told = [f"{error} [{low} to {high}]" for error, low, high in zip(errors, lows, highs, strict=True)]
+    return f"{told[0]} -> {told[1]} µm"
 
 
 def baseline_errors(loop: Loop) -> str:
@@ -160,7 +169,8 @@ def baseline_errors(loop: Loop) -> str:
         The part ``loop`` of the results.
     """
     names = dict.fromkeys(("last_value", "mean", loop.best_baseline))
-    return ", ".join(f"{BASELINES[name]} {number(getattr(loop.baselines, name).rmse_um, 3)}" for name in names) + " µm"
+    errors = alike([getattr(loop.baselines, name).rmse_um for name in names])
+    return ", ".join(f"{BASELINES[name]} {error}" for name, error in zip(names, errors, strict=True)) + " µm"
 
 
 def step_errors(step: StepPart) -> str:
@@ -171,19 +181,7 @@ def step_errors(step: StepPart) -> str:
     step : StepPart
         One of ``loop.steps``.
     """
-    cross = f"blocks left out {number(step.cross_rmse_before_um, 3)} -> {number(step.cross_rmse_after_um, 3)} µm"
+    cross = f"blocks predicted from the others {' -> '.join(alike((step.cross_rmse_before_um, step.cross_rmse_after_um)))} µm"
     if step.rmse_after_um is None:
         return f"found after the hold-out was opened, {cross}"
-    return f"held-out error {number(step.rmse_before_um, 3)} -> {number(step.rmse_after_um, 3)} µm, {cross}"
-
-
-def standing_out(anomalies: tuple[AnomalyPart, ...]) -> str:
-    """Return one sentence that names the positions that stand out with their causes.
-
-    Parameters
-    ----------
-    anomalies : tuple of AnomalyPart
-        The part ``anomalies`` of the results.
-    """
-    named = [f"position {anomaly.target} ({anomaly_cause(anomaly)})" for anomaly in anomalies]
-    return f"Standing out: {join(named)}." if named else "No position stands out from the others."
+    return f"held-out error {' -> '.join(alike((step.rmse_before_um, step.rmse_after_um)))} µm, {cross}"

@@ -12,12 +12,12 @@ from fusion.products.grouped import group, has
 from fusion.products.results import Results
 from fusion.report import record_section, summary_section
 from fusion.report.attribution_section import leading_region
-from fusion.report.charts import attribution, drift, iso230, neighbours, plan, readings, timeline
+from fusion.report.charts import attribution, drift, iso230, neighbours, plan, prediction, readings, timeline
 from fusion.report.charts import loop as closed_loop
 from fusion.report.charts.style import Chart
 from fusion.report.charts.thermal_map import plot_thermal_map
 from fusion.report.page import render_page
-from interferometry.figures import evaluate_common_start
+from interferometry.figures import evaluate_common_start, hours_since_start
 
 
 def render_report(
@@ -102,7 +102,7 @@ def _draw_charts(results: Results, datasets: Mapping[str, Any]) -> dict[str, Cha
             if deviations is not None:
                 charts["drift_temperature"] = plan.plot_drift_temperature(root, group(deviations, "drift"))
         if results.correlation is not None and "correlation" in fused.children:
-            charts |= _correlation_charts(fused, results.correlation.source.part)
+            charts |= _correlation_charts(fused, results.correlation.source.part, results.correlation.least_p)
         if has(root, "loop") and deviations is not None:
             charts |= _loop_charts(group(root, "loop"), deviations)
     return charts
@@ -135,7 +135,7 @@ def _drift_charts(results: Results, deviations: xr.Dataset) -> dict[str, Chart]:
     }
 
 
-def _correlation_charts(fused: xr.DataTree, channel: str) -> dict[str, Chart]:
+def _correlation_charts(fused: xr.DataTree, channel: str, least_p: float | None) -> dict[str, Chart]:
     """The maps of the leading part of the drift, the modes, the clusters, and the leading region by target."""
     maps = fused.children["correlation"]
     cells, position = maps.to_dataset(), fused.to_dataset()["position"]
@@ -146,7 +146,9 @@ def _correlation_charts(fused: xr.DataTree, channel: str) -> dict[str, Chart]:
         charts["sensitivity"] = attribution.plot_sensitivity(cells, channel)
     if "modes" in maps.children:
         modes = maps.children["modes"].to_dataset()
-        charts |= {f"mode_{mode}": attribution.plot_mode(modes, int(mode), channel) for mode in modes["mode"].values}
+        charts |= {
+            f"mode_{mode}": attribution.plot_mode(modes, int(mode), channel, least_p) for mode in modes["mode"].values
+        }
     if "target_regions" in maps.children:
         region, targets = leading_region(maps), maps.children["target_regions"].to_dataset()
         charts["region_targets"] = attribution.plot_region_targets(targets, region, position)
@@ -165,4 +167,8 @@ def _loop_charts(loop: xr.Dataset, deviations: xr.Dataset) -> dict[str, Chart]:
         charts["held_out_errors"] = closed_loop.plot_held_out_errors(loop, deviations)
         charts["held_out_positions"] = closed_loop.plot_held_out_positions(loop, deviations)
         charts["predicted_measured"] = closed_loop.plot_predicted_measured(loop, deviations)
+    hours = hours_since_start(deviations).mean(["direction", "target"]).values
+    for step in range(loop.sizes.get("step", 0)):
+        errors = xr.Dataset({name: loop[f"block_error_{name}"].isel(step=step) for name in ("before", "after")})
+        charts[f"block_errors_{step}"] = prediction.plot_block_errors(errors, hours, "cycle")
     return charts

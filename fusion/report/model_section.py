@@ -10,19 +10,31 @@ import numpy as np
 from fusion.products.results_axis import Evidence
 from fusion.products.results_loop import (
     AxisLoop,
+    AxisStep,
     Coefficient,
-    ErrorInterval,
     HoldOutQuestion,
     Loop,
     Nothing,
     Nuisance,
     Range,
+    RecordLoop,
     ResidualPart,
     RunnerUp,
     StepPart,
 )
 from fusion.report.tables import Row, Table, Words, table
-from fusion.report.wording import BASELINES, duration, effect_words, join, measured, number, p_value, print_unit
+from fusion.report.wording import (
+    BASELINES,
+    alike,
+    duration,
+    effect_words,
+    join,
+    measured,
+    number,
+    p_cell,
+    p_words,
+    print_unit,
+)
 
 #: Shapes of a residual in the order of the report: name in the results, words.
 _SHAPES = (
@@ -44,13 +56,13 @@ _KINDS = {
     "periodic": "a periodic motion",
 }
 _UNITS = {
-    "_um_per_K": " / (µm/K)",
-    "_um": " / µm",
-    "_nats": " / nats",
-    "_min": " / min",
-    "_mm": " / mm",
-    "_s": " / s",
-    "_K": " / K",
+    "_um_per_K": "µm/K",
+    "_um": "µm",
+    "_nats": "in log-likelihood",
+    "_min": "min",
+    "_mm": "mm",
+    "_s": "s",
+    "_K": "K",
 }
 
 
@@ -70,13 +82,24 @@ def errors_table(loop: Loop) -> Table:
         The part ``loop`` of the results.
     """
     named = [("declared model", loop.errors.declared), ("with the added effects", loop.errors.final)]
-    rows = [Row(_error_cells(name, one), marked=True) for name, one in named]
-    rows += [Row(_error_cells(words, getattr(loop.baselines, name))) for name, words in BASELINES.items()]
-    return table([Words("Prediction of the hold-out"), "Error / µm", "95 % interval / µm"], rows)
+    plain = [(words, getattr(loop.baselines, name)) for name, words in _baseline_words(loop).items()]
+    listed = [*named, *plain]
+    errors, lows, highs = (
+        alike([getattr(one, name) for _, one in listed]) for name in ("rmse_um", "low_um", "high_um")
+    )
+    rows = [
+        Row([name, error, f"{low} to {high}"], marked=at < len(named))
+        for at, ((name, _), error, low, high) in enumerate(zip(listed, errors, lows, highs, strict=True))
+    ]
+    return table([Words("Prediction of what was held out"), "Error / µm", "95 % interval / µm"], rows)
 
 
-def _error_cells(name: str, error: ErrorInterval) -> list[str]:
-    return [name, number(error.rmse_um, 3), f"{number(error.low_um, 2)} to {number(error.high_um, 2)}"]
+def _baseline_words(loop: Loop) -> dict[str, str]:
+    """Plain predictions in words: of a record values are repeated, along an axis cycles."""
+    return {
+        name: words.replace("cycle", "value") if isinstance(loop, RecordLoop) else words
+        for name, words in BASELINES.items()
+    }
 
 
 def steps_table(loop: Loop) -> Table:
@@ -92,15 +115,13 @@ def steps_table(loop: Loop) -> Table:
         Words("Effect"),
         Words("Parameters"),
         "p",
-        "Held-out error before / µm",
-        "after / µm",
-        "Blocks left out, before / µm",
-        "after / µm",
+        "Held-out error / µm, before -> after",
+        "Blocks predicted from the others / µm, before -> after",
         Words("Confirmed"),
-        Words("Runner-up"),
+        Words("Next best effect"),
     ]
     declared = join([effect_words(name).name for name in loop.declared]) or "nothing"
-    rows = [Row(["0", f"declared: {declared}", "", "–", "–", number(loop.rmse_declared_um, 3), "–", "–", "", ""])]
+    rows = [Row(["0", f"declared: {declared}", "", "–", f"{alike([loop.rmse_declared_um])[0]}", "–", "", ""])]
     for turn, step in enumerate(loop.steps, start=1):
         rows.append(Row([str(turn), *_step_cells(step)], marked=True))
     return table(columns, rows)
@@ -110,11 +131,9 @@ def _step_cells(step: StepPart) -> list[str]:
     return [
         effect_words(step.effect).name,
         parameters_with_ranges(step.parameters, step.parameter_ranges),
-        p_value(step.p_value),
-        number(step.rmse_before_um, 3),
-        number(step.rmse_after_um, 3),
-        number(step.cross_rmse_before_um, 3),
-        number(step.cross_rmse_after_um, 3),
+        p_cell(step.p_value),
+        " -> ".join(alike((step.rmse_before_um, step.rmse_after_um))),
+        " -> ".join(alike((step.cross_rmse_before_um, step.cross_rmse_after_um))),
         f"not confirmed: {step.doubt}" if step.doubt else "yes",
         _runner_up(step.runner_up),
     ]
@@ -132,12 +151,40 @@ def describe_model(loop: AxisLoop) -> list[tuple[str, str]]:
         (effect_words(coefficient.effect).name, _coefficient(coefficient)) for coefficient in loop.declared_coefficients
     ]
     for step in loop.steps:
-        rows += [(effect_words(step.effect).name, _coefficient(coefficient)) for coefficient in step.coefficients]
-    rows.append(("unexplained drift", _unexplained_drift(loop.nuisance)))
-    rows.append(("error of repeating the last value", f"{number(loop.rmse_persistence_um, 3)} µm"))
+        name = effect_words(step.effect).name
+        named = zip(coefficient_names(step), step.coefficients, strict=True)
+        rows += [(f"{name}: {what}" if what else name, _coefficient(coefficient)) for what, coefficient in named]
+    rows.append(("drift without explanation", _unexplained_drift(loop.nuisance)))
     if isinstance(loop.sealed_question, HoldOutQuestion):
-        rows.append(("hold-out test of the strongest undecided candidate", _question(loop.sealed_question)))
+        rows.append(("extra test on the held-out cycles", _question(loop.sealed_question)))
     return rows + refused_effects(loop)
+
+
+def coefficient_names(step: AxisStep) -> list[str]:
+    """Return what each coefficient of an added effect is the size of, empty for one that stands alone.
+
+    Parameters
+    ----------
+    step : AxisStep
+        One of ``loop.steps`` of a campaign along an axis.
+    """
+    count = len(step.coefficients)
+    shape = str(step.parameters.get("shape", ""))
+    shapes = (
+        ["shift", "stretch at the far end"]
+        if shape == "flat and linear"
+        else ["shift" if shape == "flat" else "stretch at the far end"]
+    )
+    if step.effect == "unseen_heat_source" and count in (len(shapes), 2 * len(shapes)):
+        start = (
+            ["what was left of the time before the start, " + name for name in shapes] if count > len(shapes) else []
+        )
+        return [f"{name} at full load" for name in shapes] + start
+    if step.effect == "periodic_disturbance" and count == 2:
+        return ["sine part", "cosine part"]
+    if count == len(shapes) and count > 1:
+        return shapes
+    return [""] if count == 1 else [f"coefficient {k}" for k in range(1, count + 1)]
 
 
 def refused_effects(loop: Loop) -> list[tuple[str, str]]:
@@ -153,7 +200,7 @@ def refused_effects(loop: Loop) -> list[tuple[str, str]]:
     return [
         (
             f"{title}: {effect_words(name).name}",
-            f"p {p_value(loop.unnamed[name])}; {reason}" if name in loop.unnamed else reason,
+            f"{p_words(loop.unnamed[name])}; {reason}" if name in loop.unnamed else reason,
         )
         for title, name, reason in rows
     ]
@@ -177,16 +224,17 @@ def _coefficient(coefficient: Coefficient) -> str:
 
 def _unexplained_drift(left: Nuisance) -> str:
     return (
-        f"{left.kind}; rms {_small(left.common_rms_um)} µm common to all positions, "
-        f"{_small(left.stretch_rms_um)} µm of stretch along the axis"
+        f"{left.kind}: {_small(left.common_rms_um)} µm rms common to all positions, "
+        f"{_small(left.stretch_rms_um)} µm rms of stretch along the axis"
     )
 
 
 def _question(asked: HoldOutQuestion) -> str:
-    """What the hold-out says of the strongest undecided candidate."""
+    """What the held-out cycles say of the strongest undecided candidate."""
+    before, after = alike((asked.rmse_before_um, asked.rmse_after_um))
     return (
-        f"{effect_words(asked.effect).name}: error {number(asked.rmse_before_um, 3)} µm without it and "
-        f"{number(asked.rmse_after_um, 3)} µm with it, predicted from the cycles before; p {p_value(asked.p_value)}"
+        f"strongest undecided candidate, {effect_words(asked.effect).name}: error {before} µm without it and {after} µm with it "
+        f"({p_words(asked.p_value)})"
     )
 
 
@@ -252,9 +300,9 @@ def describe_candidates(loop: AxisLoop) -> Table:
             parameters(score.parameters),
             _nats(score.gain),
             _nats(score.excess_gain),
-            p_value(score.family_wise_p),
+            p_cell(score.family_wise_p),
             _nats(score.held_out_gain),
-            p_value(score.held_out_p),
+            p_cell(score.held_out_p),
         ]
         for turn, scores in enumerate(loop.search, start=1)
         for score in scores
@@ -287,10 +335,10 @@ def _chance(tests: ResidualPart, shape: str) -> str:
     """Return p, and where the shape is: the instant of an event, the period of a rhythm."""
     own = " (that of the cycles)" if tests.period_is_cycle else ""
     where = {
-        "event": f", {duration(tests.event_s)} from the start",
+        "event": f", {duration(tests.event_s)} after the start",
         "rhythm": f", {number(tests.period_min, 2)} min{own}",
     }
-    return f"p {p_value(tests.p_values[shape])}{where.get(shape, '')}"
+    return f"{p_words(tests.p_values[shape])}{where.get(shape, '')}"
 
 
 def _runner_up(other: RunnerUp | Nothing) -> str:
@@ -299,23 +347,28 @@ def _runner_up(other: RunnerUp | Nothing) -> str:
         return "none"
     name = effect_words(other.effect).name
     if other.behind_by < 0:
-        return f"{name}, {number(-other.behind_by, 2)} more in log-likelihood but not confirmed"
-    return f"{name}, {number(other.behind_by, 2)} less in log-likelihood"
+        return f"{name} (log-likelihood higher by {number(-other.behind_by, 2)}, but not confirmed)"
+    return f"{name} (log-likelihood lower by {number(other.behind_by, 2)})"
 
 
 def parameters(values: Mapping[str, Any]) -> str:
-    """Return parameters as ``name value, name value``.
+    """Return parameters in words, ``name value unit``.
 
     Parameters
     ----------
     values : mapping
         Numbers or words by name; a name ends with its unit.
+
+    Examples
+    --------
+    >>> parameters({"follows": "warm_up", "time_constant_min": 30.0})
+    'follows warm up, time constant 30.0 min'
     """
-    return ", ".join(f"{spaced(name)} {in_words(value)}" for name, value in values.items())
+    return parameters_with_ranges(values, {})
 
 
 def parameters_with_ranges(values: Mapping[str, Any], ranges: Mapping[str, Range]) -> str:
-    """Return parameters, each with the values that fit as well.
+    """Return parameters in words, each with the values that fit as well.
 
     Parameters
     ----------
@@ -327,19 +380,31 @@ def parameters_with_ranges(values: Mapping[str, Any], ranges: Mapping[str, Range
     Examples
     --------
     >>> parameters_with_ranges({"time_constant_min": 39.6}, {"time_constant_min": (29.0, None)})
-    'time constant / min 39.6 (at least 29.0)'
+    'time constant 39.6 min (at least 29.0)'
     """
     return ", ".join(
-        f"{spaced(name)} {in_words(value)}{_as_well(ranges[name]) if name in ranges else ''}"
+        f"{_parameter(name, value)}{_as_well(name, ranges[name]) if name in ranges else ''}"
         for name, value in values.items()
     )
 
 
-def _as_well(fits: Range) -> str:
+def _parameter(name: str, value: Any) -> str:
+    """One parameter in words; an instant as time since the start."""
+    if name == "time_s" and isinstance(value, int | float):
+        return f"{duration(float(value))} after the start"
+    for ending, unit in _UNITS.items():
+        if name.endswith(ending):
+            return f"{name.removesuffix(ending).replace('_', ' ')} {in_words(value)} {unit}"
+    return f"{name.replace('_', ' ')} {in_words(value)}"
+
+
+def _as_well(name: str, fits: Range) -> str:
+    """The values of a parameter that fit as well, in brackets."""
     others = [word for word in fits if isinstance(word, str)]
     if others or not fits:
         return f" (or {join([spaced(word) for word in others])})"
-    low, high = (None if value is None else number(float(value), 3) for value in fits)
+    show = duration if name == "time_s" else number
+    low, high = (None if value is None else show(float(value)) for value in fits)
     if low is None and high is None:
         return " (not determined)"
     return f" (at most {high})" if low is None else f" (at least {low})" if high is None else f" ({low} to {high})"
@@ -360,7 +425,8 @@ def spaced(name: str) -> str:
     """
     for ending, unit in _UNITS.items():
         if name.endswith(ending):
-            return name.removesuffix(ending).replace("_", " ") + unit
+            bracketed = f"({unit})" if "/" in unit else unit
+            return f"{name.removesuffix(ending).replace('_', ' ')} / {bracketed}"
     return name.replace("_", " ")
 
 

@@ -13,19 +13,20 @@ from fusion.products.results import Results
 from fusion.products.results_loop import RecordLoop, RecordScorePart
 from fusion.record.problem import ENTRY_LEVEL
 from fusion.report.charts import record as charts
+from fusion.report.charts.prediction import plot_block_errors
 from fusion.report.charts.style import Chart
+from fusion.report.conclusions.actions import next_steps
+from fusion.report.conclusions.answers import conclude, headline
 from fusion.report.model_section import DECIDED_BEFORE, errors_table, parameters, refused_effects, steps_table
 from fusion.report.tables import Row, Table, Words, table
 from fusion.report.wording import (
+    alike,
     duration,
     effect_words,
     join,
     moment,
-    next_steps,
     number,
-    p_value,
-    verdict_headline,
-    verdict_numbers,
+    p_cell,
 )
 
 #: Largest number of channels with charts; all of them are in fusion.nc.
@@ -67,6 +68,9 @@ def draw_record(record: xr.Dataset) -> dict[str, Chart]:
         drawn[f"residual_{k}"] = charts.plot_residuals(record, name)
         if record.sizes["effect"]:
             drawn[f"contribution_{k}"] = charts.plot_contributions(record, name)
+    for step in range(record.sizes.get("step", 0)):
+        errors = xr.Dataset({name: record[f"block_error_{name}"].isel(step=step) for name in ("before", "after")})
+        drawn[f"block_errors_{step}"] = plot_block_errors(errors, charts.hours_of(record), "time")
     return drawn
 
 
@@ -96,21 +100,22 @@ def describe_record(results: Results, provenance: Mapping[str, Any], record: xr.
     return {
         "subtitle": _start(time[0]),
         "verdict": loop.verdict,
-        "headline": verdict_headline(loop),
+        "headline": headline(results),
+        "zone": "UTC",
         "doubts": (),
         "untouched": "",
-        "sentences": [
+        "measured": (
             f"Measured: {len(channels)} displacements and {record.sizes['sensor']} temperatures over {duration(span_s)}"
-            + (f", with {drivers} as driver." if drivers else "."),
-            verdict_numbers(loop),
-        ],
+            + (f", with {drivers} as driver." if drivers else ".")
+        ),
+        "answers": conclude(results),
         "numbers": _numbers(loop),
         "next": next_steps(results)[:6],
         "contents": [
-            ("data", "Data"),
             ("record", "Record"),
-            ("loop", "Model"),
+            ("loop", "Cause"),
             ("chained", "Part after part"),
+            ("data", "Data"),
             ("uncertainty", "Uncertainty"),
             ("glossary", "Glossary"),
             ("provenance", "Provenance"),
@@ -130,6 +135,8 @@ def describe_record(results: Results, provenance: Mapping[str, Any], record: xr.
         "omitted": max(0, len(channels) - _MOST_CHANNELS),
         "sensor_faults": _sensor_faults_table(loop),
         "steps": steps_table(loop),
+        "held_out": loop.held_out,
+        "step_names": [effect_words(step.effect).name for step in loop.steps],
         "errors": errors_table(loop),
         "unexplained": loop.unexplained,
         "channels": _channels_table(loop),
@@ -160,16 +167,17 @@ def _percent(share: float | None) -> float | None:
 
 def _numbers(loop: RecordLoop) -> list[dict[str, str]]:
     """Return the key figures."""
+    final, declared, last = alike((loop.rmse_final_um, loop.rmse_declared_um, loop.rmse_persistence_um))
     numbers = [
         {
-            "name": "Held-out error",
-            "value": f"{number(loop.rmse_final_um, 3)} µm",
-            "note": f"declared model {number(loop.rmse_declared_um, 3)} µm",
+            "name": f"Prediction error, {loop.held_out.split(' held out')[0]}",
+            "value": f"{final} µm",
+            "note": f"not used for the fit; declared model {declared} µm",
         },
         {
-            "name": "Repeating the last value",
-            "value": f"{number(loop.rmse_persistence_um, 3)} µm",
-            "note": "error of the simplest prediction on the same part",
+            "name": "Last value repeated",
+            "value": f"{last} µm",
+            "note": "error of the simplest prediction of the same part",
         },
         {
             "name": "Variance left",
@@ -270,7 +278,7 @@ def _candidates_table(loop: RecordLoop) -> Table:
                     parameters(score.parameters),
                     number(score.gain, 3),
                     number(score.excess_gain, 3),
-                    p_value(score.family_wise_p),
+                    p_cell(score.family_wise_p),
                     "–" if score.chained_rmse_after_um is None else f"{before} to {after}",
                     "chosen" if score.chosen else "predicts no better" if _is_rejected(score) else "",
                 ]

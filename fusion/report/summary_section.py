@@ -11,7 +11,7 @@ import xarray as xr
 from fusion.attribution.family_wise import LEVEL as ATTRIBUTION_LEVEL
 from fusion.diagnosis.remainder import LEVEL as REMAINDER_LEVEL
 from fusion.loop.axis import ENTRY_LEVEL, SEARCH_LEVEL, SECOND_LEVEL
-from fusion.products.grouped import group, has
+from fusion.products.grouped import group
 from fusion.products.results import Results
 from fusion.products.results_axis import NeighboursPart
 from fusion.products.results_inputs import Figures
@@ -19,14 +19,15 @@ from fusion.products.results_loop import AxisLoop, Loop
 from fusion.products.results_part import Quantity
 from fusion.products.results_radiometry import RadiometryPart
 from fusion.report.attribution_section import describe_correlation
+from fusion.report.conclusions.actions import next_steps
+from fusion.report.conclusions.answers import conclude, describe_anomaly, headline, prediction_sentence, reconcile
 from fusion.report.findings import (
     ISO230_TERMS,
     anomaly_cause,
-    anomaly_figures,
     anomaly_place,
     iso230_values,
     quoted_window,
-    standing_out,
+    span_words,
 )
 from fusion.report.iso230_section import contained_sentence, describe_iso230
 from fusion.report.model_section import (
@@ -41,21 +42,19 @@ from fusion.report.model_section import (
 )
 from fusion.report.tables import Table, Words, table
 from fusion.report.wording import (
+    alike,
     condition,
-    conditional,
-    conditional_headline,
     decimals_of,
     duration,
     effect_words,
     measured,
     moment,
-    next_steps,
     number,
-    p_value,
+    p_cell,
+    place,
     premise,
     quantity,
     untouched,
-    verdict_numbers,
 )
 from interferometry.figures import time_span
 
@@ -74,13 +73,22 @@ _GLOSSARY = (
         "B_i: difference of the mean deviations of both approaches at a position, positive minus negative. B: the largest |B_i|.",
     ),
     (
-        "Held-out error",
-        "Root mean square error on cycles that took no part in fitting: only this says whether a model predicts.",
+        "Prediction error",
+        "Root mean square of measured minus predicted on cycles that took no part in the fit (held out): only this says whether a model "
+        "predicts.",
     ),
-    ("Noise floor", "What a perfect model would leave: the scatter of single readings."),
+    (
+        "Blocks of cycles predicted from the others",
+        "Prediction errors when blocks of cycles are left out in turn and predicted from those before and after: for an event before the "
+        "held-out cycles only these can tell.",
+    ),
+    ("Noise", "What a perfect model would leave: the scatter of single readings."),
+    ("Thermal mode", "A part of the temperature field that warms by itself, usually one heat source with its halo."),
+    ("Lag", "Time constant by which the drift follows a temperature."),
     (
         "Family-wise p",
-        "Probability that data without any effect show something as strong anywhere among all that was tested.",
+        "Probability that data without any effect show something as strong anywhere among all that was tested. Where it comes from a "
+        "number of simulations and none of them was as strong, it is written as an upper limit, p ≤.",
     ),
     (
         "Rise",
@@ -89,15 +97,21 @@ _GLOSSARY = (
     ),
     ("Expanded uncertainty", "Twice the standard uncertainty (k = 2), about 95 % coverage."),
 )
+#: Section of the report, the part of the results without which it is absent, and its title in the contents: first what a reader acts on ...
 _SECTIONS = (
-    ("registration", "registration", "Registration"),
-    ("fields", "hotspots", "Temperature"),
-    ("drift", "drift", "Drift"),
-    ("paper", "neighbours", "Paper's charts"),
     ("iso230", "iso230", "ISO 230-2"),
-    ("anomalies", "anomalies", "Anomalies"),
-    ("correlation", "correlation", "Correlation"),
+    ("drift", "drift", "Drift"),
+    ("anomalies", "anomalies", "Positions"),
+    ("fields", "hotspots", "Heat"),
+    ("cause", "loop", "Cause"),
+    ("place", "correlation", "Place"),
+)
+#: ... then, in the appendix, what it rests on.
+_APPENDIX = (
+    ("paper", "neighbours", "Neighbour differences"),
+    ("correlation", "correlation", "Drift and field"),
     ("loop", "loop", "Model"),
+    ("registration", "registration", "Registration"),
 )
 #: Section of the report -> what its figures rest on.
 _RESTS_ON: dict[str, tuple[Figures, ...]] = {
@@ -106,12 +120,16 @@ _RESTS_ON: dict[str, tuple[Figures, ...]] = {
     "paper": ("positions",),
     "iso230": ("positions",),
     "anomalies": ("positions",),
+    "place": ("attribution",),
     "correlation": ("attribution",),
+    "cause": ("causes",),
     "loop": ("causes",),
 }
 #: Axis values among the key figures.
-_KEY_VALUES = ("A", "R", "B")
+_KEY_VALUES = ("A",)
 _SIGNS = {"positive": "+", "negative": "−"}
+#: Actions in the summary; all remedies stand with what was left out.
+_MOST_STEPS = 6
 
 
 def describe_campaign(
@@ -130,25 +148,25 @@ def describe_campaign(
         See `fusion.report.html.render_report`.
     """
     deviations, fields, fused = (datasets.get(name) for name in ("deviations", "fields", "fusion"))
-    correlation = None if fused is None else describe_correlation(fused, results.correlation, joint)
-    sentences = _sentences(results, deviations, fields)
-    if correlation is not None:
-        correlation["headline"] = conditional(correlation["headline"], results.inputs, "attribution")
-        sentences.append(correlation["headline"])
+    correlation = None if fused is None else describe_correlation(fused, results, joint)
+    zone = results.time.zone if results.time else None
     return {
-        "subtitle": _subtitle(provenance, deviations),
+        "subtitle": _subtitle(provenance, deviations, zone),
+        "zone": zone or "UTC",
         "verdict": results.loop.verdict if results.loop else "",
-        "headline": conditional_headline(results),
+        "headline": headline(results),
         "doubts": results.inputs.doubts if results.inputs else (),
         "untouched": untouched(results.inputs),
         "premises": {section: premise(results.inputs, *figures) for section, figures in _RESTS_ON.items()},
-        "sentences": sentences,
+        "measured": _measured(deviations, fields),
+        "answers": conclude(results),
         "numbers": _numbers(results, deviations, fields),
-        "next": next_steps(results)[:6],
+        "next": next_steps(results)[:_MOST_STEPS],
         "contents": [
+            *_titles(results, _SECTIONS),
             ("data", "Data"),
-            *((anchor, title) for anchor, part, title in _SECTIONS if getattr(results, part) is not None),
             ("uncertainty", "Uncertainty"),
+            *_titles(results, _APPENDIX),
             ("glossary", "Glossary"),
             ("provenance", "Provenance"),
         ],
@@ -166,6 +184,7 @@ def describe_campaign(
         "iso230": None if results.iso230 is None else describe_iso230(results.iso230, deviations),
         "anomalies": _anomalies(results),
         "correlation": correlation,
+        "reconciled": reconcile(results),
         "joint": None if joint is None else {**joint, "table": _joint_table(joint)},
         "loop": None if results.loop is None else _describe_loop(results.loop),
         "uncertainty": _uncertainty(results, fields),
@@ -173,35 +192,33 @@ def describe_campaign(
     }
 
 
-def _subtitle(provenance: Mapping[str, Any], deviations: xr.Dataset | None) -> str:
+def _titles(results: Results, sections: tuple[tuple[str, str, str], ...]) -> list[tuple[str, str]]:
+    """Anchor and title of the sections that the results have."""
+    return [(anchor, title) for anchor, part, title in sections if getattr(results, part) is not None]
+
+
+def _subtitle(provenance: Mapping[str, Any], deviations: xr.Dataset | None, zone: str | None) -> str:
     axis = provenance["parameters"]["campaign"].get("axis", "")
-    parts = [f"{axis} axis" if axis else "", moment(time_span(deviations)[0]) if deviations is not None else ""]
+    parts = [f"{axis} axis" if axis else "", moment(time_span(deviations)[0], zone) if deviations is not None else ""]
     return ", ".join(part for part in parts if part)
 
 
-def _sentences(results: Results, deviations: xr.Dataset | None, fields: xr.Dataset | None) -> list[str]:
-    """What was measured, what the model says, what stands out: one sentence each."""
-    sentences = []
+def _measured(deviations: xr.Dataset | None, fields: xr.Dataset | None) -> str:
+    """What was measured, in one sentence."""
     if deviations is not None:
         sizes = deviations.sizes
         first, last = time_span(deviations)
-        position = deviations["position"].values
-        sentences.append(
-            f"Measured: {sizes['target']} positions over {np.ptp(position):g} mm, approached {_approaches(deviations)} in "
-            f"{sizes['cycle']} cycles, {duration(float((last - first) / np.timedelta64(1, 's')))} in all."
+        return (
+            f"Measured: {sizes['target']} positions over {np.ptp(deviations['position'].values):g} mm, approached "
+            f"{_approaches(deviations)} in {sizes['cycle']} cycles, {duration(float((last - first) / np.timedelta64(1, 's')))} in all."
         )
-    elif fields is not None:
-        first, last = fields["time"].values[[0, -1]]
-        sentences.append(
-            f"Measured: {fields.sizes['time']} frames of the table over {duration(float((last - first) / np.timedelta64(1, 's')))}, "
-            f"reduced to {fields.sizes['cycle']} fields; no laser was used, so nothing is said of the positioning."
-        )
-    if results.loop is not None:
-        sentences.append(verdict_numbers(results.loop))
-    if results.anomalies is not None:
-        rests_on = {figure for anomaly in results.anomalies for figure in anomaly_figures(anomaly)} or {"positions"}
-        sentences.append(conditional(standing_out(results.anomalies), results.inputs, *sorted(rests_on)))
-    return sentences
+    if fields is None:
+        return ""
+    first, last = fields["time"].values[[0, -1]]
+    return (
+        f"Measured: {fields.sizes['time']} frames of the table over {duration(float((last - first) / np.timedelta64(1, 's')))}, "
+        f"reduced to {fields.sizes['cycle']} fields; no laser was used, so nothing is said of the positioning."
+    )
 
 
 def _approaches(deviations: xr.Dataset) -> str:
@@ -218,13 +235,13 @@ def _numbers(results: Results, deviations: xr.Dataset | None, fields: xr.Dataset
     def add(name: str, value: str, note: str) -> None:
         numbers.append({"name": name, "value": value, "note": note})
 
-    if deviations is not None and has(deviations, "drift"):
-        drift = group(deviations, "drift")
-        mean = drift["drift"].mean("direction")
-        span = float(mean.max() - mean.min())
-        add("Drift during the test", f"{number(span)} µm", "largest difference between any two times and positions")
-        sigma = float(drift["sigma"])
-        add("Scatter of single readings", f"{number(sigma, 2)} µm", "standard deviation, drift subtracted")
+    if results.drift is not None and results.drift.range_um:
+        at = int(np.nanargmax(np.array(results.drift.range_um, float)))
+        add(
+            "Largest drift",
+            measured(results.drift.range_um[at], results.drift.range_u_um[at], "µm"),
+            f"at position {at + 1} ({results.drift.position_mm[at]:g} mm), during the test",
+        )
     if results.iso230 is not None:
         quoted = quoted_window(results.iso230)
         values = iso230_values(quoted)
@@ -241,16 +258,26 @@ def _numbers(results: Results, deviations: xr.Dataset | None, fields: xr.Dataset
         add(
             "Rise of the table",
             measured(float(rise.mean()), u, "K"),
-            f"mean of the last cycle; warmest cell {number(float(rise.max()))} K {condition(results.inputs, 'field')}".rstrip(),
+            f"mean of the last cycle; {_warmest(results, rise)} {condition(results.inputs, 'field')}".rstrip(),
         )
     if results.loop is not None:
-        declared, floor = number(results.loop.rmse_declared_um, 2), number(results.loop.noise_floor_um, 2)
+        loop = results.loop
+        final, declared, last = alike((loop.rmse_final_um, loop.rmse_declared_um, loop.rmse_persistence_um))
         add(
-            "Held-out error",
-            f"{number(results.loop.rmse_final_um, 2)} µm",
-            f"declared model {declared} µm, noise {floor} µm",
+            f"Prediction error, {loop.held_out.split(' held out')[0]}",
+            f"{final} µm",
+            f"not used for the fit; declared model {declared} µm, last cycle repeated {last} µm",
         )
     return numbers
+
+
+def _warmest(results: Results, rise: xr.DataArray) -> str:
+    """The largest rise in the last cycle: that of the hottest spot as the table of hotspots has it, or of a cell."""
+    spots = [spot for spot in results.hotspots or () if spot.peak_rise_K is not None]
+    if not spots:
+        return f"warmest cell {number(float(rise.max()))} K"
+    hottest = max(spots, key=lambda spot: spot.peak_rise_K or 0.0)
+    return f"{hottest.name or 'hottest spot'} {measured(hottest.peak_rise_K, hottest.peak_rise_u_K, 'K')}"
 
 
 def _data_rows(
@@ -263,11 +290,11 @@ def _data_rows(
         origin = deviations["time"].attrs.get("origin", "recorded")
         rows.append(("Readings", f"{readings} of {deviations['deviation'].size} possible; times {origin}"))
         first, last = time_span(deviations)
-        rows.append(("Time", f"{moment(first)} to {moment(last)}"))
+        rows.append(("Time", _span(first, last, results)))
     if fields is not None:
         first, last = fields["time"].values[[0, -1]]
-        clock = " on the laser's clock" if results.alignment is not None else ""
-        rows.append(("Frames", f"{fields.sizes['time']}, from {moment(first)} to {moment(last)}{clock}"))
+        clock = ", on the laser's clock" if results.alignment is not None else ""
+        rows.append(("Frames", f"{fields.sizes['time']}, {_span(first, last, results)}{clock}"))
         cell = float(np.median(np.diff(fields["x"])))
         rows.append(("Plan", f"{fields.sizes['x']} × {fields.sizes['y']} cells of {cell:g} mm"))
         visible = float(np.isfinite(fields["temperature_rise"].isel(cycle=-1)).mean())
@@ -278,6 +305,13 @@ def _data_rows(
         rows.append(("Clock offset", _clock_offset(results.alignment.clock_offset_s)))
     rows.append(("Input files", f"{len(provenance['inputs'])}, listed with their SHA-256 under Provenance"))
     return rows
+
+
+def _span(first: np.datetime64, last: np.datetime64, results: Results) -> str:
+    """From when to when, in local time and UTC where the campaign states a zone."""
+    zone = results.time.zone if results.time else None
+    local = f"{moment(first, zone)} to {moment(last, zone)}"
+    return local if zone in (None, "UTC") else f"{local} ({moment(first)} to {moment(last)})"
 
 
 def _clock_offset(offset: Quantity) -> str:
@@ -375,15 +409,27 @@ def _surfaces_table(part: RadiometryPart) -> Table:
 
 
 def _hotspots_table(results: Results) -> Table:
-    """Return place, rise, driven targets, p and lag of every hotspot."""
-    columns = ["x / mm", "y / mm", "Peak rise / K (k = 2)", Words("Positions it drives"), "p (family-wise)", "Lag"]
+    """Return name, area, peak, rise, and the positions whose drift goes with every hotspot."""
+    columns = [
+        Words("Hotspot"),
+        Words("Area"),
+        Words("Peak at"),
+        Words("Middle of the area"),
+        "Peak rise / K (k = 2)",
+        Words("Positions whose drift goes with it"),
+        "p (family-wise)",
+        "Lag",
+    ]
+    least = results.correlation.least_p if results.correlation else None
     rows = [
         [
-            number(spot.x_mm),
-            number(spot.y_mm),
+            spot.name,
+            span_words(spot.area),
+            place(spot.x_mm, spot.y_mm),
+            place(spot.centroid_x_mm, spot.centroid_y_mm),
             measured(spot.peak_rise_K, spot.peak_rise_u_K),
             ", ".join(map(str, spot.targets)) or "none shown by these data",
-            p_value(spot.p_value),
+            p_cell(spot.p_value, least),
             duration(spot.lag_s),
         ]
         for spot in results.hotspots or ()
@@ -429,8 +475,8 @@ def _comparison_table(deviations: xr.Dataset) -> Table:
 def _neighbours_text(part: NeighboursPart) -> str:
     ratio = part.ratio.values()
     return (
-        f"The conventional standard deviation is {number(min(ratio), 3)} to {number(max(ratio), 3)} times that of the "
-        "differences. This ratio measures the drift, not the quality of an evaluation: it is 0.71 without drift. The chain of "
+        f"The conventional standard deviation is {min(ratio):.2f} to {max(ratio):.2f} times that of the differences. This ratio measures "
+        "the drift, not the quality of an evaluation: it is 0.71 without drift. The chain of "
         "mean differences gives exactly the conventional mean profile: differencing removes the drift from the standard deviation, not "
         "from the mean. What the paper's equations (5) and (6) divide by n (n − 1) is the standard uncertainty of a mean; the charts "
         "here show sample standard deviations."
@@ -445,8 +491,7 @@ def _anomalies(results: Results) -> list[dict[str, Any]]:
         described.append(
             {
                 "title": f"{where[0].upper()}{where[1:]}: {anomaly_cause(anomaly)}",
-                "p": p_value(anomaly.p_value),
-                "scatter": f"{number(anomaly.scatter_um, 2)} µm",
+                "sentence": describe_anomaly(anomaly),
                 **describe_evidence(anomaly.evidence),
             }
         )
@@ -466,8 +511,9 @@ def _describe_loop(loop: Loop) -> dict[str, Any]:
     """Return the section on the model."""
     assert isinstance(loop, AxisLoop)
     return {
-        "numbers": verdict_numbers(loop),
+        "numbers": prediction_sentence(loop),
         "steps": steps_table(loop),
+        "step_names": [effect_words(step.effect).name for step in loop.steps],
         "errors": errors_table(loop),
         "held_out": loop.held_out,
         "noise": f"{number(loop.noise_floor_um, 2)} µm",

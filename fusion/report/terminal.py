@@ -14,27 +14,19 @@ from fusion.products.results import Results
 from fusion.products.results_axis import RegistrationPart
 from fusion.products.results_inputs import Figures
 from fusion.products.results_loop import Loop, RecordLoop
+from fusion.report.conclusions.actions import next_steps
+from fusion.report.conclusions.answers import conclude, headline
 from fusion.report.findings import (
-    anomaly_cause,
-    anomaly_figures,
-    anomaly_place,
-    attribution_headline,
     baseline_errors,
     hold_out_errors,
-    iso230_values,
-    quoted_window,
-    randomised_causes,
     scatter_range,
     step_errors,
 )
 from fusion.report.wording import (
     condition,
-    conditional,
-    conditional_headline,
     duration,
-    join,
     number,
-    p_value,
+    p_words,
     untouched,
 )
 
@@ -71,29 +63,15 @@ def summary_rows(results: Results) -> list[tuple[str, str]]:
         rows.append(("inputs", "\n".join(lines) or f"sound in {len(results.inputs.checks)} checks"))
     if results.registration is not None:
         rows.append(("registration", _registration(results.registration)))
-    if results.iso230 is not None:
-        quoted = quoted_window(results.iso230)
-        values = iso230_values(quoted)
-        rows += [
-            (f"{symbol} ({quoted.window})", _under(values[symbol], results, "positions")) for symbol in ("A", "R", "B")
-        ]
     if results.drift is not None:
         rows.append(("scatter per position", _under(scatter_range(results.drift), results, "positions")))
-    if results.anomalies is not None:
-        rows.append(("anomalies", "\n".join(_anomaly_lines(results)) or _under("none", results, "positions")))
-    if results.correlation is not None:
-        causes = randomised_causes(results.correlation)
-        shown = [_under(f"cause by randomised duty: {join(causes)}", results, "causes")] if causes else []
-        rows.append(
-            (
-                "drift and field",
-                "\n".join(
-                    [conditional(attribution_headline(results.correlation), results.inputs, "attribution"), *shown]
-                ),
-            )
-        )
+    if results.loop is not None:
+        rows.append(("verdict", f"{results.loop.verdict.replace('_', ' ')}: {headline(results)}"))
+    rows += [(answer.question.lower(), answer.text) for answer in conclude(results)]
     if results.loop is not None:
         rows += _loop_rows(results, results.loop)
+    steps = enumerate(next_steps(results), start=1)
+    rows.append(("next", "\n".join(f"{number}. {step}" for number, step in steps)))
     return rows + [("warning", warning.message) for warning in results.warnings]
 
 
@@ -103,17 +81,6 @@ def _registration(part: RegistrationPart) -> str:
         count = len(part.leave_one_out_mm)
         return f"standard uncertainty {number(part.position_u_mm, 2)} mm, not checked: {count} fiducials determine the plan exactly"
     return f"{number(part.rms_mm, 2)} mm rms"
-
-
-def _anomaly_lines(results: Results) -> list[str]:
-    return [
-        _under(
-            f"{anomaly_place(anomaly)}: {anomaly_cause(anomaly)} (p {p_value(anomaly.p_value)})",
-            results,
-            *anomaly_figures(anomaly),
-        )
-        for anomaly in results.anomalies or ()
-    ]
 
 
 def _run_rows(loop: Loop) -> list[tuple[str, str]]:
@@ -133,19 +100,16 @@ def _run_rows(loop: Loop) -> list[tuple[str, str]]:
 def _loop_rows(results: Results, loop: Loop) -> list[tuple[str, str]]:
     rows = [("declared", ", ".join(loop.declared) or "nothing")]
     for step in loop.steps:
-        text = f"{step.effect} (p {p_value(step.p_value)}), {step_errors(step)}"
+        text = (
+            f"{step.effect} ({p_words(step.p_value)}), {step_errors(step)}{'' if step.confirmed else ', not confirmed'}"
+        )
         rows.append(("added", _under(text, results, "causes")))
-    rows += [("not confirmed", f"{step.effect}: {step.doubt}") for step in loop.steps if step.doubt]
-    rows += [
-        ("without a name", _under(f"{name} (p {p_value(p)})", results, "causes")) for name, p in loop.unnamed.items()
-    ]
     return [
         *rows,
         ("held-out error", _under(hold_out_errors(loop), results, "positions")),
         ("plain predictions", _under(baseline_errors(loop), results, "positions")),
         ("noise floor", _under(f"{number(loop.noise_floor_um, 3)} µm", results, "positions")),
         *_run_rows(loop),
-        ("verdict", f"{loop.verdict}: {conditional_headline(results)}"),
     ]
 
 

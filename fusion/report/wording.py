@@ -1,4 +1,4 @@
-"""Numbers and verdicts as a reader meets them: significant digits, unit, uncertainty, and what to do next."""
+"""Numbers, times, places and conditions as a reader meets them: significant digits, unit, uncertainty, zone."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from fusion.effects.library import describe_effect
-from fusion.products.results import Results
 from fusion.products.results_inputs import Figures, InputsPart
-from fusion.products.results_loop import Loop, RecordLoop
 from fusion.products.results_part import Quantity
 
 _FIGURE_WORDS: dict[Figures, str] = {
@@ -137,17 +135,76 @@ def print_unit(unit: str) -> str:
     return {"degC": "°C", "percent": "%", "1": ""}.get(unit, unit.replace("um", "µm"))
 
 
-def p_value(p: float | None) -> str:
-    """Return a p-value to two digits, or as a bound below 0.001.
+def p_cell(p: float | None, least: float | None = None) -> str:
+    """Return a p-value for a table: to two digits, as a bound below 0.001 and where it is the smallest that can be shown.
 
     Parameters
     ----------
     p : float or None
         None and NaN are shown as a dash.
+    least : float, optional
+        Smallest p-value that the number of simulations can show; a p-value equal to it is an upper limit, rounded up.
+
+    Examples
+    --------
+    >>> p_cell(0.212, 0.002), p_cell(0.0035714, 0.0035714), p_cell(1e-6)
+    ('0.21', '≤ 0.004', '< 0.001')
     """
     if p is None or not math.isfinite(p):
         return "–"
+    if least and p <= least * (1.0 + 1e-9):
+        digit = math.floor(math.log10(p))
+        rounded = math.ceil(round(p / 10.0**digit, 6)) * 10.0**digit
+        return f"≤ {rounded:.{max(0, -digit)}f}"
     return "< 0.001" if p < 0.001 else f"{p:.2g}"
+
+
+def p_words(p: float | None, least: float | None = None) -> str:
+    """Return a p-value in a sentence, see `p_cell`.
+
+    Parameters
+    ----------
+    p : float or None
+        None and NaN are shown as a dash.
+    least : float, optional
+        Smallest p-value that the number of simulations can show.
+
+    Examples
+    --------
+    >>> p_words(0.212), p_words(0.002, 0.002)
+    ('p = 0.21', 'p ≤ 0.002, limit of the simulation')
+    """
+    cell = p_cell(p, least)
+    if cell.startswith("≤"):
+        return f"p {cell}, limit of the simulation"
+    return f"p {cell}" if cell.startswith("<") else f"p = {cell}"
+
+
+def alike(values: Sequence[float | None], digits: int = 2) -> list[str]:
+    """Return numbers that are compared with as many decimals each, so many that the smallest has the digits.
+
+    Parameters
+    ----------
+    values : sequence of float or None
+        In one unit; None and values that are not finite are shown as a dash.
+    digits : int
+        Significant digits of the smallest one; more where two that differ would read alike.
+
+    Examples
+    --------
+    >>> alike([1.938, 0.4643]), alike([0.733, 0.7331])
+    (['1.94', '0.46'], ['0.7330', '0.7331'])
+    """
+    known = [value for value in values if value is not None and math.isfinite(value) and value]
+    smallest = min(map(abs, known), default=1.0)
+    decimals = max(0, digits - 1 - math.floor(math.log10(smallest)))
+    differ = len(set(known))
+    while decimals < 4 and len({round(value, decimals) for value in known}) < differ:
+        decimals += 1
+    return [
+        "–" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}".replace("-", "−")
+        for value in values
+    ]
 
 
 def duration(seconds: float | None) -> str:
@@ -215,75 +272,12 @@ def join(items: Sequence[str]) -> str:
 
 #: Plain predictions of the hold-out in words, by their key in ``loop.baselines``.
 BASELINES = {
-    "last_value": "last value repeated",
-    "mean": "mean of the training part",
+    "last_value": "last cycle simply repeated",
+    "mean": "mean of the cycles before",
     "least_squares": "least squares on all that was logged",
     "ridge": "ridge regression on the same",
     "ridge_with_lags": "ridge regression with lagged copies",
 }
-
-
-def verdict_headline(loop: Loop) -> str:
-    """Return one sentence that states what the closed loop found.
-
-    Parameters
-    ----------
-    loop : Loop
-        The part ``loop`` of the results.
-    """
-    confirmed = [step for step in loop.steps if step.confirmed]
-    added = join([effect_words(step.effect).name for step in confirmed])
-    noun, pronoun = ("an effect", "it") if len(confirmed) == 1 else (f"{len(confirmed)} effects", "them")
-    lacked = f"The declared model lacked {noun}: {added}. "
-    return {
-        "complete": "The declared model explains the drift; nothing in these data shows that an effect is missing.",
-        "explained": f"{lacked}With {pronoun}, nothing is left that these data can show.",
-        "partial": f"{lacked}With {pronoun}, something without a name is left{_left(loop)}.",
-        "unexplained": f"Something is left that no effect of the library explains{_left(loop)}.",
-        "no_skill": (
-            "The model predicts no better than repeating the last value or the mean: these data cannot tell whether an effect is "
-            f"missing{_left(loop)}."
-        ),
-    }[loop.verdict]
-
-
-def _left(loop: Loop) -> str:
-    """What is left, in brackets: a shape, significant effects without a name, effects that were not confirmed."""
-    parts = [loop.unexplained.shape] if loop.unexplained.shape else []
-    parts += [
-        f"{effect_words(name).name} is significant, p {p_value(p)}, and was not admitted"
-        for name, p in loop.unnamed.items()
-    ]
-    parts += [f"{effect_words(step.effect).name} is not confirmed" for step in loop.steps if not step.confirmed]
-    return f" ({'; '.join(parts)})" if parts else ""
-
-
-def verdict_numbers(loop: Loop) -> str:
-    """Return the sentence with the errors on the hold-out and the noise beside them.
-
-    Parameters
-    ----------
-    loop : Loop
-        The part ``loop`` of the results.
-    """
-    record = isinstance(loop, RecordLoop)
-    where, noise = ("the held-out part", "a block mean") if record else ("held-out cycles", "single readings")
-    declared, final = number(loop.rmse_declared_um, 2), number(loop.rmse_final_um, 2)
-    errors = f"{declared} µm with the declared model, {final} µm after" if loop.steps else f"{declared} µm"
-    plain = f"{number(loop.rmse_persistence_um, 2)} µm for repeating the last value"
-    return f"Error on {where}: {errors}, {plain}; the noise of {noise} is {number(loop.noise_floor_um, 2)} µm."
-
-
-def conditional_headline(results: Results) -> str:
-    """Return the headline of a run, conditional where an input is doubted.
-
-    Parameters
-    ----------
-    results : Results
-        Results of a run.
-    """
-    headline = verdict_headline(results.loop) if results.loop else "Evaluated without a model of the drift."
-    return conditional(headline, results.inputs, "causes")
 
 
 def conditional(sentence: str, inputs: InputsPart | None, *figures: Figures) -> str:
@@ -342,29 +336,3 @@ def untouched(inputs: InputsPart | None) -> str:
         return ""
     held = [words for figure, words in _FIGURE_WORDS.items() if not inputs.premises(figure)]
     return f"Not touched by that: {join(held)}." if held else ""
-
-
-def next_steps(results: Results) -> list[str]:
-    """Return what to do next: first doubted inputs, then what the loop found, then the anomalies, then the remedies of the warnings.
-
-    Parameters
-    ----------
-    results : Results
-        Results of a run.
-
-    Returns
-    -------
-    list of str
-        Sentences, each once; one that says so where nothing has to be done.
-    """
-    steps = [check.remedy for check in results.inputs.doubts] if results.inputs else []
-    if results.loop is not None:
-        steps += [effect_words(step.effect).remedy for step in results.loop.steps]
-        if results.loop.verdict in {"partial", "unexplained", "no_skill"}:
-            steps.append(
-                "Log more of what happens at the machine (duty, coolant, doors, air) in the next test: what is left has no name."
-            )
-    steps += [f"Position {anomaly.target}: {anomaly.evidence.check}" for anomaly in results.anomalies or ()]
-    steps += [warning.remedy for warning in results.warnings]
-    unique = list(dict.fromkeys(step for step in steps if step))
-    return unique or ["Nothing has to be done: use the profile and its uncertainty as they are."]

@@ -21,7 +21,7 @@ from fusion.report.charts.style import (
     palette,
     span_words,
 )
-from fusion.report.wording import CHANNELS, duration, number, p_value
+from fusion.report.wording import CHANNELS, duration, number, p_cell, p_words
 from interferometry.figures import ARROWS, COLOURS, INK
 
 #: Upper ends of the steps in which a p-value is shown, their colours, and their names; above the last one a cell is left blank.
@@ -130,13 +130,13 @@ def _add_steps(drawn: figure, mapper: LinearColorMapper, label: str, names: dict
 def _where(maps: xr.Dataset, passed: np.ndarray, p: np.ndarray, more: str) -> str:
     """Say how many cells are significant and where the strongest is."""
     row, column = np.unravel_index(np.argmin(p), p.shape)
-    place = f"x {float(maps['x'][column]):.0f} mm, y {float(maps['y'][row]):.0f} mm (p {p_value(float(p.min()))})"
+    place = f"x {float(maps['x'][column]):.0f} mm, y {float(maps['y'][row]):.0f} mm (p {p_cell(float(p.min()))})"
     if not passed.any():
         return f"No cell of {p.size} is significant at 0.05; the closest is at {place}."
     return f"{int(passed.sum())} of {p.size} cells are significant at 0.05{', ' + more if more else ''}; the strongest is at {place}."
 
 
-def plot_mode(modes: xr.Dataset, mode: int, channel: str) -> Chart:
+def plot_mode(modes: xr.Dataset, mode: int, channel: str, least_p: float | None = None) -> Chart:
     """Draw the pattern of a thermal mode, relative to the cell marked by a cross, with its p-value and lag in one part of the drift.
 
     Parameters
@@ -147,6 +147,8 @@ def plot_mode(modes: xr.Dataset, mode: int, channel: str) -> Chart:
         Its number.
     channel : str
         Part of the drift whose p-value and lag are written.
+    least_p : float, optional
+        Smallest p-value that the number of simulations can show: one equal to it is written as an upper limit.
 
     Returns
     -------
@@ -155,7 +157,7 @@ def plot_mode(modes: xr.Dataset, mode: int, channel: str) -> Chart:
     one, extent = modes.sel(mode=mode), extent_of(modes)
     p, lag = (float(one[name].sel(channel=channel)) for name in ("p_value", "lag"))
     significant = p <= LEVEL
-    title = f"mode {mode}: {'significant, ' if significant else ''}p {p_value(p)}, lag {duration(lag)}"
+    title = f"mode {mode}: {'significant, ' if significant else ''}p {p_cell(p, least_p)}, lag {duration(lag)}"
     drawn = new_plan(extent, title=title, height=250)
     mapper = LinearColorMapper(palette("PuOr_r"), low=-1.0, high=1.0, nan_color="#e1e5e7")
     pattern = one["pattern"].values
@@ -166,7 +168,7 @@ def plot_mode(modes: xr.Dataset, mode: int, channel: str) -> Chart:
     add_colour_bar(drawn, mapper, "warming relative to the cross")
     seen = (
         f"Thermal mode {mode}, strongest at x {x:.0f} mm, y {y:.0f} mm; it {'goes' if significant else 'does not go'} with the "
-        f"{CHANNELS.get(channel, channel)} (p {p_value(p)})."
+        f"{CHANNELS.get(channel, channel)} ({p_words(p, least_p)})."
     )
     return Chart(drawn, seen, _cell_columns(modes, **{"warming relative to the cross": pattern}))
 

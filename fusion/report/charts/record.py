@@ -47,7 +47,7 @@ def plot_prediction(record: xr.Dataset, channel: str) -> Chart:
     -------
     Chart
     """
-    hours, chosen = _hours(record), record.sel(channel=channel)
+    hours, chosen = hours_of(record), record.sel(channel=channel)
     half = 2 * np.where(record["sealed"].values, float(chosen["predicted_u"]), _fit_error(chosen))
     measured, declared, final = (
         chosen[name].values for name in ("displacement", "predicted_declared", "predicted_final")
@@ -91,7 +91,7 @@ def plot_residuals(record: xr.Dataset, channel: str) -> Chart:
     -------
     Chart
     """
-    hours, chosen = _hours(record), record.sel(channel=channel)
+    hours, chosen = hours_of(record), record.sel(channel=channel)
     drawn = new_figure(x=_TIME, y="measured − predicted / µm", title=channel)
     _shade_hold_out(record, drawn)
     add_zero_line(drawn)
@@ -120,7 +120,7 @@ def plot_temperatures(record: xr.Dataset) -> Chart:
     -------
     Chart
     """
-    hours = _hours(record)
+    hours = hours_of(record)
     rise = (record["temperature"] - record["temperature"].isel(time=0)).transpose("time", "sensor").values
     names = [str(name) for name in record["sensor"].values]
     order = np.argsort(-np.ptp(rise, axis=0))
@@ -153,7 +153,7 @@ def plot_drivers(record: xr.Dataset) -> Chart:
     -------
     Chart
     """
-    hours = _hours(record)
+    hours = hours_of(record)
     columns: dict[str, np.ndarray] = {_TIME: hours}
     parts: list[figure] = []
     said = []
@@ -187,7 +187,7 @@ def plot_contributions(record: xr.Dataset, channel: str) -> Chart:
     -------
     Chart
     """
-    hours = _hours(record)
+    hours = hours_of(record)
     drawn = new_figure(x=_TIME, y="contribution / µm", title=channel)
     _shade_hold_out(record, drawn)
     add_zero_line(drawn)
@@ -205,15 +205,21 @@ def plot_contributions(record: xr.Dataset, channel: str) -> Chart:
 
 def _shade_hold_out(record: xr.Dataset, drawn: figure) -> None:
     """Shade the hold-out, every run that is held out by itself."""
-    hours, sealed = _hours(record), record["sealed"].values
+    hours, sealed = hours_of(record), record["sealed"].values
     run = record["run"].values if "run" in record else np.zeros(hours.size, int)
     for one in np.unique(run[sealed]):
         here = hours[sealed & (run == one)]
         add_hold_out(drawn, float(here[0]), float(here[-1]))
 
 
-def _hours(record: xr.Dataset) -> np.ndarray:
-    """Return the time of every block since the start of the record in hours; of several runs, the time between them left out."""
+def hours_of(record: xr.Dataset) -> np.ndarray:
+    """Return the time of every block since the start of the record in hours; of several runs, the time between them left out.
+
+    Parameters
+    ----------
+    record : Dataset
+        fusion.nc of a record.
+    """
     if "elapsed" in record:
         return np.asarray(record["elapsed"].values / 3600.0)
     time = record["time"].values

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from fusion.products.results import Results
 from fusion.products.results_axis import AnomalyPart
+from fusion.report.conclusions.answers import headline
 from fusion.report.findings import anomaly_cause, anomaly_place
-from fusion.report.wording import number, verdict_headline
+from fusion.report.wording import number
 
 #: Verdicts under which nothing is left in the drift that these data can show.
 _SOUND_VERDICTS = ("complete", "explained")
@@ -29,7 +30,7 @@ def objections(results: Results) -> list[str]:
     if results.loop is None:
         found.append("the drift was not modelled, so that nothing says whether the profile is free of it")
     elif results.loop.verdict not in _SOUND_VERDICTS:
-        found.append(f"the verdict is {results.loop.verdict}: {verdict_headline(results.loop).rstrip('.')}")
+        found.append(f"the verdict is {results.loop.verdict}: {headline(results).rstrip('.')}")
     if results.inputs is None:
         found.append("the inputs were not checked against each other")
     else:

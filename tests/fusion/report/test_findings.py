@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from fusion.products.results import (
     AnomalyPart,
     ByDirection,
@@ -16,6 +14,7 @@ from fusion.products.results import (
     SourcePart,
 )
 from fusion.products.results_loop import Baselines, ErrorInterval, ModelErrors, StepPart
+from fusion.products.results_part import AreaPart
 from fusion.report import findings
 
 ISO = Iso230Part(
@@ -51,20 +50,15 @@ def test_anomalies_are_named_with_their_cause() -> None:
     one = AnomalyPart.model_construct(target=5, direction="negative", cause="undetermined")
     assert findings.anomaly_place(both) == "position 3, both approaches"
     assert findings.anomaly_place(one) == "position 5, negative approach"
-    assert findings.standing_out((both, one)) == "Standing out: position 3 (stick-slip) and position 5 (undetermined)."
-    assert findings.standing_out(()) == "No position stands out from the others."
 
 
-@pytest.mark.parametrize(
-    ("verdict", "part"),
-    [
-        ("attributable", "The drift goes with the temperature around x 355 mm, y 95 mm"),
-        ("not attributable", "the closest is around x 355 mm, y 95 mm (p = 0.002)."),
-        ("not separable", "These data cannot tell"),
-    ],
-)
-def test_every_attribution_has_its_sentence(verdict: str, part: str) -> None:
-    assert part in findings.attribution_headline(correlation(verdict))
+def test_a_place_is_named_as_an_area() -> None:
+    area = AreaPart(x_low_mm=280.0, x_high_mm=420.0, y_low_mm=40.0, y_high_mm=150.0)
+    assert findings.span_words(area) == "x 280 to 420 mm, y 40 to 150 mm"
+    assert findings.area_words(area, 355.0, 95.0) == (
+        "the area x 280 to 420 mm, y 40 to 150 mm (strongest at x 355 mm, y 95 mm)"
+    )
+    assert findings.area_words(None, 355.0, 95.0) == "the place around x 355 mm, y 95 mm"
 
 
 def test_randomised_loads_that_are_causes_are_named() -> None:
@@ -78,7 +72,7 @@ def error(rmse_um: float) -> ErrorInterval:
 
 def test_errors_are_stated_before_and_after_with_their_intervals() -> None:
     loop = Loop.model_construct(errors=ModelErrors(declared=error(1.94), final=error(0.464)))
-    assert findings.hold_out_errors(loop) == "1.94 [1.7, 2.1] -> 0.464 [0.42, 0.51] \u00b5m"
+    assert findings.hold_out_errors(loop) == "1.94 [1.75 to 2.13] -> 0.46 [0.42 to 0.51] \u00b5m"
 
 
 def test_plain_predictions_are_last_value_mean_and_the_best_regression() -> None:
@@ -86,10 +80,10 @@ def test_plain_predictions_are_last_value_mean_and_the_best_regression() -> None
     baselines = Baselines(**{name: error(1.0 + place) for place, name in enumerate(names)})
     told = findings.baseline_errors(Loop.model_construct(baselines=baselines, best_baseline="ridge"))
     assert told == (
-        "last value repeated 1.00, mean of the training part 2.00, ridge regression on the same 4.00 \u00b5m"
+        "last cycle simply repeated 1.0, mean of the cycles before 2.0, ridge regression on the same 4.0 \u00b5m"
     )
     short = findings.baseline_errors(Loop.model_construct(baselines=baselines, best_baseline="mean"))
-    assert short == "last value repeated 1.00, mean of the training part 2.00 \u00b5m"
+    assert short == "last cycle simply repeated 1.0, mean of the cycles before 2.0 \u00b5m"
 
 
 def test_a_step_has_both_pairs_of_errors() -> None:
@@ -97,7 +91,9 @@ def test_a_step_has_both_pairs_of_errors() -> None:
         rmse_before_um=0.6, rmse_after_um=0.7, cross_rmse_before_um=0.5, cross_rmse_after_um=0.4
     )
     assert findings.step_errors(step) == (
-        "held-out error 0.600 -> 0.700 \u00b5m, blocks left out 0.500 -> 0.400 \u00b5m"
+        "held-out error 0.60 -> 0.70 \u00b5m, blocks predicted from the others 0.50 -> 0.40 \u00b5m"
     )
     late = step.model_copy(update={"rmse_after_um": None})
-    assert findings.step_errors(late).startswith("found after the hold-out was opened, blocks left out 0.500")
+    assert findings.step_errors(late).startswith(
+        "found after the hold-out was opened, blocks predicted from the others 0.50"
+    )

@@ -71,6 +71,7 @@ def test_every_section_and_figure_is_there(opened: tuple[Page, list[str]]) -> No
         "glossary",
     ):
         assert page.locator(f"section#{section}").count() == 1, section
+    page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
     figures = page.locator("figure svg, figure .drawing")
     assert figures.count() >= 18
     for at in range(figures.count()):
@@ -80,13 +81,42 @@ def test_every_section_and_figure_is_there(opened: tuple[Page, list[str]]) -> No
     assert len(ids) == len(set(ids))
     for target in page.evaluate("[...document.querySelectorAll('nav a')].map(a => a.getAttribute('href').slice(1))"):
         assert target in ids
+    page.evaluate("document.querySelectorAll('details').forEach(d => d.open = false)")
+
+
+def test_a_link_of_the_contents_opens_the_appendix(opened: tuple[Page, list[str]]) -> None:
+    page, _ = opened
+    assert not page.locator("section#paper").is_visible()
+    page.locator("nav.contents a[href='#paper']").click()
+    assert page.locator("section#paper").is_visible()
+    page.evaluate("document.querySelectorAll('details').forEach(d => d.open = false)")
+
+
+def test_what_a_reader_acts_on_comes_before_the_statistics(opened: tuple[Page, list[str]]) -> None:
+    page, _ = opened
+    order = page.evaluate("[...document.querySelectorAll('section[id]')].map(s => s.id)")
+    wanted = [
+        "summary",
+        "iso230",
+        "drift",
+        "anomalies",
+        "fields",
+        "cause",
+        "place",
+        "data",
+        "appendix",
+        "paper",
+        "loop",
+        "glossary",
+    ]
+    assert [name for name in order if name in wanted] == wanted
 
 
 def test_the_summary_comes_first_and_fits_one_screen(opened: tuple[Page, list[str]]) -> None:
     page, _ = opened
     box = page.locator("section#summary").bounding_box()
     assert box is not None and box["y"] + box["height"] < 900
-    assert "reversal that changes with time" in page.locator("section#summary .headline").inner_text()
+    assert "a reversal error that changes" in page.locator("section#summary .headline").inner_text()
 
 
 @pytest.mark.parametrize("width", [390, 1280])

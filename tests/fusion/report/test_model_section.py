@@ -18,17 +18,18 @@ def test_steps_start_with_the_declared_model() -> None:
         "declared: expansion of the axis",
         "",
         "\u2013",
-        "\u2013",
-        "0.600",
-        "\u2013",
+        "0.60",
         "\u2013",
         "",
         "",
     ]
     assert added.marked
-    assert added.cells[1:3] == ["sudden step or new zero", "time / s 1800 (at least 1700), shape flat (or linear)"]
-    assert added.cells[4:9] == ["0.600", "0.400", "0.700", "0.500", "yes"]
-    assert added.cells[-1] == "dead path of the laser, 4.0 less in log-likelihood"
+    assert added.cells[1:3] == [
+        "sudden step or new zero",
+        "30 min after the start (at least 28 min), shape flat (or linear)",
+    ]
+    assert added.cells[4:7] == ["0.60 -> 0.40", "0.70 -> 0.50", "yes"]
+    assert added.cells[-1] == "dead path of the laser (log-likelihood lower by 4.0)"
 
 
 def test_a_name_that_is_not_confirmed_is_told_with_both_errors() -> None:
@@ -36,15 +37,15 @@ def test_a_name_that_is_not_confirmed_is_told_with_both_errors() -> None:
         update={"confirmed": False, "doubt": "the error is 0.4 µm without it and 0.5 µm with it"}
     )
     _, added = model_section.steps_table(LOOP.model_copy(update={"steps": (doubted,)})).rows
-    assert added.cells[8] == "not confirmed: the error is 0.4 µm without it and 0.5 µm with it"
+    assert added.cells[6] == "not confirmed: the error is 0.4 µm without it and 0.5 µm with it"
 
 
 def test_errors_stand_beside_those_of_plain_predictions() -> None:
     rows = [row.cells for row in model_section.errors_table(LOOP).rows]
     assert rows[:3] == [
-        ["declared model", "0.600", "0.50 to 0.70"],
-        ["with the added effects", "0.400", "0.35 to 0.46"],
-        ["last value repeated", "0.900", "0.80 to 1.0"],
+        ["declared model", "0.60", "0.50 to 0.70"],
+        ["with the added effects", "0.40", "0.35 to 0.46"],
+        ["last cycle simply repeated", "0.90", "0.80 to 1.00"],
     ]
     assert len(rows) == 7
 
@@ -59,11 +60,11 @@ def test_the_model_is_told_in_numbers() -> None:
     rows = dict(model_section.describe_model(LOOP))
     assert rows["expansion of the axis"] == "11.60 \u00b1 0.40 ppm/K (expected beforehand 11.7 \u00b1 4.0 ppm/K)"
     assert rows["sudden step or new zero"] == "1.00 \u00b1 0.20 \u00b5m"
-    assert rows["unexplained drift"].startswith(
-        "random walk; rms 0.10 \u00b5m common to all positions, below 0.001 \u00b5m"
+    assert rows["drift without explanation"].startswith(
+        "random walk: 0.10 \u00b5m rms common to all positions, below 0.001 \u00b5m"
     )
     assert rows["not tried: dead path of the laser"] == "no air"
-    assert "hold-out test of the strongest undecided candidate" not in rows
+    assert "extra test on the held-out cycles" not in rows
 
 
 def test_an_effect_that_cannot_be_detected_has_no_limit() -> None:
@@ -86,7 +87,7 @@ def test_evidence_is_told_with_all_its_numbers() -> None:
     assert RESULTS.anomalies is not None
     told = model_section.describe_evidence(RESULTS.anomalies[0].evidence)
     assert told["stands_out"] == "extra scatter of 0.30 \u00b5m"
-    assert ("step held out / nats", "0") in told["numbers"] and ("step cycle", "12") in told["numbers"]
+    assert ("step held out / in log-likelihood", "0") in told["numbers"] and ("step cycle", "12") in told["numbers"]
     assert (told["support"], told["against"], told["check"]) == (("a",), ("b",), "c")
 
 
@@ -94,3 +95,20 @@ def test_values_and_names_are_words() -> None:
     assert model_section.spaced("jump_um_per_K") == "jump / (\u00b5m/K)"
     assert model_section.in_words([1.0, True, None, "warm_up"]) == "1.00, yes, \u2013 and warm up"
     assert Coefficient(value=1.0, u=0.1, unit="um").prior is None
+
+
+def test_every_coefficient_has_a_name_of_its_own() -> None:
+    (step,) = LOOP.steps
+    coefficient = step.coefficients[0]
+
+    def named(effect: str, shape: str, count: int) -> list[str]:
+        changed = {"effect": effect, "parameters": {"shape": shape}, "coefficients": (coefficient,) * count}
+        return model_section.coefficient_names(step.model_copy(update=changed))
+
+    start = "what was left of the time before the start, shift"
+    assert named("unseen_heat_source", "flat", 2) == ["shift at full load", start]
+    four = named("unseen_heat_source", "flat and linear", 4)
+    assert len(set(four)) == 4 and four[1] == "stretch at the far end at full load"
+    assert named("thermal_lag", "flat and linear", 2) == ["shift", "stretch at the far end"]
+    assert named("periodic_disturbance", "flat", 2) == ["sine part", "cosine part"]
+    assert named("step_event", "flat", 1) == [""] and named("bed_bending", "", 2) == ["coefficient 1", "coefficient 2"]

@@ -40,7 +40,7 @@ def record(channels: int = 1, drivers: int = 1) -> xr.Dataset:
 def test_a_record_is_told_with_its_channels_and_its_driver() -> None:
     assert isinstance(RESULTS.loop, RecordLoop)
     told = describe_record(RESULTS, {"inputs": {"record.csv": {}}}, record())
-    assert told["sentences"][0] == "Measured: 1 displacements and 2 temperatures over 4 min, with speed as driver."
+    assert told["measured"] == "Measured: 1 displacements and 2 temperatures over 4 min, with speed as driver."
     assert told["channels"].rows[0].cells == ["X", "0.900", "0.600", "0.400", "10", "0.10", "0.300"]
     assert told["chained"].rows[-1].cells == ["mean", "", "0.900", "0.600", "0.400"]
     assert told["rejected"].rows == ()
@@ -51,7 +51,7 @@ def test_a_record_is_told_with_its_channels_and_its_driver() -> None:
 def test_the_page_stays_readable_with_many_channels() -> None:
     told = describe_record(RESULTS, {"inputs": {}}, record(channels=9, drivers=0))
     assert (len(told["shown"]), told["omitted"]) == (6, 3)
-    assert "driver" not in told["sentences"][0]
+    assert "driver" not in told["measured"]
     charts = draw_record(record(channels=9, drivers=0))
     assert "drivers" not in charts
     assert len([name for name in charts if name.startswith("prediction_")]) == 6

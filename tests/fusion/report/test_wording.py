@@ -1,5 +1,4 @@
 """Numbers and verdicts in words: digits follow the uncertainty, every verdict has its sentence, remedies come in order."""
-# ruff: noqa: E501 - sentences are quoted whole
 
 from __future__ import annotations
 
@@ -7,8 +6,6 @@ import numpy as np
 import pytest
 
 from fusion.consistency.checks import Check, inputs_part
-from fusion.products.results import AnomalyPart, Loop, Notice, RecordLoop, Results, StepPart, Unexplained, Verdict
-from fusion.products.results_axis import Evidence
 from fusion.products.results_inputs import InputsPart
 from fusion.report import wording
 
@@ -30,72 +27,32 @@ def test_a_value_has_the_digits_of_its_uncertainty(value: float | None, u: float
 
 
 def test_small_things_read_well() -> None:
-    assert wording.p_value(0.0004) == "< 0.001" and wording.p_value(0.0123) == "0.012" and wording.p_value(None) == "–"
+    assert wording.p_cell(0.0004) == "< 0.001" and wording.p_cell(0.0123) == "0.012" and wording.p_cell(None) == "–"
     assert wording.duration(90) == "90 s" and wording.duration(1800) == "30 min" and wording.duration(25200) == "7.0 h"
     assert wording.join(["a", "b", "c"]) == "a, b and c" and wording.join(["a"]) == "a" and wording.join([]) == ""
     assert wording.moment(np.datetime64("2026-03-09T06:30:05")) == "2026-03-09 06:30 UTC"
 
 
-def loop(verdict: Verdict, *effects: str, shape: str = "") -> Loop:
-    """The part of a loop that sentences are made of."""
-    return Loop.model_construct(
-        verdict=verdict,
-        steps=tuple(StepPart.model_construct(effect=name, confirmed=True) for name in effects),
-        unnamed={},
-        rmse_persistence_um=2.5,
-        unexplained=Unexplained.model_construct(shape=shape, rms_um=0.2),
-        rmse_declared_um=1.94,
-        rmse_final_um=0.66,
-        noise_floor_um=0.42,
-    )
+def test_the_limit_of_a_simulation_is_an_upper_limit() -> None:
+    assert wording.p_cell(1 / 280, 1 / 280) == "≤ 0.004" and wording.p_cell(0.002, 0.002) == "≤ 0.002"
+    assert wording.p_cell(0.025, 0.025) == "≤ 0.03" and wording.p_cell(0.004, 0.002) == "0.004"
+    assert wording.p_words(0.002, 0.002) == "p ≤ 0.002, limit of the simulation"
+    assert wording.p_words(0.004, 0.002) == "p = 0.004" and wording.p_words(1e-9, 0.0) == "p < 0.001"
 
 
-@pytest.mark.parametrize(
-    ("found", "sentence"),
-    [
-        (loop("complete"), "The declared model explains the drift; nothing in these data shows that an effect is missing."),
-        (loop("explained", "step_event"), "The declared model lacked an effect: sudden step or new zero. With it, nothing is left that these data can show."),
-        (
-            loop("explained", "step_event", "dead_path"),
-            "The declared model lacked 2 effects: sudden step or new zero and dead path of the laser. With them, nothing is left that these data can show.",
-        ),
-        (
-            loop("partial", "step_event", shape="a wave of 37 min"),
-            "The declared model lacked an effect: sudden step or new zero. With it, something without a name is left (a wave of 37 min).",
-        ),
-        (loop("unexplained"), "Something is left that no effect of the library explains."),
-        (
-            loop("unexplained").model_copy(update={"unnamed": {"dead_path": 9e-35}}),
-            "Something is left that no effect of the library explains (dead path of the laser is significant, p < 0.001, and was not admitted).",
-        ),
-        (
-            loop("unexplained").model_copy(update={"steps": (StepPart.model_construct(effect="step_event", confirmed=False),)}),
-            "Something is left that no effect of the library explains (sudden step or new zero is not confirmed).",
-        ),
-        (
-            loop("no_skill", shape="a slow drift"),
-            "The model predicts no better than repeating the last value or the mean: these data cannot tell whether an effect is missing (a slow drift).",
-        ),
-    ],
-)  # fmt: skip
-def test_every_verdict_has_its_sentence(found: Loop, sentence: str) -> None:
-    assert wording.verdict_headline(found) == sentence
+def test_numbers_that_are_compared_have_as_many_decimals() -> None:
+    assert wording.alike([1.938, 0.4643, None]) == ["1.94", "0.46", "–"]
+    assert wording.alike([0.7331, 0.7372]) == ["0.73", "0.74"]
+    # Two that differ do not read alike; two that are equal do.
+    assert wording.alike([0.7331, 0.7332]) == ["0.7331", "0.7332"]
+    assert wording.alike([0.5, 0.5]) == ["0.50", "0.50"]
+    assert wording.alike([-0.5, float("nan")]) == ["−0.50", "–"]
 
 
-def test_next_steps_start_with_the_model_and_leave_out_what_asks_for_nothing() -> None:
-    results = Results.model_construct(
-        loop=loop("partial", "dead_path"),
-        anomalies=(
-            AnomalyPart.model_construct(target=3, evidence=Evidence.model_construct(check="Inspect the guide.")),
-        ),
-        warnings=(Notice("gaps", "Gaps are allowed for.", ""), Notice("camera", "Late.", "Start the camera earlier.")),
-    )
-    first, second, third, last = wording.next_steps(results)
-    assert first == wording.effect_words("dead_path").remedy
-    assert second.startswith("Log more of what happens at the machine")
-    assert third == "Position 3: Inspect the guide." and last == "Start the camera earlier."
-    quiet = Results.model_construct(loop=loop("complete"), anomalies=(), warnings=())
-    assert wording.next_steps(quiet) == ["Nothing has to be done: use the profile and its uncertainty as they are."]
+def test_a_time_is_local_where_a_zone_is_stated() -> None:
+    assert wording.moment("2026-03-09T06:30:05Z", "Europe/Vienna") == "2026-03-09 07:30 CET"
+    assert wording.moment("2026-07-09T06:30:05Z", "Europe/Vienna") == "2026-07-09 08:30 CEST"
+    assert wording.moment(np.datetime64("NaT")) == "–"
 
 
 def test_an_effect_of_a_users_own_has_a_name_and_no_remedy() -> None:
@@ -105,19 +62,6 @@ def test_an_effect_of_a_users_own_has_a_name_and_no_remedy() -> None:
 def test_places_and_units_are_printed() -> None:
     assert wording.place(355.4, None) == "x 355 mm, y – mm"
     assert wording.print_unit("um/K") == "µm/K"
-
-
-def test_errors_are_those_of_what_was_held_out() -> None:
-    assert wording.verdict_numbers(loop("explained", "step_event")) == (
-        "Error on held-out cycles: 1.9 µm with the declared model, 0.66 µm after, 2.5 µm for repeating the last value; the noise of single readings is 0.42 µm."
-    )
-    record = RecordLoop.model_construct(
-        steps=(), rmse_declared_um=1.94, rmse_final_um=1.94, noise_floor_um=0.42, rmse_persistence_um=2.5
-    )
-    assert (
-        wording.verdict_numbers(record)
-        == "Error on the held-out part: 1.9 µm, 2.5 µm for repeating the last value; the noise of a block mean is 0.42 µm."
-    )
 
 
 def doubted(*codes: str) -> InputsPart:

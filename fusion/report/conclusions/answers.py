@@ -1,0 +1,308 @@
+"""Conclusions of a run as answers to a reader's questions: why, how much, where, how sure, which place, what remains."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from fusion.products.results import Results
+from fusion.products.results_attribution import CorrelationPart
+from fusion.products.results_axis import AnomalyPart
+from fusion.products.results_loop import Loop, RecordLoop, StepPart
+from fusion.products.results_part import TimePart
+from fusion.report.conclusions.effects import phrase, step_phrase
+from fusion.report.findings import anomaly_figures, area_words, iso230_values, quoted_window, randomised_causes
+from fusion.report.wording import (
+    alike,
+    conditional,
+    effect_words,
+    join,
+    measured,
+    number,
+    p_words,
+)
+
+#: Effects that the seen temperatures of the table drive.
+_SEEN = {"axis_expansion", "table_offset", "thermal_lag"}
+#: Anomalies in words: what the position does, and what that speaks for.
+_ANOMALIES = {
+    "scatter": "repeats worse than the others",
+    "slow": "moves slowly by itself",
+    "step": "makes a step by itself",
+    "periodic": "moves periodically by itself",
+}
+_ANOMALY_CAUSES = {
+    "structural": "probably mechanical (guideway, scale, screw or nut)",
+    "local_temperature": "it goes with the temperature at its own place",
+    "stick_slip": "probably stick-slip",
+    "step": "one step at cycle {cycle}",
+    "undetermined": "these data do not tell why",
+}
+
+
+class Conclusion(NamedTuple):
+    """One conclusion of a run.
+
+    Attributes
+    ----------
+    question : str
+        What it answers: how much, where, how sure, which place, what remains.
+    text : str
+        Sentences.
+    """
+
+    question: str
+    text: str
+
+
+def conclude(results: Results) -> list[Conclusion]:
+    """Return the conclusions of a run in the order of a reader's questions; those that the run does not answer are absent.
+
+    Parameters
+    ----------
+    results : Results
+        Results of a run.
+    """
+    answers = (
+        ("How much", _how_much(results)),
+        ("Where", _where(results)),
+        ("How sure", _how_sure(results)),
+        ("Which place", _which_place(results)),
+        ("What remains", _what_remains(results)),
+    )
+    return [Conclusion(question, " ".join(sentences)) for question, sentences in answers if sentences]
+
+
+def headline(results: Results) -> str:
+    """Return one sentence that states the outcome, conditional where an input is doubted.
+
+    Parameters
+    ----------
+    results : Results
+        Results of a run.
+    """
+    if results.loop is None:
+        return conditional("Evaluated without a model of the drift.", results.inputs, "causes")
+    return conditional(_verdict(results.loop, results.time), results.inputs, "causes")
+
+
+def _verdict(loop: Loop, time: TimePart | None) -> str:
+    record = isinstance(loop, RecordLoop)
+    lacks = join([step_phrase(step, time, record=record) for step in loop.steps if step.confirmed])
+    declared = join([phrase(name, record=record) for name in loop.declared])
+    explains = f"The declared model explains the drift ({declared})" if declared else "No effect is declared"
+    last = "value" if record else "cycle"
+    alone = f"{'The declared model' if declared else 'Random drift'} does not explain the drift alone:"
+    return {
+        "complete": f"{explains}; no missing effect can be shown.",
+        "explained": f"{alone} it lacks {lacks}. With that, no further cause can be shown.",
+        "partial": f"{alone} it lacks {lacks}. Even with that, a part is left that has no name.",
+        "unexplained": "A part of the drift has no explanation: no effect of the library deserves its name.",
+        "no_skill": f"The model predicts no better than repeating the last {last} or the mean: these data cannot tell what drives it.",
+    }[loop.verdict]
+
+
+def _how_much(results: Results) -> list[str]:
+    """Size of the drift, and the accuracy by the standard."""
+    sentences = []
+    if results.drift is not None and results.drift.range_um:
+        largest, least = _extreme_position(results, largest=True), _extreme_position(results, largest=False)
+        sentences.append(f"During the test the deviation drifted by {largest}, and least by {least}.")
+    if results.iso230 is not None:
+        quoted = quoted_window(results.iso230)
+        values = iso230_values(quoted)
+        sentences.append(
+            f"By ISO 230-2, {quoted.window}: A = {values['A']}, R = {values['R']}, B = {values['B']} (k = 2)."
+        )
+    return [conditional(" ".join(sentences), results.inputs, "positions")] if sentences else []
+
+
+def _extreme_position(results: Results, *, largest: bool) -> str:
+    """Largest or smallest range of drift with its position."""
+    drift = results.drift
+    assert drift is not None
+    known = [k for k, value in enumerate(drift.range_um) if value is not None]
+    choose = max if largest else min
+    at = choose(known, key=lambda k: drift.range_um[k] or 0.0)
+    return f"{measured(drift.range_um[at], drift.range_u_um[at], 'µm')} at position {at + 1} ({drift.position_mm[at]:g} mm)"
+
+
+def _where(results: Results) -> list[str]:
+    """Positions that stand out."""
+    if results.anomalies is None:
+        return []
+    told = " ".join(map(describe_anomaly, results.anomalies)) or "No position stands out from the others."
+    rests_on = {figure for anomaly in results.anomalies for figure in anomaly_figures(anomaly)} or {"positions"}
+    return [conditional(told, results.inputs, *sorted(rests_on))]
+
+
+def describe_anomaly(anomaly: AnomalyPart) -> str:
+    """Return one sentence on a position that stands out: what it does, by how much, and what that speaks for.
+
+    Parameters
+    ----------
+    anomaly : AnomalyPart
+        An entry of ``anomalies`` in the results.
+    """
+    evidence = anomaly.evidence
+    approach = "" if anomaly.direction == "both" else f", {anomaly.direction} approach,"
+    sizes = (
+        f"its standard deviation is {number(_scatter(anomaly), 2)} µm, that of the others {number(evidence.scatter_typical_um, 2)} µm"
+        if evidence.kind == "scatter"
+        else f"{number(evidence.extra_um, 2)} µm"
+    )
+    cause = _ANOMALY_CAUSES[anomaly.cause].format(cycle=evidence.step_cycle)
+    return (
+        f"{position_words(anomaly.target, anomaly.position_mm)}{approach} {_ANOMALIES[evidence.kind]}: {sizes} "
+        f"({p_words(anomaly.p_value, anomaly.least_p)}); {cause}."
+    )
+
+
+def position_words(target: int, position_mm: float | None) -> str:
+    """Return the name of a target position with its place.
+
+    Parameters
+    ----------
+    target : int
+        Number of the position, from 1.
+    position_mm : float or None
+        Place along the axis, mm; None: left out.
+    """
+    return f"Position {target}" + ("" if position_mm is None else f" ({position_mm:g} mm)")
+
+
+def _scatter(anomaly: AnomalyPart) -> float | None:
+    """Standard deviation of the approach that stands out, um; root mean square of both where both do."""
+    evidence = anomaly.evidence
+    sides = {"positive": evidence.scatter_positive_um, "negative": evidence.scatter_negative_um}
+    if anomaly.direction != "both":
+        return sides[anomaly.direction]
+    known = [value for value in sides.values() if value is not None]
+    return float((sum(value**2 for value in known) / len(known)) ** 0.5) if known else None
+
+
+def _how_sure(results: Results) -> list[str]:
+    """Probability of what was found, what was not confirmed, and what the prediction is worth."""
+    loop = results.loop
+    if loop is None:
+        return []
+    added = [f"{effect_words(step.effect).name} {p_words(step.p_value)}" for step in loop.steps if step.confirmed]
+    found = f"{join(added)} (chance that the whole search finds as much where nothing is missing)." if added else ""
+    found = f"{found[:1].upper()}{found[1:]}"
+    doubtful = [f"{effect_words(step.effect).name} ({step.doubt})" for step in loop.steps if not step.confirmed]
+    named = " ".join(text for text in (found, f"Not confirmed: {join(doubtful)}." if doubtful else "") if text)
+    sentences = [conditional(named, results.inputs, "causes")] if named else []
+    return [*sentences, conditional(prediction_sentence(loop), results.inputs, "positions")]
+
+
+def prediction_sentence(loop: Loop) -> str:
+    """Return the sentences on the error of prediction: before, after, of repeating the last cycle, and what they say.
+
+    Parameters
+    ----------
+    loop : Loop
+        The part ``loop`` of the results.
+    """
+    record = isinstance(loop, RecordLoop)
+    last = "value" if record else "cycle"
+    values = (loop.rmse_declared_um, loop.rmse_final_um, loop.rmse_persistence_um, loop.noise_floor_um)
+    declared, final, plain, noise = alike(values)
+    scatter = "the noise of a block mean" if record else "the scatter of single readings"
+    steps = [step for step in loop.steps if step.rmse_after_um is not None]
+    better = "" if loop.rmse_persistence_um is None or not steps else _plain_wins(loop)
+    beside = f"repeating the last {last} gives {plain} µm{better}, {scatter} is {noise} µm"
+    where = loop.held_out.split(" held out")[0]
+    if not steps:
+        return f"Error of predicting {where} from what was measured before: {declared} µm; {beside}."
+    lower = (loop.rmse_final_um or 0.0) < (loop.rmse_declared_um or 0.0)
+    change = (
+        f"falls from {declared} to {final} µm" if lower else f"does not fall ({declared} µm before, {final} µm after)"
+    )
+    noun = "effect" if len(steps) == 1 else "effects"
+    blocks = f"blocks of {'time' if record else 'cycles'} predicted from the others: {_block_errors(steps)}"
+    return f"With the added {noun} the error of predicting {where} {change}; {beside}; {blocks}."
+
+
+def _block_errors(steps: list[StepPart]) -> str:
+    """Errors of blocks that are left out, before and after every step."""
+    texts = []
+    for step in steps:
+        before, after = alike((step.cross_rmse_before_um, step.cross_rmse_after_um))
+        texts.append(f"{before} -> {after} µm" + (f" ({effect_words(step.effect).name})" if len(steps) > 1 else ""))
+    return join(texts)
+
+
+def _plain_wins(loop: Loop) -> str:
+    """Than which models the plain repetition predicts better, in brackets; empty where it wins against none."""
+    plain, declared, final = loop.rmse_persistence_um, loop.rmse_declared_um, loop.rmse_final_um
+    if plain is None or declared is None or final is None:
+        return ""
+    if plain < final:
+        return " (less than the model, which explains here but does not predict better)"
+    return " (less than the declared model alone)" if plain < declared else ""
+
+
+def place_sentence(correlation: CorrelationPart) -> str:
+    """Return one sentence on the place of the field that the drift follows.
+
+    Parameters
+    ----------
+    correlation : CorrelationPart
+        The part ``correlation`` of the results.
+    """
+    source = correlation.source
+    where = area_words(source.area, source.x_mm, source.y_mm)
+    shown = p_words(source.p_value, correlation.least_p)
+    return {
+        "not separable": "These data cannot tell which place the drift follows: the whole session is one warm-up, in which every "
+        "temperature rises like every drift.",
+        "not attributable": "The drift follows no place that the camera sees more closely than chance allows; the closest is "
+        f"{where} ({shown}).",
+        "attributable": f"The drift as a whole follows the temperature of {where} more closely than chance and a common warm-up allow "
+        f"({shown}); this is not yet proof of cause.",
+    }[correlation.verdict]
+
+
+def _which_place(results: Results) -> list[str]:
+    """The place that the drift follows, and how that goes together with the model."""
+    correlation = results.correlation
+    if correlation is None:
+        return []
+    causes = randomised_causes(correlation)
+    verb = "is a cause" if len(causes) == 1 else "are causes"
+    shown = f"Loads were switched at random, which shows that {join(causes)} {verb} of drift." if causes else ""
+    sentences = (place_sentence(correlation), shown, reconcile(results))
+    return [conditional(" ".join(text for text in sentences if text), results.inputs, "attribution")]
+
+
+def reconcile(results: Results) -> str:
+    """Return one sentence on how the place that the drift follows goes together with what the model names; empty where nothing has to.
+
+    Parameters
+    ----------
+    results : Results
+        Results of a run.
+    """
+    correlation, loop = results.correlation, results.loop
+    if correlation is None or loop is None or correlation.verdict != "attributable":
+        return ""
+    if not any(step.confirmed and step.effect == "unseen_heat_source" for step in loop.steps):
+        return ""
+    seen = [phrase(name, record=False) for name in loop.declared if name in _SEEN]
+    part = f"the part that follows the seen temperatures ({join(seen)})" if seen else "what was declared"
+    return f"The unseen heat source is what is left beside {part}, so this place does not show where it is."
+
+
+def _what_remains(results: Results) -> list[str]:
+    """What the final model leaves."""
+    loop = results.loop
+    if loop is None:
+        return []
+    left = loop.unexplained
+    sentences = [f"{left.shape[0].upper()}{left.shape[1:]}: {number(left.rms_um, 2)} µm rms."] if left.shape else []
+    sentences += [
+        f"Significant and not admitted: {effect_words(name).name} ({p_words(p)})." for name, p in loop.unnamed.items()
+    ]
+    if sentences:
+        return sentences
+    scatter = "the noise of a block mean" if isinstance(loop, RecordLoop) else "the scatter of single readings"
+    return [f"Nothing that these data can show beyond {scatter}, {number(loop.noise_floor_um, 2)} µm."]
