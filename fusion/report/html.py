@@ -129,9 +129,9 @@ def _drift_charts(results: Results, deviations: xr.Dataset) -> dict[str, Chart]:
         "scatter": neighbours.plot_scatter_comparison(group(deviations, "comparison"), position),
         "mean_differences": neighbours.plot_mean_differences(group(deviations, "neighbours"), position),
         "chart": neighbours.plot_reference_chart(group(deviations, "chart"), position),
-        "iso230": iso230.plot_test(group(deviations, "settled"), position),
         "windows": readings.plot_windows(group(deviations, "iso")),
         "anomalies": drift.plot_position_scatter(joint, position, flagged),
+        **({"iso230": iso230.plot_test(group(deviations, "settled"), position)} if has(deviations, "settled") else {}),
     }
 
 

@@ -25,7 +25,7 @@ from fusion.report.wording import print_unit
 
 
 class Iso230PageError(FusionError):
-    """A page that cannot be written; the message says why."""
+    """A test whose page or values cannot be written; the message says why."""
 
 
 #: A test of one cycle has no scatter.
@@ -69,7 +69,13 @@ def render_iso230(
         What was left out or assumed when the file was read.
     versions : mapping
         ``thermofuse`` and its version.
+
+    Raises
+    ------
+    Iso230PageError
+        If the axis is a rotary one.
     """
+    _refuse_angles(dataset, "page")
     standard = None if part is None else describe_iso230(part, dataset)
     single = single_run_table(dataset) if part is None else None
     return render_page(
@@ -137,9 +143,23 @@ def iso230_json(part: Iso230Part | None, dataset: xr.Dataset) -> dict[str, Any]:
         None of a test of one cycle, of which the readings alone are returned.
     dataset : Dataset
         Readings with the group ``settled``.
+
+    Raises
+    ------
+    Iso230PageError
+        If the axis is a rotary one.
     """
+    _refuse_angles(dataset, "JSON")
     rows = _rows(part, dataset)
     return {"targets": rows} if part is None else {**part.model_dump(mode="json"), "targets": rows}
+
+
+def _refuse_angles(dataset: xr.Dataset, kind: str) -> None:
+    """Refuse a rotary axis where the names of the values carry the units of a linear one."""
+    if dataset["deviation"].attrs["units"] == "arcsec":
+        raise Iso230PageError(
+            f"the axis is a rotary one, whose {kind} is not written: its units are those of lengths; use the tables, or --csv"
+        )
 
 
 def iso230_csv(part: Iso230Part | None, dataset: xr.Dataset) -> str:

@@ -37,8 +37,7 @@ class Iso230Budget:
         Of the temperature that the compensation took for that of the measured length, K: accuracy of the probe and of its place.
         Assumed: 0.3 K.
     expansion_coefficient_ppm_per_K : float
-        Of the expansion coefficient that the compensation used, ppm/K. Assumed: 1.2 ppm/K, limits of 2 ppm/K with a rectangular
-        distribution.
+        Of the expansion coefficient that the compensation used, ppm/K. Assumed: 2 ppm/K, a steel or cast iron of unknown grade.
     difference_from_20_degC_K : float
         Difference of the material temperature from 20 degC, K (no uncertainty: it scales that of the coefficient). Assumed: 3 K.
     nominal_expansion_ppm_per_K : float
@@ -65,7 +64,7 @@ class Iso230Budget:
     device_ppm: float = 0.25
     alignment_ppm: float = 0.3
     material_temperature_K: float = 0.3
-    expansion_coefficient_ppm_per_K: float = 1.2
+    expansion_coefficient_ppm_per_K: float = 2.0
     difference_from_20_degC_K: float = 3.0
     nominal_expansion_ppm_per_K: float = 11.7
     environmental_variation_um: float | None = None

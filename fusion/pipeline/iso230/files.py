@@ -139,7 +139,10 @@ def _evaluate(
     )
     groups = {"iso": windows, "settled": settled, **({} if drift is None else {"drift": drift})}
     dataset = joined(deviations, **groups)
-    sheet: dict[str, Any] = complete_sheet(found, dataset, campaign=campaign, environment=environment)
+    linear = deviations["deviation"].attrs["units"] == "um"
+    sheet: dict[str, Any] = (
+        complete_sheet(found, dataset, campaign=campaign, environment=environment) if linear else found
+    )
     return StandardTest(title, Iso230Part.model_validate(plain(sheet)), dataset, remarks)
 
 

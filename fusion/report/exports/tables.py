@@ -11,6 +11,7 @@ import xarray as xr
 from fusion.products.grouped import group
 from fusion.products.results import Results
 from fusion.products.store import read_dataset
+from fusion.report.findings import quoted_window
 from interferometry import iso230
 
 #: Bytes of a row of fields.csv, measured on the demo.
@@ -79,16 +80,17 @@ def iso230_axis_table(deviations: xr.Dataset) -> pd.DataFrame:
 
 
 def iso230_position_table(deviations: xr.Dataset, results: Results) -> pd.DataFrame:
-    """Return mean, standard deviation, reversal and repeatability per target in the window that the results state, um.
+    """Return mean, standard deviation, reversal and repeatability per target in the window whose values are quoted, um.
 
     Parameters
     ----------
     deviations : Dataset
         Product ``deviations.nc``.
     results : Results
-        Results of the run; its window of cycles is evaluated.
+        Results of the run; the window that it quotes is evaluated and named in the last column.
     """
-    window = _cycles_of(results.iso230.window if results.iso230 is not None else "", deviations)
+    name = "" if results.iso230 is None else quoted_window(results.iso230).window
+    window = _cycles_of(name, deviations)
     evaluated = iso230.evaluate_iso230(deviations, cycles=window)
     columns = {"position_mm": deviations["position"]}
     for direction in ("positive", "negative"):
@@ -101,7 +103,7 @@ def iso230_position_table(deviations: xr.Dataset, results: Results) -> pd.DataFr
         "mean_bidirectional_um": evaluated["mean_bidirectional"],
         "repeatability_bidirectional_um": evaluated["repeatability_bidirectional"],
     }
-    return xr.Dataset(columns).to_dataframe().reset_index()
+    return xr.Dataset(columns).to_dataframe().reset_index().assign(window=evaluated.attrs["window"])
 
 
 def fields_table(folder: Path) -> pd.DataFrame:

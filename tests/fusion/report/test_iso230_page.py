@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from fusion.campaign.iso_budget import StatedBudget
 from fusion.pipeline.iso230.evaluation import evaluate_standard
 from fusion.pipeline.iso230.sheet import complete_sheet
 from fusion.products.grouped import joined
@@ -27,6 +28,7 @@ from fusion.report.iso230_page import (
     write_iso230,
 )
 from fusion.report.iso230_section import describe_iso230
+from interferometry.iso230.budget import SCATTER_ALONE
 from tests.fusion.pipeline.iso230.test_evaluation import ASSUMED
 from tests.interferometry.iso230.made_tests import test_made
 
@@ -169,3 +171,21 @@ def test_names_from_files_are_escaped_and_no_file_is_replaced(
     with pytest.raises(Iso230PageError, match="exists already"):
         write_iso230(tmp_path / "page.html", page)
     assert iso230_tables(*test_sheet, title="A")[0].title == "A, cycles 1 to 5"
+
+
+def test_a_rotary_axis_has_tables_and_csv_alone() -> None:
+    deviations = test_made(X)
+    deviations["deviation"].attrs["units"], deviations["position"].attrs["units"] = "arcsec", "deg"
+    budget = StatedBudget(SCATTER_ALONE, dict.fromkeys(ASSUMED.origins, "not of a rotary axis"))
+    windows, settled, part = evaluate_standard(deviations, budget, drift=None, material_degC=None)
+    dataset = joined(deviations, iso=windows, settled=settled)
+    found = Iso230Part.model_validate(plain(part))
+    tables = iso230_tables(found, dataset, title="A")
+    assert tables[0].columns[1].header == "cycles 1 to 5 / arcsec" and tables[1].columns[1].header == "Position / deg"
+    assert iso230_csv(found, dataset).startswith("target,position_deg,mean_positive_arcsec")
+    for write in (
+        lambda: iso230_json(found, dataset),
+        lambda: render_iso230("A", found, dataset, remarks=(), versions=VERSIONS),
+    ):
+        with pytest.raises(Iso230PageError, match="a rotary one"):
+            write()
