@@ -7,6 +7,8 @@ from .inspection import inspect_file
 from .io.flir import index_frames, read_frame
 from .io.flir_writer import write_jpeg, write_sequence
 from .io.frame import CameraParameters
+from .io.frame_readers import index_recordings
+from .io.temperature_frames import StackOptions
 from .radiometry.planck import calibrate
 from .radiometry.uncertainty import temperature_uncertainty
 from .registration.plan import PlanGrid, read_fiducials
@@ -15,10 +17,12 @@ from .registration.register import register
 __all__ = [
     "CameraParameters",
     "PlanGrid",
+    "StackOptions",
     "ThermographyError",
     "calibrate",
     "detect_hotspots",
     "index_frames",
+    "index_recordings",
     "inspect_file",
     "read_fiducials",
     "read_frame",

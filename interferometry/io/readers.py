@@ -17,13 +17,15 @@ from interferometry.io.wide_table import find_wide_table, read_wide_table
 
 DEVIATION_COLUMNS = ("cycle", "direction", "target", "position_mm", "time", "deviation_um")
 
+#: Heading of the tables of averages that laser programs write as a report.
+_AVERAGES = b"Bidirectional Avg Error"
 #: The header of a log stands within so many rows.
 _HEADER_WITHIN = 40
-#: Column of the environment file, variable, unit, kind of quantity, smallest and largest plausible value.
+#: Below 1 % of humidity lies a fraction of 1, and no workshop. Column of the environment file, variable, unit, kind of quantity, smallest and largest plausible value.
 ENVIRONMENT_COLUMNS = (
     ("air_temperature_degC", "air_temperature", "degC", "temperature", -9.0, 60.0),
     ("air_pressure_hPa", "air_pressure", "hPa", "pressure", 500.0, 1200.0),
-    ("relative_humidity_percent", "relative_humidity", "percent", "humidity", 0.0, 100.0),
+    ("relative_humidity_percent", "relative_humidity", "percent", "humidity", 1.0, 100.0),
     ("material_temperature_degC", "material_temperature", "degC", "temperature", -9.0, 80.0),
 )
 
@@ -98,6 +100,10 @@ def read_deviations(
         return read_rtl(path, feed_mm_per_min=feed_mm_per_min, dwell_s=dwell_s)
     if is_ecmc_log(start):
         return read_ecmc_log(path)
+    if _AVERAGES in start:
+        raise LaserFormatError(
+            f"{path}: a report of averages over runs holds no single reading; export the readings of every run"
+        )
     deviations = _read_table_of_deviations(path, sheet)
     if deviations["deviation"].attrs["units"] != "um" and not rotary:
         raise LaserFormatError(
@@ -157,13 +163,13 @@ def is_environment_log(path: Path) -> bool:
 
 
 def read_environment(path: str | Path) -> xr.Dataset:
-    r"""Read logged air and material conditions from a CSV file.
+    r"""Read logged air and material conditions from delimited text or a spreadsheet.
 
     Parameters
     ----------
     path : str or pathlib.Path
-        With the columns time (ISO 8601), air_temperature_degC, air_pressure_hPa, relative_humidity_percent and
-        material_temperature_degC.
+        With the columns time, air_temperature_degC, air_pressure_hPa, relative_humidity_percent and material_temperature_degC, or
+        headings in another language or unit (docs/formats.md).
 
     Returns
     -------

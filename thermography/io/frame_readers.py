@@ -131,6 +131,10 @@ def index_recordings(
     --------
     thermography.io.flir.index_frames : The same for FLIR files alone.
 
+    Notes
+    -----
+    docs/formats.md lists the kinds of files.
+
     Examples
     --------
     >>> index_recordings(["does_not_exist.tif"])[1][0].reason

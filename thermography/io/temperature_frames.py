@@ -64,6 +64,15 @@ class StackOptions:
         With which the camera's program calculated the temperatures; 1 where it is not known.
     reflected_temperature_K : float
         Likewise, K.
+
+    Notes
+    -----
+    docs/formats.md lists the kinds of files, and the same keys of the campaign file.
+
+    Examples
+    --------
+    >>> StackOptions(unit="K", scale=0.04, time_in_name="%Y%m%d_%H%M%S").emissivity
+    1.0
     """
 
     unit: str = ""

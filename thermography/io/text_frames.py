@@ -14,6 +14,8 @@ from thermography.io.temperature_frames import StackContents, StackOptions, Temp
 _DELIMITERS = (";", "\t", ",", " ")
 #: Fewest rows and columns of a frame: a table with a few columns is none.
 _FEWEST = 8
+#: Largest ratio of the sides of a frame: a log of a few columns over many lines is none.
+_LONGEST = 4
 #: A text frame of a large camera has about 10 MB.
 _MOST_BYTES = 1 << 28
 
@@ -88,11 +90,17 @@ class TextReader(TemperatureReader):
         lines = content.decode("utf-16" if utf16 else "utf-8-sig", errors="replace").splitlines()
         for delimiter in _DELIMITERS:
             block = _longest_block(lines, delimiter)
-            if len(block) >= _FEWEST:
+            if _is_a_frame(block):
                 return np.array(block)
         raise ThermographyError(
-            f"{path}: no block of at least {_FEWEST} x {_FEWEST} numbers; export the temperatures of the frame as CSV, one line per row"
+            f"{path}: no block of at least {_FEWEST} x {_FEWEST} numbers in the proportions of a sensor; "
+            "export the temperatures of the frame as CSV, one line per row"
         )
+
+
+def _is_a_frame(block: list[list[float]]) -> bool:
+    rows, columns = len(block), len(block[0]) if block else 0
+    return min(rows, columns) >= _FEWEST and max(rows, columns) <= _LONGEST * min(rows, columns)
 
 
 def _longest_block(lines: list[str], delimiter: str) -> list[list[float]]:

@@ -279,3 +279,19 @@ def test_environment_in_other_units_is_converted(tmp_path: Path) -> None:
     path.write_text("time,air_temperature_degC\n2026-03-09T06:32:00Z,20\n", encoding="utf-8")
     with pytest.raises(LaserFormatError, match="line 1 lacks air_pressure_hPa, relative_humidity_percent, material"):
         read_environment(path)
+
+
+def test_humidity_as_a_fraction_is_not_read_as_percent(tmp_path: Path) -> None:
+    path = tmp_path / "environment.csv"
+    path.write_text(ENVIRONMENT + "\n2026-03-09T06:32:00Z,23.7,1000.1,0.45,23.8\n", encoding="utf-8")
+    with pytest.raises(LaserFormatError, match=r"'0.45' lies outside 1 .. 100, the range of relative_humidity_percent"):
+        read_environment(path)
+
+
+def test_a_report_of_averages_is_no_test(tmp_path: Path) -> None:
+    path = tmp_path / "x.pos"
+    path.write_text("Position   \tBidirectional Avg Error\n0\t0.001\n10\t0.002\n")
+    with pytest.raises(
+        LaserFormatError, match="a report of averages over runs holds no single reading; export the readings"
+    ):
+        read_deviations(path)

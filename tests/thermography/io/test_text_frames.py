@@ -57,8 +57,11 @@ def test_a_table_is_no_frame(tmp_path: Path) -> None:
     path = tmp_path / "laser.csv"
     path.write_text("time,a,b\n1,2,3\n" * 20)
     assert not READER.holds_a_frame(path)
+    path.write_text("\t".join(["1.5"] * 9) + "\n" + ("\t".join(["2.5"] * 9) + "\n") * 500)
+    assert not READER.holds_a_frame(path)
     with pytest.raises(
-        ThermographyError, match="no block of at least 8 x 8 numbers; export the temperatures of the frame as CSV"
+        ThermographyError,
+        match="no block of at least 8 x 8 numbers in the proportions of a sensor; export the temperatures",
     ):
         READER.contents(path, StackOptions())
 
