@@ -21,7 +21,8 @@ DEVIATION_COLUMNS = ("cycle", "direction", "target", "position_mm", "time", "dev
 _AVERAGES = b"Bidirectional Avg Error"
 #: The header of a log stands within so many rows.
 _HEADER_WITHIN = 40
-#: Below 1 % of humidity lies a fraction of 1, and no workshop. Column of the environment file, variable, unit, kind of quantity, smallest and largest plausible value.
+#: Column of the environment file, variable, unit, kind of quantity, smallest and largest plausible value. Below 1 % of humidity lies a
+#: fraction of 1, and no workshop.
 ENVIRONMENT_COLUMNS = (
     ("air_temperature_degC", "air_temperature", "degC", "temperature", -9.0, 60.0),
     ("air_pressure_hPa", "air_pressure", "hPa", "pressure", 500.0, 1200.0),
