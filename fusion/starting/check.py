@@ -13,7 +13,6 @@ from fusion.alignment.align import camera_on_laser_clock
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import counted, read_source
 from fusion.campaign.logged_tables import read_drivers
-from fusion.campaign.record_runs import read_record
 from fusion.campaign.sources import CameraInputs, Inputs, LaserInputs
 from fusion.consistency.checks import Check, ContradictionError, open_doubts, refuse_contradictions
 from fusion.errors import FusionError
@@ -129,12 +128,12 @@ def _check_record(campaign: Campaign) -> CampaignCheck:
     """Check a campaign whose data are a record."""
     title = campaign.campaign.title
     try:
-        source, table = record_stage.read_source(campaign), read_record(campaign)
+        source = record_stage.read_source(campaign)
     except _BAD_INPUT as error:
         return CampaignCheck(campaign.path, title, faults=(_words(error),))
-    runs = len(campaign.record_paths())
+    runs, table = len(campaign.record_paths()), source.health.table
     content = (
-        f"record: {counted(runs, 'run')}, {counted(table.sizes['sensor'], 'temperature')}, "
+        f"record: {counted(runs, 'run')}, {counted(len(source.health.names), 'temperature')}, "
         f"{counted(table.sizes['channel'], 'displacement')}, {counted(table.sizes['time'], 'row')}",
     )
     recordings = (Recording("record", table["time"].values),)

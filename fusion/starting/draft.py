@@ -100,6 +100,7 @@ def draft_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
         yield from _plan(content, asker, along_axis=bool(readings))
     if readings:
         yield from _interferometry(content, asker)
+        yield from _report(asker)
     if content.frames or readings:
         yield from _drivers(content)
     else:
@@ -189,6 +190,20 @@ def _interferometry(content: FolderContent, asker: Asker) -> Iterator[str]:
     if times == "reconstructed":
         yield '# feed = "300 mm/min"                     # with dwell: places the readings of this file more closely in time'
         yield '# dwell = "2 s"'
+
+
+def _report(asker: Asker) -> Iterator[str]:
+    """Yield the conditions that the ISO 230-2 page and compensation tables print."""
+    machine = asker.text("Machine, as the report names it; empty: not stated", "")
+    if machine:
+        yield from ("", "[report]", f"machine = {_quoted(machine)}")
+    else:
+        yield from (
+            "",
+            "# [report]                               # conditions of the test, printed with the ISO 230-2 values",
+        )
+        yield '# machine = "name of the machine"'
+    yield '# machine_compensation = "none"           # what was active during the test'
 
 
 def _drivers(content: FolderContent) -> Iterator[str]:

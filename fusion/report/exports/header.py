@@ -22,8 +22,9 @@ class Origin:
 
     Attributes
     ----------
-    campaign, machine, axis : str
-        As the campaign file states them; empty where it does not.
+    campaign, machine, axis, active : str
+        As the campaign file states them, machine with its serial number, `active` the compensation during the test; empty where it does
+        not.
     verdict : str
         Verdict of the closed loop; empty where there was none.
     state : ThermalState
@@ -35,6 +36,7 @@ class Origin:
     campaign: str
     machine: str
     axis: str
+    active: str
     verdict: str
     state: ThermalState
     results_sha256: str
@@ -53,9 +55,12 @@ def read_origin(folder: Path, results: Results, state: ThermalState) -> Origin:
         When and how warm.
     """
     stated = _parameters(folder / "provenance.json")
+    report = stated.get("report", {})
+    serial = report.get("machine_serial_number")
     return Origin(
         campaign=results.campaign,
-        machine=str(stated.get("report", {}).get("machine") or ""),
+        machine=", serial number ".join(str(part) for part in (report.get("machine"), serial) if part),
+        active=str(report.get("machine_compensation") or ""),
         axis=str(stated.get("campaign", {}).get("axis") or ""),
         verdict=results.loop.verdict if results.loop is not None else "",
         state=state,
@@ -109,6 +114,7 @@ def header_lines(
         *content,
         f"sign: {sign}",
         *remarks,
+        f"compensation that was active during the test: {origin.active or _NOT_STATED}",
         "Not on top of an active table: what was measured is what the table that was active during the test left.",
         "How to try it: switch the compensation on with one value of 0.010 mm and check with the laser in which direction the axis "
         "moves; then load the table, repeat the measurement of both approaches in the thermal state above, and compare.",

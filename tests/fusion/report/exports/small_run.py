@@ -57,7 +57,9 @@ def write_run(folder: Path, deviations: xr.Dataset, *, axis: str = "X", **change
     write_dataset(folder / "fusion.nc", fused)
     title = "=1+1 \n; M30 axis µ"
     write_json(folder / "results.json", assemble(title, parts, [Notice("a", "b", "")]).as_json())
-    provenance = {"parameters": {"campaign": {"axis": axis}, "report": {"machine": "Mill 5"}}}
+    provenance = {
+        "parameters": {"campaign": {"axis": axis}, "report": {"machine": "Mill 5", "machine_serial_number": "77"}}
+    }
     (folder / "provenance.json").write_text(json.dumps(provenance), encoding="utf-8")
     return folder
 

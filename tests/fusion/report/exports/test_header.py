@@ -31,7 +31,7 @@ def test_the_header_names_source_state_and_trial(small_run) -> None:
     digest = hashlib.sha256((small_run / "results.json").read_bytes()).hexdigest()
     assert lines[-1] == f"source: results.json, SHA-256 {digest}"
     assert {
-        "machine: Mill 5",
+        "machine: Mill 5, serial number 77",
         "axis: X",
         "verdict on the drift: explained",
         "exported: 2026-11-22 09:30 UTC",
@@ -54,4 +54,8 @@ def test_what_is_not_stated_is_said(small_run, tmp_path) -> None:
     for name in ("deviations.nc", "results.json"):
         (tmp_path / name).write_bytes((small_run / name).read_bytes())
     lines = lines_of(tmp_path, axis="")
-    assert {"machine: not stated", "axis: not stated"} <= set(lines)
+    assert {
+        "machine: not stated",
+        "axis: not stated",
+        "compensation that was active during the test: not stated",
+    } <= set(lines)
