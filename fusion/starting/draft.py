@@ -7,12 +7,13 @@ import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from fusion.campaign.time_zones import lacks_zone
 from fusion.errors import FusionError
 from fusion.products.store import write_text
 from fusion.starting.folder import FolderContent, scan_folder
 from fusion.starting.kinds import Kind, Recognised, column_unit, is_displacement, is_temperature, is_time
 from fusion.starting.questions import TO_FILL, Asker
+from interferometry.errors import InterferometryError
+from interferometry.io.dates import NO_ZONE
 from interferometry.io.readers import read_deviations
 from thermography.registration.plan import Fiducial, read_fiducials
 
@@ -89,12 +90,7 @@ def draft_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
     yield f"title = {_quoted(asker.text('Title of the report', content.folder.name or 'Campaign'))}"
     if content.frames or readings:
         yield f"axis = {_quoted(asker.text('Axis that was measured', 'X'))}"
-    zone = asker.text("Time zone of times without one, an IANA name such as Europe/Vienna; empty: none needed", "")
-    yield (
-        f"time_zone = {_quoted(zone)}"
-        if zone
-        else '# time_zone = "Europe/Vienna"   # of times that the files give without a zone'
-    )
+    yield from _time_zone(readings, asker)
     if content.frames:
         yield from _thermography(content, asker)
         yield from _plan(content, asker, along_axis=bool(readings))
@@ -112,7 +108,7 @@ def draft_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
 
 def _time_zone(readings: Sequence[Recognised], asker: Asker) -> Iterator[str]:
     """Yield the zone of times that the readings give without one."""
-    without = [one.path.name for one in readings if lacks_zone(read_deviations(one.path))]
+    without = [one.path.name for one in readings if _times(one.path).get("reference") == NO_ZONE]
     if not without:
         yield '# time_zone = "Europe/Vienna"            # only where files give times without their zone'
         return
@@ -186,10 +182,17 @@ def _interferometry(content: FolderContent, asker: Asker) -> Iterator[str]:
     )
     yield f"expansion_coefficient = {coefficient}"
     yield f"dead_path = {asker.quantity('Dead path of the laser', 'mm', '0 mm')}"
-    times = read_deviations(content.folder / chosen)["time"].attrs.get("origin")
-    if times == "reconstructed":
+    if _times(content.folder / chosen).get("origin") == "reconstructed":
         yield '# feed = "300 mm/min"                     # with dwell: places the readings of this file more closely in time'
         yield '# dwell = "2 s"'
+
+
+def _times(path: Path) -> dict[str, str]:
+    """Return what is known of the times of a file of deviations; nothing where it cannot be read, which the check says."""
+    try:
+        return {str(name): str(value) for name, value in read_deviations(path)["time"].attrs.items()}
+    except InterferometryError:
+        return {}
 
 
 def _report(asker: Asker) -> Iterator[str]:

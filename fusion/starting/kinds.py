@@ -45,7 +45,6 @@ class Kind(StrEnum):
     ENVIRONMENT = "environment log"
     FIDUCIALS = "fiducials"
     REGIONS = "regions of the plan"
-    PLACES = "places on the plan"
     LENS = "lens calibration"
     DRIVERS = "log of drivers"
     RECORD = "record of temperatures and displacements"

@@ -54,6 +54,40 @@ def test_an_existing_file_is_never_replaced(copied: Path) -> None:
     assert (copied / "campaign.toml").read_text() == before
 
 
+def test_times_without_a_zone_are_asked_for(copied: Path) -> None:
+    (copied / "campaign.toml").unlink()
+    laser = copied / "laser.csv"
+    text = laser.read_text()
+    laser.write_text(text.replace("+00:00", ""))
+    asked: list[str] = []
+
+    def vienna(question: str, default: str) -> str:
+        asked.append(question)
+        return (
+            "Europe/Vienna"
+            if question.startswith("Time zone of the times in laser.csv")
+            else answering(question, default)
+        )
+
+    path, _ = write_campaign(copied, Asker(vienna))
+    assert load_campaign(path).campaign.time_zone == "Europe/Vienna"
+    path.unlink()
+    write_campaign(copied, Asker(None))
+    assert 'time_zone = "UTC"   # taken, as the file gives none: check it' in path.read_text()
+    path.unlink()
+    laser.write_text(text)
+    asked.clear()
+    write_campaign(copied, Asker(vienna))
+    assert not any("zone" in question for question in asked)
+
+
+def test_a_file_of_readings_with_a_fault_is_written_down_and_left_to_the_check(copied: Path) -> None:
+    (copied / "campaign.toml").unlink()
+    (copied / "laser.csv").write_text("cycle,direction,target,position_mm,time,deviation_um\nx,y,z,a,b,c\n")
+    path, _ = write_campaign(copied, Asker(answering))
+    assert any("laser.csv" in fault for fault in check_campaign(path).faults)
+
+
 def test_a_folder_without_measurements_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DraftError, match="neither thermal frames nor deviations nor a record"):
         write_campaign(tmp_path, Asker(None))
