@@ -8,11 +8,13 @@ Source: conjunction of two tests, Nichols et al. (2005), NeuroImage 25, 653 (the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy import stats
 
 from fusion._typing import Array
 from fusion.attribution.attribute import ATTRIBUTABLE, NOT_ATTRIBUTABLE, NOT_SEPARABLE
@@ -86,6 +88,11 @@ class SourceAgreement:
         Whether both sessions pass there, with one sign and one size.
     separate : bool
         Whether it leads its session, or adds to the leading source; otherwise it may only be collinear with it.
+    power : float or None
+        Of a source that one session alone shows: chance that the other one would have shown it, had it the same sensitivity there.
+    agreed_near_mm : (float, float, float) or None
+        Of a source on which the sessions do not agree: place (x, y) of the nearest one on which they do, and its distance; None where
+        they agree on none.
     """
 
     channel: str
@@ -98,6 +105,8 @@ class SourceAgreement:
     lag_s: tuple[float, float]
     agrees: bool
     separate: bool
+    power: float | None = None
+    agreed_near_mm: tuple[float, float, float] | None = None
 
     @property
     def cause(self) -> bool:
@@ -117,12 +126,15 @@ class SessionComparison:
     channels : list of ChannelAgreement
         Best agreement on every part of the drift that both sessions have.
     sources : list of SourceAgreement
-        Every source that either session shows, once.
+        Every source that either session shows, once, and places on which both agree without one.
+    least_p : (float, float)
+        Smallest p-values that the numbers of simulations of both sessions can show.
     """
 
     maps: xr.Dataset
     channels: list[ChannelAgreement]
     sources: list[SourceAgreement]
+    least_p: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -181,11 +193,18 @@ def compare_sessions(first: xr.DataTree, second: xr.DataTree) -> SessionComparis
         for channel in _shared_channels(first, second)
     }
     separable = any(session.attrs["excitation"] != "warm-up only" for session in (first, second))
+    channels = [_conclude(channel, pair, separable) for channel, pair in pairs.items()]
     return SessionComparison(
         maps=_maps(first.to_dataset(), pairs, separable),
-        channels=[_conclude(channel, pair, separable) for channel, pair in pairs.items()],
-        sources=_list_sources(first, second, pairs),
+        channels=channels,
+        sources=_tell_apart(_list_sources(first, second, pairs), channels, first.to_dataset(), pairs),
+        least_p=(_least_p(first), _least_p(second)),
     )
+
+
+def _least_p(session: xr.DataTree) -> float:
+    """Smallest p-value that the number of simulations of a session can show."""
+    return 1.0 / (int(session.attrs["draws"]) + 1)
 
 
 def _list_sources(first: xr.DataTree, second: xr.DataTree, pairs: dict[str, _Pair]) -> list[SourceAgreement]:
@@ -196,24 +215,97 @@ def _list_sources(first: xr.DataTree, second: xr.DataTree, pairs: dict[str, _Pai
         for channel, x_mm, y_mm, separate in _sources_of(session):
             if channel not in pairs or _listed(sources, channel, x_mm, y_mm):
                 continue
-            pair = pairs[channel]
-            place = int(np.argmin(np.abs(plan["y"].values - y_mm))), int(np.argmin(np.abs(plan["x"].values - x_mm)))
-            agrees = bool(pair.agree[place])
-            sources.append(
-                SourceAgreement(
-                    channel=channel,
-                    x_mm=x_mm,
-                    y_mm=y_mm,
-                    shown_by=(0, 1) if agrees else (number,),
-                    p_value=pair.at("p_value", *place),
-                    sensitivity_um_per_K=pair.at("sensitivity", *place),
-                    sensitivity_u_um_per_K=pair.at("sensitivity_u", *place),
-                    lag_s=pair.at("lag", *place),
-                    agrees=agrees,
-                    separate=separate,
-                )
-            )
+            place = _cell_of(plan, x_mm, y_mm)
+            agrees = bool(pairs[channel].agree[place])
+            shown_by = (0, 1) if agrees else (number,)
+            source = _source_at(pairs[channel], channel, (x_mm, y_mm), place, shown_by, separate)
+            if not agrees:
+                other = (second, first)[number].to_dataset().sel(channel=channel)
+                source = replace(source, power=_power(source.sensitivity_um_per_K[number], other, place))
+            sources.append(source)
     return sources
+
+
+def _cell_of(plan: xr.Dataset, x_mm: float, y_mm: float) -> tuple[int, int]:
+    """Row and column of the cell of a place."""
+    return int(np.argmin(np.abs(plan["y"].values - y_mm))), int(np.argmin(np.abs(plan["x"].values - x_mm)))
+
+
+def _source_at(
+    pair: _Pair,
+    channel: str,
+    place_mm: tuple[float, float],
+    cell: tuple[int, int],
+    shown_by: tuple[int, ...],
+    separate: bool,
+) -> SourceAgreement:
+    """A source with what both sessions show at its cell (row, column)."""
+    return SourceAgreement(
+        channel=channel,
+        x_mm=place_mm[0],
+        y_mm=place_mm[1],
+        shown_by=shown_by,
+        p_value=pair.at("p_value", *cell),
+        sensitivity_um_per_K=pair.at("sensitivity", *cell),
+        sensitivity_u_um_per_K=pair.at("sensitivity_u", *cell),
+        lag_s=pair.at("lag", *cell),
+        agrees=len(shown_by) == 2,
+        separate=separate,
+    )
+
+
+def _power(sensitivity: float, other: xr.Dataset, cell: tuple[int, int]) -> float | None:
+    """Chance that a session detects a sensitivity (um/K) at a cell, from its detection limit there; None where nothing was tested.
+
+    The limit is the sensitivity that is detected with 80 % power: the root of the threshold and the quantile of 0.8, in standard
+    uncertainties.
+    """
+    root, limit = float(np.sqrt(other["threshold"])), float(other["detectable_sensitivity"].values[cell])
+    if not (np.isfinite(limit) and limit > 0):
+        return None
+    u = limit / (root + float(stats.norm.ppf(0.8)))
+    return float(stats.norm.cdf(abs(sensitivity) / u - root))
+
+
+def _tell_apart(
+    sources: list[SourceAgreement], channels: list[ChannelAgreement], plan: xr.Dataset, pairs: dict[str, _Pair]
+) -> list[SourceAgreement]:
+    """The same sources and every place on which the sessions agree beside them; those of one session with the nearest agreed place.
+
+    A place on which both agree, and which is no source of its own in either session, may lie on the halo of one.
+    """
+    agreed = [
+        _source_at(
+            pairs[found.channel],
+            found.channel,
+            (found.x_mm, found.y_mm),
+            _cell_of(plan, found.x_mm, found.y_mm),
+            (0, 1),
+            False,
+        )
+        for found in channels
+        if found.verdict == "attributable" and not _known_place(sources, found)
+    ]
+    every = [*sources, *agreed]
+    return [one if one.agrees else replace(one, agreed_near_mm=_nearest(one, every)) for one in every]
+
+
+def _known_place(sources: Sequence[SourceAgreement], found: ChannelAgreement) -> bool:
+    """Whether the sessions agree on a source at this place, be it in another part of the drift."""
+    return any(
+        source.agrees and np.hypot(source.x_mm - found.x_mm, source.y_mm - found.y_mm) <= _SAME_PLACE_MM
+        for source in sources
+    )
+
+
+def _nearest(one: SourceAgreement, sources: Sequence[SourceAgreement]) -> tuple[float, float, float] | None:
+    """Place and distance of the nearest source of the same part of the drift on which both sessions agree, mm."""
+    near = [
+        (other.x_mm, other.y_mm, float(np.hypot(other.x_mm - one.x_mm, other.y_mm - one.y_mm)))
+        for other in sources
+        if other.agrees and other.channel == one.channel
+    ]
+    return min(near, key=lambda place: place[2], default=None)
 
 
 def _sources_of(session: xr.DataTree) -> list[tuple[str, float, float, bool]]:

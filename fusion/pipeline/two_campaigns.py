@@ -1,18 +1,27 @@
-"""Compare the finished runs of two campaigns of one machine, in joint.json, joint.nc and both reports."""
+"""Compare the finished runs of two campaigns of one machine: joint.json, joint.nc, a page joint.html, and both reports."""
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from fusion.attribution.two_sessions import ChannelAgreement, SourceAgreement, compare_sessions
+from fusion.attribution.two_sessions import compare_sessions
 from fusion.products.results import read_results
 from fusion.products.store import read_dataset, read_tree, write_dataset, write_json, write_text
 from fusion.report.html import render_report
-from fusion.report.wording import CHANNELS, duration, measured, number, p_cell
+from fusion.report.joint_page import (
+    channel_sentence,
+    conclude_sessions,
+    describe_sources,
+    render_joint,
+    session_names,
+    sources_table,
+)
+from fusion.report.wording import CHANNELS
 
 _READERS = {"fields": read_dataset, "deviations": read_dataset, "fusion": read_tree}
 
@@ -25,12 +34,12 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
     folders : sequence of Path
         Results folders of two campaigns of one machine, on the same plan grid.
     out : Path
-        Folder for ``joint.json`` and ``joint.nc``.
+        Folder for ``joint.json``, ``joint.nc`` and ``joint.html``.
 
     Returns
     -------
     list of (str, str)
-        Place and verdict of every source that either session shows, for the terminal.
+        What both say together, place and verdict of every source that either session shows, and where the page is, for the terminal.
 
     Raises
     ------
@@ -41,73 +50,36 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
         {name: read(folder / f"{name}.nc") for name, read in _READERS.items()} for folder in folders
     ]
     comparison = compare_sessions(*(product["fusion"].children["correlation"] for product in products))
-    titles = [read_results(folder).campaign for folder in folders]
+    results = [read_results(folder) for folder in folders]
+    sessions = session_names(results)
+    told = describe_sources(comparison, sessions)
     write_dataset(out / "joint.nc", comparison.maps)
     write_json(
         out / "joint.json",
         {
-            "campaigns": titles,
+            "campaigns": [one.campaign for one in results],
             "sources": [asdict(channel) for channel in comparison.channels],
-            "agreement": [{**asdict(source), "cause": source.cause} for source in comparison.sources],
+            "agreement": [
+                {**asdict(source), "cause": source.cause, "name": words.name, "verdict": words.verdict}
+                for source, words in zip(comparison.sources, told, strict=True)
+            ],
         },
     )
-    table = [source_row(source, titles) for source in comparison.sources]
+    seen_from = [Path(os.path.relpath(folder, out)).as_posix() for folder in folders]
+    write_text(out / "joint.html", render_joint(results, seen_from, comparison))
     joint = {
         "rows": [
-            (CHANNELS.get(channel.channel, channel.channel), _channel_text(channel)) for channel in comparison.channels
+            (CHANNELS.get(channel.channel, channel.channel), channel_sentence(channel))
+            for channel in comparison.channels
         ],
-        "causes": [f"x {source.x_mm:.0f} mm, y {source.y_mm:.0f} mm" for source in comparison.sources if source.cause],
-        "sources": table,
+        "causes": [words.where for source, words in zip(comparison.sources, told, strict=True) if source.cause],
+        "table": sources_table(told, sessions),
     }
-    for folder, product, other in zip(folders, products, reversed(titles), strict=True):
+    for folder, product, other, own in zip(folders, products, reversed(sessions), results, strict=True):
         provenance = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
-        report = render_report(read_results(folder), provenance, product, joint={"other": other, **joint})
-        write_text(folder / "report.html", report)
-    if not table:
-        return [("sources", "neither session shows one")]
-    return [
-        (f"x, y {place} mm, {part}", f"{verdict}; {first}; {second}") for place, part, first, second, verdict in table
-    ]
-
-
-def source_row(source: SourceAgreement, titles: Sequence[str]) -> list[str]:
-    """Return one source as the cells of a row of a table.
-
-    Parameters
-    ----------
-    source : SourceAgreement
-        What both sessions show at its place.
-    titles : sequence of str
-        Titles of the first and the second campaign.
-
-    Returns
-    -------
-    list of str
-        Place (x, y in mm), part of the drift, result of the first and of the second session, and whether the source is a cause.
-    """
-    shown = [
-        f"p {p_cell(p)}, {measured(value, u, 'µm/K')}, lag {duration(lag)}"
-        for p, value, u, lag in zip(
-            source.p_value,
-            source.sensitivity_um_per_K,
-            source.sensitivity_u_um_per_K,
-            source.lag_s,
-            strict=True,
-        )
-    ]
-    if source.cause:
-        verdict = "a cause: both agree"
-    elif source.agrees:
-        verdict = "both agree, but it may only warm with the leading source"
-    else:
-        verdict = f"shown by {titles[source.shown_by[0]]} alone"
-    return [f"{source.x_mm:.0f}, {source.y_mm:.0f}", CHANNELS.get(source.channel, source.channel), *shown, verdict]
-
-
-def _channel_text(channel: ChannelAgreement) -> str:
-    """The agreement on one part of the drift as a sentence."""
-    first, second = (number(value, 2) for value in channel.sensitivity_um_per_K)
-    return (
-        f"{channel.verdict}: {channel.reason}; x {channel.x_mm:.0f} mm, y {channel.y_mm:.0f} mm, larger p of both "
-        f"{p_cell(channel.p_value)}, {first} and {second} µm/K"
-    )
+        write_text(folder / "report.html", render_report(own, provenance, product, joint={"other": other, **joint}))
+    rows = [("together", " ".join(conclude_sessions(comparison, told, sessions)))]
+    for words in told:
+        shown = "; ".join(f"{session}: {text}" for session, text in zip(sessions, words.shown, strict=True))
+        rows.append((f"{words.name} ({words.where})", f"{words.verdict}; {shown}"))
+    return [*rows, ("report", str((out / "joint.html").resolve()))]

@@ -8,7 +8,7 @@ from fusion.diagnosis.causes import CAUSES
 from fusion.products.results_attribution import CorrelationPart
 from fusion.products.results_axis import AnomalyPart, DriftPart, Iso230Part, Iso230Window
 from fusion.products.results_inputs import Figures
-from fusion.products.results_loop import Loop, StepPart
+from fusion.products.results_loop import Loop, RecordLoop, StepPart
 from fusion.products.results_part import AreaPart
 from fusion.report.wording import BASELINES, alike, number, place, quantity
 
@@ -170,7 +170,23 @@ def baseline_errors(loop: Loop) -> str:
     """
     names = dict.fromkeys(("last_value", "mean", loop.best_baseline))
     errors = alike([getattr(loop.baselines, name).rmse_um for name in names])
-    return ", ".join(f"{BASELINES[name]} {error}" for name, error in zip(names, errors, strict=True)) + " µm"
+    words = baseline_words(loop)
+    return ", ".join(f"{words[name]} {error}" for name, error in zip(names, errors, strict=True)) + " µm"
+
+
+def baseline_words(loop: Loop) -> dict[str, str]:
+    """Return plain predictions in words, by their key in ``loop.baselines``: along an axis cycles are repeated, of a record values.
+
+    Parameters
+    ----------
+    loop : Loop
+        The part ``loop`` of the results.
+    """
+    record = isinstance(loop, RecordLoop)
+    return {
+        name: words.replace("cycles before", "time before").replace("cycle", "value") if record else words
+        for name, words in BASELINES.items()
+    }
 
 
 def step_errors(step: StepPart) -> str:

@@ -40,7 +40,7 @@ def render_report(
         have may be absent. A ``record`` (Dataset) stands alone.
     joint : mapping, optional
         What this campaign and another one of the machine agree on: ``other`` (its title), ``causes`` (places in words),
-        ``sources`` (rows of cells: place, part of the drift, first and second session, verdict), ``rows`` (name and text).
+        ``table`` (Table of the places, None without any), ``rows`` (name and text of every part of the drift).
 
     Returns
     -------

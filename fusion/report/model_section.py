@@ -17,14 +17,13 @@ from fusion.products.results_loop import (
     Nothing,
     Nuisance,
     Range,
-    RecordLoop,
     ResidualPart,
     RunnerUp,
     StepPart,
 )
+from fusion.report.findings import baseline_words
 from fusion.report.tables import Row, Table, Words, table
 from fusion.report.wording import (
-    BASELINES,
     alike,
     duration,
     effect_words,
@@ -82,7 +81,7 @@ def errors_table(loop: Loop) -> Table:
         The part ``loop`` of the results.
     """
     named = [("declared model", loop.errors.declared), ("with the added effects", loop.errors.final)]
-    plain = [(words, getattr(loop.baselines, name)) for name, words in _baseline_words(loop).items()]
+    plain = [(words, getattr(loop.baselines, name)) for name, words in baseline_words(loop).items()]
     listed = [*named, *plain]
     errors, lows, highs = (
         alike([getattr(one, name) for _, one in listed]) for name in ("rmse_um", "low_um", "high_um")
@@ -92,14 +91,6 @@ def errors_table(loop: Loop) -> Table:
         for at, ((name, _), error, low, high) in enumerate(zip(listed, errors, lows, highs, strict=True))
     ]
     return table([Words("Prediction of what was held out"), "Error / µm", "95 % interval / µm"], rows)
-
-
-def _baseline_words(loop: Loop) -> dict[str, str]:
-    """Plain predictions in words: of a record values are repeated, along an axis cycles."""
-    return {
-        name: words.replace("cycle", "value") if isinstance(loop, RecordLoop) else words
-        for name, words in BASELINES.items()
-    }
 
 
 def steps_table(loop: Loop) -> Table:

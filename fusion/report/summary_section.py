@@ -185,7 +185,7 @@ def describe_campaign(
         "anomalies": _anomalies(results),
         "correlation": correlation,
         "reconciled": reconcile(results),
-        "joint": None if joint is None else {**joint, "table": _joint_table(joint)},
+        "joint": joint,
         "loop": None if results.loop is None else _describe_loop(results.loop),
         "uncertainty": _uncertainty(results, fields),
         "glossary": _GLOSSARY,
@@ -496,15 +496,6 @@ def _anomalies(results: Results) -> list[dict[str, Any]]:
             }
         )
     return described
-
-
-def _joint_table(joint: Mapping[str, Any]) -> Table | None:
-    """Return the sources that either of two sessions shows; None where neither shows one."""
-    columns = [
-        "x, y / mm",
-        *(Words(title) for title in ("Part of the drift", "First session", "Second session", "Verdict")),
-    ]
-    return table(columns, joint["sources"]) if joint["sources"] else None
 
 
 def _describe_loop(loop: Loop) -> dict[str, Any]:

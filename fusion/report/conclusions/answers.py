@@ -204,8 +204,8 @@ def prediction_sentence(loop: Loop) -> str:
     """
     record = isinstance(loop, RecordLoop)
     last = "value" if record else "cycle"
-    values = (loop.rmse_declared_um, loop.rmse_final_um, loop.rmse_persistence_um, loop.noise_floor_um)
-    declared, final, plain, noise = alike(values)
+    declared, final, plain = alike((loop.rmse_declared_um, loop.rmse_final_um, loop.rmse_persistence_um))
+    noise = number(loop.noise_floor_um, 2)
     scatter = "the noise of a block mean" if record else "the scatter of single readings"
     steps = [step for step in loop.steps if step.rmse_after_um is not None]
     better = "" if loop.rmse_persistence_um is None or not steps else _plain_wins(loop)

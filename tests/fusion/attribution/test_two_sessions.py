@@ -1,7 +1,10 @@
 """Two campaigns of one machine: only what both show is a cause."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import xarray as xr
 
 from fusion.attribution import two_sessions as module
 from fusion.attribution.attribute import correlate
@@ -112,3 +115,24 @@ def test_small_sensitivities_of_opposite_sign_do_not_agree_though_their_sizes_do
         )
     )
     assert not pair.agree[0, 0]
+
+
+def test_the_chance_of_the_other_session_follows_from_its_detection_limit():
+    other = xr.Dataset({"threshold": 9.0, "detectable_sensitivity": (("y", "x"), [[2.0, np.nan]])})
+    assert module._power(2.0, other, (0, 0)) == pytest.approx(0.8)
+    assert module._power(-4.0, other, (0, 0)) > 0.999 > 0.05 > module._power(0.5, other, (0, 0))
+    assert module._power(2.0, other, (0, 1)) is None
+
+
+def test_a_place_on_which_both_agree_is_told_apart_from_its_neighbour():
+    """One session has its mode 75 mm beside the place on which both agree: both places are listed, and the one names the other."""
+    plan = xr.Dataset(coords={"y": np.arange(5.0, 200.0, 10.0), "x": np.arange(5.0, 500.0, 10.0)})
+    pair = SimpleNamespace(at=lambda name, row, column: (row, column))
+    alone = module._source_at(pair, "joint", (405.0, 95.0), (9, 40), (0,), True)
+    agreed = module.ChannelAgreement("joint", "attributable", 330.0, 95.0, 0.004, (4.0, 5.8), (0.0, 0.0), "")
+    first, second = module._tell_apart([alone], [agreed], plan, {"joint": pair})
+    assert (second.x_mm, second.agrees, second.cause, second.shown_by) == (330.0, True, False, (0, 1))
+    assert first.agreed_near_mm == (330.0, 95.0, 75.0) and not first.agrees
+    # A cause at that place already, be it in another part of the drift, is not listed a second time.
+    cause = module._source_at(pair, "common", (345.0, 95.0), (9, 34), (0, 1), True)
+    assert module._tell_apart([cause], [agreed], plan, {"joint": pair}) == [cause]

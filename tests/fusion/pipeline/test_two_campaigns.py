@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from fusion.attribution.two_sessions import SessionComparisonError, SourceAgreement
-from fusion.pipeline.two_campaigns import join_campaigns, source_row
+from fusion.attribution.two_sessions import SessionComparisonError
+from fusion.pipeline.two_campaigns import join_campaigns
 from fusion.products.store import read_dataset, read_tree, write_dataset
 
 
@@ -28,13 +27,16 @@ def test_both_reports_tell_what_the_sessions_agree_on(folders: list[Path], tmp_p
     document = json.loads((tmp_path / "joint.json").read_text())
     assert document["campaigns"] == ["Small campaign", "Second campaign"]
     assert len(document["sources"]) == 4
-    assert len(rows) == max(len(document["agreement"]), 1)
+    assert len(rows) == len(document["agreement"]) + 2
+    assert rows[0][0] == "together" and rows[-1] == ("report", str((tmp_path / "joint.html").resolve()))
+    page = (tmp_path / "joint.html").read_text(encoding="utf-8")
+    assert "A (Small campaign)" in page and "B (Second campaign)" in page and 'href="tuesday/report.html"' in page
     # A session agrees with itself on whatever it shows.
     assert all(one["agrees"] and one["shown_by"] == [0, 1] for one in document["agreement"])
     assert read_dataset(tmp_path / "joint.nc")["p_value"].dims == ("channel", "y", "x")
     first, second = ((folder / "report.html").read_text() for folder in folders)
-    assert "Together with Second campaign" in first
-    assert "Together with Small campaign" in second
+    assert "Together with B (Second campaign)" in first
+    assert "Together with A (Small campaign)" in second
 
 
 def test_other_grids_are_refused(folders: list[Path], tmp_path: Path) -> None:
@@ -45,15 +47,3 @@ def test_other_grids_are_refused(folders: list[Path], tmp_path: Path) -> None:
     write_dataset(folders[1] / "fusion.nc", fusion)
     with pytest.raises(SessionComparisonError, match="the plan grids differ along x"):
         join_campaigns(folders, tmp_path)
-
-
-def test_a_source_of_one_session_names_that_session() -> None:
-    one = SourceAgreement("common", 120.0, 60.0, (1,), (0.4, 0.01), (0.2, 1.0), (0.5, 0.1), (0.0, 600.0), False, True)
-    row = source_row(one, ["Monday", "Tuesday"])
-    assert row[0] == "120, 60"
-    assert row[2] == "p 0.4, 0.2 ± 1.0 µm/K, lag 0 s"
-    assert row[-1] == "shown by Tuesday alone"
-    cause = SourceAgreement("common", 120.0, 60.0, (0, 1), (0.01, 0.01), (1.0, 1.0), (0.1, 0.1), (0.0, 0.0), True, True)
-    assert source_row(cause, ["Monday", "Tuesday"])[-1] == "a cause: both agree"
-    alike = replace(cause, separate=False)
-    assert source_row(alike, ["Monday", "Tuesday"])[-1] == "both agree, but it may only warm with the leading source"
