@@ -216,8 +216,9 @@ def _statistics(matrix: Array, signs: Array, place: Array) -> Array:
 
 
 def _largest(matrix: Array) -> float:
-    """Largest singular value, from the products of its columns: the sites are few, the cycles may be many."""
-    return float(np.sqrt(np.linalg.eigvalsh(matrix.T @ matrix)[-1]))
+    """Largest singular value, from the products of its columns or of its rows, whichever are fewer."""
+    narrow = matrix if matrix.shape[1] <= matrix.shape[0] else matrix.T
+    return float(np.sqrt(np.linalg.eigvalsh(narrow.T @ narrow)[-1]))
 
 
 def _slowness(series: Array) -> float:

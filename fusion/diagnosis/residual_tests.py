@@ -134,11 +134,11 @@ def examine_residual(model: ModelFit, rng: np.random.Generator) -> ResidualTests
 
 
 def _periods_min(seconds: Array) -> Array:
-    """Return the periods that are tested, min, longest first."""
+    """Return the periods that are tested, min, longest first; of a test of some minutes the longest alone."""
     span = float(seconds[-1] - seconds[0]) / 60.0
-    return np.asarray(
-        1.0 / np.arange(_FEWEST_OSCILLATIONS / span, 1.0 / _SHORTEST_MIN, 0.5 / span, dtype=np.float64)[:_MOST_PERIODS]
-    )
+    lowest, step = _FEWEST_OSCILLATIONS / span, 0.5 / span
+    highest = max(1.0 / _SHORTEST_MIN, lowest + 0.5 * step)
+    return np.asarray(1.0 / np.arange(lowest, highest, step, dtype=np.float64)[:_MOST_PERIODS])
 
 
 def _permutations_of(values: Array, rng: np.random.Generator) -> Array:

@@ -230,21 +230,32 @@ def field_notices(errors: Sequence[FieldFault]) -> list[Notice]:
     ]
 
 
-def join_fusion(fused: xr.Dataset, maps: xr.DataTree | None, loop: xr.Dataset | None) -> xr.DataTree:
+def join_fusion(
+    fused: xr.Dataset, modelled: xr.Dataset, maps: xr.DataTree | None, loop: xr.Dataset | None
+) -> xr.DataTree:
     """Everything that joins both recordings, for fusion.nc: readings and loop at the root, the attribution in its own groups.
 
     Parameters
     ----------
-    fused : both recordings on one clock
+    fused : readings with what was seen and logged, on one clock
+    modelled : the same at the targets that take part in attribution and loop
     maps : of the attribution; None where it was not possible
     loop : of the closed loop; None where it was not possible
     """
-    root = fused if loop is None else joined(fused, loop=loop)
+    root = fused if loop is None else joined(fused, loop=_over_all_targets(loop, fused, modelled))
     if maps is None:
         return xr.DataTree(root)
-    correlation = maps.copy()
+    groups = {path: node.to_dataset() for path, node in maps.subtree_with_keys}
+    correlation = xr.DataTree.from_dict({path: _over_all_targets(one, fused, modelled) for path, one in groups.items()})
     correlation.attrs = {name: value for name, value in maps.attrs.items() if name not in store.GLOBAL_ATTRIBUTES}
     return xr.DataTree(root, children={"correlation": correlation})
+
+
+def _over_all_targets(found: xr.Dataset, fused: xr.Dataset, modelled: xr.Dataset) -> xr.Dataset:
+    """What was found at some of the targets, laid out over all of them; NaN at those that did not take part."""
+    if "target" not in found.dims or found.sizes["target"] == fused.sizes["target"]:
+        return found
+    return found.assign_coords(target=modelled["target"].values).reindex(target=fused["target"].values)
 
 
 def loop_variables(fused: xr.Dataset, models: Mapping[str, ModelFit], tests: Mapping[str, ResidualTests]) -> xr.Dataset:

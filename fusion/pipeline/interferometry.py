@@ -104,10 +104,27 @@ def _drift_ranges(drift: xr.Dataset) -> dict[str, list[float]]:
     return {"range_um": ranges.values.tolist(), "range_u_um": u.values.tolist()}
 
 
+def _approach_notices(deviations: xr.Dataset) -> list[Notice]:
+    """Return the notice that a test of one approach has no bidirectional values."""
+    read = deviations["deviation"].notnull().any(("cycle", "target"))
+    sides = [str(name) for name in read["direction"].values[read.values]]
+    if len(sides) == 2:
+        return []
+    return [
+        Notice(
+            "one_approach",
+            f"Positions were approached in the {sides[0]} direction only: unidirectional values are given; reversal error, bidirectional "
+            "values and the drift of the reversal need both.",
+            "Approach every position from both sides.",
+        )
+    ]
+
+
 def _reading_notices(deviations: xr.Dataset, drift: xr.Dataset, zone: str | None) -> list[Notice]:
     """Return notices for missing readings, with what they cost the profile, and for readings that were given little weight."""
-    notices = []
-    gaps = np.isnan(deviations["deviation"].values)
+    notices = _approach_notices(deviations)
+    approached = deviations["deviation"].notnull().any(("cycle", "target")).values
+    gaps = np.isnan(deviations["deviation"].values) & approached[:, None]
     if gaps.any():
         cycles = [str(cycle) for cycle in deviations["cycle"].values[gaps.any(axis=(1, 2))]]
         share = np.sqrt(1.0 - gaps.mean(axis=0))
@@ -115,7 +132,8 @@ def _reading_notices(deviations: xr.Dataset, drift: xr.Dataset, zone: str | None
         notices.append(
             Notice(
                 "readings_missing",
-                f"{counted(int(gaps.sum()), 'reading')} of {gaps.size} missing, in {counted(len(cycles), 'cycle')}: {listed(cycles)}. "
+                f"{counted(int(gaps.sum()), 'reading')} of {gaps[:, approached].size} missing, in {counted(len(cycles), 'cycle')}: "
+                f"{listed(cycles)}. "
                 f"This widens the profile's standard uncertainty by up to {wider:.3f} µm. The joint estimate allows for gaps; conventional "
                 "values use the remaining readings.",
                 remedy="",

@@ -23,7 +23,7 @@ from fusion.pipeline.camera import camera_corrected
 from fusion.pipeline.consistency import check_fields, check_fields_alone, check_loop, check_plan, check_source
 from fusion.pipeline.iso230.sheet import complete_sheet
 from fusion.pipeline.provenance import FileState, describe_run, hash_inputs, input_states, note_changes, versions
-from fusion.pipeline.sizes import lacks_for_correlation, lacks_for_model
+from fusion.pipeline.sizes import choose_targets, lacks_for_correlation, lacks_for_model
 from fusion.products.folder import claim, open_folder
 from fusion.products.progress import Report, silent
 from fusion.products.results import Notice, Outcome, Results, assemble
@@ -201,16 +201,13 @@ def run_campaign(
     campaign = load_campaign(path)
     folder = Path(out)
     seen = input_states(campaign)
-    report("reading and checking", 0, 1)
     if campaign.record is not None:
         record = record_stage.read_source(campaign)
-        report("reading and checking", 1, 1)
         with open_folder(folder, resume=resume):
             return _run_record(_start_run(campaign, folder, seen, report), record)
     source = read_source(campaign)
     checks = check_source(source)
     refuse_contradictions(checks)
-    report("reading and checking", 1, 1)
     with open_folder(folder, resume=resume):
         run = _start_run(campaign, folder, seen, report)
         return _run_instruments(run, source, checks, scheduler=scheduler)
@@ -257,7 +254,8 @@ def _run_both(run: Run, source: Source, *, scheduler: str | None) -> tuple[dict[
     fused, outside = interferometry.align_recordings(source, fields, deviations)
     run.notices.extend(outside)
     too_small = [*lacks_for_model(deviations), *lacks_for_correlation(fields)]
-    run.notices.extend(too_small)
+    modelled, left_out = choose_targets(fused)
+    run.notices.extend(too_small or left_out)
     maps = model = None
     if too_small:
         run.parts["hotspots"] = attribution.describe_hotspots(fields)
@@ -266,11 +264,11 @@ def _run_both(run: Run, source: Source, *, scheduler: str | None) -> tuple[dict[
             "correlation",
             ("plan", "interferometry", "drivers"),
             ("fields", "deviations"),
-            lambda: attribution.correlate_field(source, fields, fused, report=run.report),
+            lambda: attribution.correlate_field(source, fields, modelled, report=run.report),
             read_tree,
         )
-        model = _model(run, source, fields, fused, deviations, after=("fields", "deviations"))
-    fusion = _write_fusion(run, fused, maps, model)
+        model = _model(run, source, fields, modelled, deviations, after=("fields", "deviations"))
+    fusion = _write_fusion(run, fused, modelled, maps, model)
     _write_maps(run, fields)
     checks = [*check_plan(source, run.parts["registration"]), *check_fields(source, fields, fused)]
     checks += [] if model is None else check_loop(run.parts["loop"], source)
@@ -291,9 +289,10 @@ def _run_laser(run: Run, source: LaserInputs) -> tuple[dict[str, Any], list[Chec
     deviations = _evaluate(run, source, after=())
     fused, outside = interferometry.align_with_logs(source, deviations)
     too_small = lacks_for_model(deviations)
-    run.notices.extend([*outside, *too_small])
-    model = None if too_small else _model(run, source, None, fused, deviations, after=("deviations",))
-    fusion = _write_fusion(run, fused, None, model)
+    modelled, left_out = choose_targets(fused)
+    run.notices.extend([*outside, *(too_small or left_out)])
+    model = None if too_small else _model(run, source, None, modelled, deviations, after=("deviations",))
+    fusion = _write_fusion(run, fused, modelled, None, model)
     checks = [] if model is None else check_loop(run.parts["loop"], source)
     return {"deviations": deviations, "fusion": fusion}, checks
 
@@ -332,11 +331,12 @@ def _model(
     after: tuple[str, ...],
 ) -> xr.Dataset:
     """The stage of the model: closed loop, and positions that stand out."""
+    modelled = deviations.sel(target=fused["target"].values)
     return run.stage(
         "model",
         ("plan", "interferometry", "drivers", "model"),
         after,
-        lambda: drift_model.model_drift(source, fields, fused, deviations, report=run.report),
+        lambda: drift_model.model_drift(source, fields, fused, modelled, report=run.report),
         read_dataset,
     )
 
@@ -347,9 +347,11 @@ def _write_maps(run: Run, fields: xr.Dataset) -> None:
     thermal.write_exr(run.folder / "maps", fields, report=run.report)
 
 
-def _write_fusion(run: Run, fused: xr.Dataset, maps: xr.DataTree | None, model: xr.Dataset | None) -> xr.DataTree:
+def _write_fusion(
+    run: Run, fused: xr.Dataset, modelled: xr.Dataset, maps: xr.DataTree | None, model: xr.Dataset | None
+) -> xr.DataTree:
     """Write fusion.nc: the readings on one clock, with what was found beside them."""
-    fusion = run.described(drift_model.join_fusion(fused, maps, model))
+    fusion = run.described(drift_model.join_fusion(fused, modelled, maps, model))
     write_dataset(run.folder / "fusion.nc", fusion)
     return fusion
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import xarray as xr
 
 from fusion.campaign.inputs import counted
@@ -9,6 +10,8 @@ from fusion.products.results import Notice
 
 #: Smallest test whose drift can be modelled and attributed: below, no cycle can be held out and no course be told from chance.
 LEAST_CYCLES, LEAST_TARGETS, LEAST_FRAMES = 12, 3, 12
+#: So many targets take part in the model of the drift at most: they share their drift, and the work grows with the cube of their number.
+MOST_TARGETS = 64
 
 
 def lacks_for_model(deviations: xr.Dataset) -> list[Notice]:
@@ -28,6 +31,36 @@ def lacks_for_model(deviations: xr.Dataset) -> list[Notice]:
             f"{counted(cycles, 'cycle')} at {counted(targets, 'target')}: ISO 230-2, profile, scatter and drift are evaluated; positions "
             f"that stand out, causes of drift and closed loop need at least {LEAST_CYCLES} cycles (better 50) at {LEAST_TARGETS} targets.",
             f"Measure at least {LEAST_CYCLES} cycles, better 50, for the causes of the drift.",
+        )
+    ]
+
+
+def choose_targets(deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
+    """Return the readings that take part in the model of the drift: all, or those at some of very many targets, evenly chosen.
+
+    Parameters
+    ----------
+    deviations : Dataset
+        Keeps ``interferometry.contract.DEVIATIONS``; or readings aligned with what was seen and logged.
+
+    Returns
+    -------
+    Dataset
+        The same, both ends of the axis among them.
+    list of Notice
+        What was left out; empty where nothing was.
+    """
+    count = deviations.sizes["target"]
+    if count <= MOST_TARGETS:
+        return deviations, []
+    order = np.argsort(deviations["position"].values, kind="stable")
+    chosen = np.sort(order[np.round(np.linspace(0, count - 1, MOST_TARGETS)).astype(int)])
+    return deviations.isel(target=chosen), [
+        Notice(
+            "targets_chosen",
+            f"Positions that stand out and the closed loop use {MOST_TARGETS} of the {count} positions, evenly spread with both ends, "
+            "which know the drift as well; ISO 230-2, profile, scatter and drift use all.",
+            "",
         )
     ]
 

@@ -23,16 +23,26 @@ def of_one_kind(paths: Sequence[Path]) -> bool:
     Raises
     ------
     CampaignError
-        If a file cannot be used, or some are records and others campaigns with both instruments.
+        If a file cannot be used, some are records and others campaigns with instruments, or one lacks an instrument.
     """
-    records = {path: load_campaign(path).record is not None for path in paths}
+    campaigns = {path: load_campaign(path) for path in paths}
+    records = {path: campaign.record is not None for path, campaign in campaigns.items()}
     if len(set(records.values())) > 1:
         record = next(path for path, is_record in records.items() if is_record)
         other = next(path for path, is_record in records.items() if not is_record)
         raise CampaignError(
-            f"{record} holds a [record], {other} both instruments; two campaigns of one kind can be compared, run these one by one"
+            f"{record} holds a [record], {other} instruments; two campaigns of one kind can be compared, run these one by one"
         )
-    return all(records.values())
+    if all(records.values()):
+        return True
+    for path, campaign in campaigns.items():
+        if campaign.thermography is None or campaign.interferometry is None:
+            lacking = "[thermography]" if campaign.thermography is None else "[interferometry]"
+            raise CampaignError(
+                f"{path} has no {lacking}; two campaigns are compared by the part of the field that goes with the drift, which takes both "
+                "instruments in both of them: run these one by one"
+            )
+    return False
 
 
 def join_records(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:

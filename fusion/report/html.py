@@ -114,22 +114,29 @@ def _drift_charts(results: Results, deviations: xr.Dataset) -> dict[str, Chart]:
     flagged = {anomaly.target for anomaly in results.anomalies or ()}
     shown = min(flagged, default=int(deviations["target"][min(3, deviations.sizes["target"] - 1)]))
     shifted = evaluate_common_start(deviations)
+    read = deviations["deviation"].notnull().any(("cycle", "target"))
+    sides = [str(side) for side in read["direction"].values[read.values]]
+    windows = group(deviations, "iso")
+    both: dict[str, Chart] = {}
+    if len(sides) == 2:
+        both["reversal"] = drift.plot_reversal(joint, position)
+        # The last window is the whole test.
+        both |= {"windows": readings.plot_windows(windows)} if windows.sizes["window"] > 1 else {}
     return {
-        **{f"deviations_{side}": readings.plot_cycles(deviations, side) for side in ("positive", "negative")},
+        **{f"deviations_{side}": readings.plot_cycles(deviations, side) for side in sides},
         **{
             f"common_start_{side}": readings.plot_cycles(shifted, side, quantity="deviation from a common start")
-            for side in ("positive", "negative")
+            for side in sides
         },
         "deviation_map": drift.plot_deviation_map(deviations),
         "drift_map": drift.plot_drift_map(joint, position),
         "history": readings.plot_history(deviations, joint, shown),
         "drift": drift.plot_drift(joint, deviations),
         "profile": drift.plot_profile(joint, position),
-        "reversal": drift.plot_reversal(joint, position),
         "scatter": neighbours.plot_scatter_comparison(group(deviations, "comparison"), position),
         "mean_differences": neighbours.plot_mean_differences(group(deviations, "neighbours"), position),
         "chart": neighbours.plot_reference_chart(group(deviations, "chart"), position),
-        "windows": readings.plot_windows(group(deviations, "iso")),
+        **both,
         "anomalies": drift.plot_position_scatter(joint, position, flagged),
         **({"iso230": iso230.plot_test(group(deviations, "settled"), position)} if has(deviations, "settled") else {}),
     }

@@ -42,6 +42,8 @@ _OUTLIER_LIMIT = 3.0
 _LARGEST_EXCESS = 1e6
 #: A whitened column is collinear with those before it where they leave less than this share of its squared length unexplained.
 _DEPENDENCE_TOLERANCE = 1e-10
+#: So many fixed effects of single sites take part in the search for the variances of the drift at most.
+_MOST_SITES = 160
 #: The drift is taken as an integrated random walk only if that raises the restricted log-likelihood by this much: where both fit,
 #: the random walk is the safer nuisance, because it extrapolates less.
 _SMOOTH_MARGIN = 2.0
@@ -214,21 +216,21 @@ def _maximise(system: DriftSystem, response: Array, design: Array, start: Array 
     low, high = _LOG_RATIO_LIMITS
     components = system.loadings.shape[1]
     problem = _Problem.of(response, design)
+    searched, few = _for_search(system, problem)
     # Ratios are searched per component in units that make the drift over one hour comparable to one reading's noise.
     unit = np.log10(1.0 / 3600.0 ** (1.0 if system.order == 1 else 3.0)) - 2 * np.log10(
         np.maximum(np.abs(system.loadings).max(axis=0), 1e-12)
     )
 
-    def fitted(log_ratio: Array) -> DriftFit:
-        ratios = 10.0 ** (unit + np.clip(log_ratio, low, high))
-        return _solve(replace(system, ratios=ratios), problem)
+    def ratios(log_ratio: Array) -> Array:
+        return np.asarray(10.0 ** (unit + np.clip(log_ratio, low, high)))
 
     guess = np.zeros(components) if start is None else np.clip(np.log10(np.maximum(start, 1e-300)) - unit, low, high)
     # Steps that would leave the limits go the other way: clipped, they would leave the simplex without volume.
     step = np.where(guess + _FIRST_STEP > high, -_FIRST_STEP, _FIRST_STEP)
     simplex = np.vstack([guess, guess + np.diag(step)])
     optimum = optimize.minimize(
-        lambda log_ratio: -fitted(log_ratio).log_likelihood,
+        lambda log_ratio: -_solve(replace(searched, ratios=ratios(log_ratio)), few).log_likelihood,
         guess,
         method="Nelder-Mead",
         bounds=[_LOG_RATIO_LIMITS] * components,
@@ -239,7 +241,33 @@ def _maximise(system: DriftSystem, response: Array, design: Array, start: Array 
             "maxfev": 120 * components,
         },
     )
-    return fitted(optimum.x)
+    return _solve(replace(system, ratios=ratios(optimum.x)), problem)
+
+
+def _for_search(system: DriftSystem, problem: _Problem) -> tuple[DriftSystem, _Problem]:
+    """Return the readings by which the variances of the drift are searched for: all, or those of some of very many sites.
+
+    A site is told by its own column of the design. The drift is common to all sites, so that an even choice of them knows its variances
+    hardly worse, while the cost of one likelihood grows with the square of their number. The fixed effects are fitted to all readings.
+    """
+    own = (problem.design != 0).mean(axis=0) < 1.0 / _MOST_SITES
+    if own.sum() <= _MOST_SITES:
+        return system, problem
+    site = np.where((problem.design[:, own] != 0).any(axis=1), (problem.design[:, own] != 0).argmax(axis=1), -1)
+    sites = np.unique(site)
+    chosen = sites[np.round(np.linspace(0, sites.size - 1, _MOST_SITES)).astype(int)]
+    rows = np.isin(site, chosen)
+    design = problem.design[rows]
+    design = design[:, (design != 0).any(axis=0)]
+    few = replace(
+        system,
+        seconds=system.seconds[rows],
+        loadings=system.loadings[rows],
+        variance=system.variance[rows],
+        observed=system.observed[rows],
+        process_noise_scale=None if system.process_noise_scale is None else system.process_noise_scale[rows],
+    )
+    return few, _Problem.of(problem.response[rows], design)
 
 
 def settling_noise_scale(seconds: Array, time_s: float, exponent: float) -> Array:
@@ -272,16 +300,18 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
     system, problem = fit.system, _Problem.of(fit.response, fit.design)
     span = float(system.seconds[-1] - system.seconds[0])
     first_s = _SETTLING_SHARE * span
+    searched, few = _for_search(system, problem)
+    constant = fit.log_likelihood if few is problem else _solve(searched, few).log_likelihood
 
     def fitted(log_ratio: Array, time_s: float, exponent: float) -> DriftFit:
-        scale = settling_noise_scale(system.seconds, time_s, exponent)
-        return _solve(replace(system, ratios=10.0**log_ratio, process_noise_scale=scale), problem)
+        scale = settling_noise_scale(searched.seconds, time_s, exponent)
+        return _solve(replace(searched, ratios=10.0**log_ratio, process_noise_scale=scale), few)
 
     def with_same_mean(exponent: float) -> Array:
-        return np.log10(system.ratios / settling_noise_scale(system.seconds, first_s, exponent).mean())
+        return np.log10(system.ratios / settling_noise_scale(searched.seconds, first_s, exponent).mean())
 
     likely = max((1.0, 2.0), key=lambda exponent: fitted(with_same_mean(exponent), first_s, exponent).log_likelihood)
-    if fitted(with_same_mean(likely), first_s, likely).log_likelihood < fit.log_likelihood:
+    if fitted(with_same_mean(likely), first_s, likely).log_likelihood < constant:
         return fit
     components = system.ratios.size
     guess = np.r_[with_same_mean(likely), np.log10(first_s), likely]
@@ -299,10 +329,11 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
         },
     )
     settled = fitted(optimum.x[:components], 10.0 ** optimum.x[-2], optimum.x[-1]).system
-    if -optimum.fun < fit.log_likelihood + _SETTLING_MARGIN:
+    if -optimum.fun < constant + _SETTLING_MARGIN:
         return fit
     start_scale = float(np.exp(np.log(settled.ratios / system.ratios).mean()))
-    scale = np.maximum(1.0, start_scale * settled.step_scales)
+    settling = settling_noise_scale(system.seconds, 10.0 ** optimum.x[-2], optimum.x[-1])
+    scale = np.maximum(1.0, start_scale * settling)
     return _solve(replace(system, process_noise_scale=scale), problem)
 
 

@@ -73,7 +73,7 @@ def plot_thermal_map(
     Parameters
     ----------
     fields : Dataset
-        Content of fields.nc.
+        Content of fields.nc; without a laser it places no targets.
     hotspots : sequence of HotspotPart
         Places that are ringed and numbered.
     position : (target,) DataArray, optional
@@ -109,8 +109,7 @@ def plot_thermal_map(
     drawn.select_one(HoverTool).name = "reading"
     add_colour_bar(drawn, mapper, f"{first.words} / {first.unit}")
     drawn.below[-1].name = "bar"
-    # Without readings there are no targets on the plan.
-    if "target" in fields:
+    if "target_x" in fields:
         _draw_line(drawn, fields, position)
     _draw_hotspots(drawn, hotspots)
     flat = {name: values.reshape(len(values), -1) for name, values in steps.items()}

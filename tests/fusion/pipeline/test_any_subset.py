@@ -158,3 +158,55 @@ def test_five_cycles_give_all_but_causes_and_say_what_those_need(ordinary_test: 
     assert {"fields", "drift", "iso230"} <= set(sections(out))
     assert not {"anomalies", "correlation", "loop"} & set(sections(out))
     assert "mean_rise" in read_tree(out / "fusion.nc").to_dataset()
+
+
+def write_laser(folder: Path, cycles: int, targets: int, directions: tuple[str, ...]) -> Path:
+    """A campaign of the laser alone, made by hand: a profile, a drift that grows along the axis, noise of 0.25 um."""
+    rng = np.random.default_rng(1)
+    profile, seconds, rows = rng.normal(0.0, 0.6, targets), 0.0, []
+    for cycle in range(1, cycles + 1):
+        for direction in directions:
+            order = range(targets) if direction == "positive" else range(targets - 1, -1, -1)
+            for k in order:
+                seconds += 4.0
+                share = k / (targets - 1)
+                value = profile[k] + (2.0 + 6.0 * share) * (1.0 - np.exp(-seconds / 5400.0)) + rng.normal(0.0, 0.25)
+                time = np.datetime64("2026-03-09T06:30:00.000") + np.timedelta64(round(1000 * seconds), "ms")
+                rows.append(f"{cycle},{direction},{k + 1},{20.0 * k:.1f},{time}Z,{value:.3f}")
+            seconds += 20.0
+    folder.mkdir()
+    heading = "cycle,direction,target,position_mm,time,deviation_um"
+    (folder / "laser.csv").write_text("\n".join([heading, *rows]) + "\n", encoding="utf-8")
+    path = folder / "campaign.toml"
+    path.write_text('[campaign]\ntitle = "Size"\n\n[interferometry]\ndeviations = "laser.csv"\n', encoding="utf-8")
+    return path
+
+
+BOTH = ("positive", "negative")
+
+
+@pytest.mark.parametrize(
+    ("cycles", "targets", "directions"),
+    [(2, 2, BOTH), (5, 11, BOTH), (5, 11, ("negative",)), (12, 3, BOTH), (12, 3, ("positive",))],
+)
+def test_a_test_of_any_size_ends_with_what_it_can_carry(
+    tmp_path: Path, cycles: int, targets: int, directions: tuple[str, ...]
+) -> None:
+    out = tmp_path / "results"
+    results = run_campaign(write_laser(tmp_path / "campaign", cycles, targets, directions), out)
+    assert results.drift is not None and results.neighbours is not None and results.iso230 is not None
+    assert (results.iso230.A_um.value is not None) == (directions == BOTH)
+    assert (results.loop is not None) == (results.anomalies is not None) == (cycles >= 12)
+    codes = [warning.code for warning in results.warnings]
+    assert ("one_approach" in codes) == (directions != BOTH)
+    assert ("too_small_for_model" in codes) == (cycles < 12)
+    assert "readings_missing" not in codes
+    assert {"drift", "iso230"} <= set(sections(out)) and ("loop" in sections(out)) == (cycles >= 12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("cycles", "targets"), [(12, 400), (2000, 5)])
+def test_a_very_large_test_ends(tmp_path: Path, cycles: int, targets: int) -> None:
+    results = run_campaign(write_laser(tmp_path / "campaign", cycles, targets, BOTH), tmp_path / "results")
+    assert results.loop is not None and results.drift is not None
+    assert len(results.drift.profile_um["positive"]) == targets

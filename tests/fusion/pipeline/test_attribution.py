@@ -82,7 +82,7 @@ def test_the_switched_load_gets_its_own_verdict(outcome) -> None:
 
 def test_the_report_says_it_in_words(outcome) -> None:
     maps, parts, fused = outcome
-    whole = join_fusion(fused, maps, xr.Dataset())
+    whole = join_fusion(fused, fused, maps, xr.Dataset())
     xr.testing.assert_equal(whole["correlation/duty"].to_dataset(inherit=False), maps["duty"].to_dataset(inherit=False))
     assert whole["correlation"].attrs["verdict"] == maps.attrs["verdict"]
     said = describe_correlation(whole, assemble("x", parts, []).correlation, None)

@@ -263,7 +263,7 @@ def test_a_model_without_effects_has_no_contribution():
 def test_the_loop_stands_beside_the_readings_and_the_attribution_in_a_group():
     fused = xr.Dataset({"deviation": ("cycle", [0.0, 1.0])}, attrs={"axis": "X"})
     maps = xr.DataTree(xr.Dataset({"map": ("x", [1.0])}, attrs={"Conventions": "CF-1.13", "lag": "30 s"}))
-    tree = join_fusion(fused, maps, xr.Dataset({"residual": ("cycle", [2.0, 3.0])}))
+    tree = join_fusion(fused, fused, maps, xr.Dataset({"residual": ("cycle", [2.0, 3.0])}))
     assert set(tree.to_dataset().data_vars) == {"deviation", "loop_residual"}
     # What every product says of itself is said once, at the root.
     assert tree["correlation"].attrs == {"lag": "30 s"} and "map" in tree["correlation"]

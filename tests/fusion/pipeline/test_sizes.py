@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from fusion.pipeline.sizes import lacks_for_correlation, lacks_for_model
+from fusion.pipeline.sizes import MOST_TARGETS, choose_targets, lacks_for_correlation, lacks_for_model
 
 
 def deviations(cycles: int, targets: int) -> xr.Dataset:
@@ -29,3 +29,14 @@ def test_a_dozen_frames_can_be_held_against_the_drift() -> None:
     few, enough = (xr.Dataset(coords={"time": np.arange(count)}) for count in (11, 12))
     assert lacks_for_correlation(few)[0].message.startswith("11 frames: fields and hotspots are evaluated")
     assert lacks_for_correlation(enough) == []
+
+
+def test_very_many_targets_are_thinned_evenly_and_keep_both_ends() -> None:
+    few = deviations(12, MOST_TARGETS).assign(position=("target", np.arange(MOST_TARGETS)))
+    assert choose_targets(few) == (few, [])
+    many = deviations(12, 400).assign(position=("target", np.arange(400.0)[::-1]))
+    chosen, (notice,) = choose_targets(many)
+    assert chosen.sizes["target"] == MOST_TARGETS
+    assert chosen["position"].values.max() == 399.0 and chosen["position"].values.min() == 0.0
+    assert np.abs(np.diff(chosen["position"].values)).max() <= 7.0
+    assert "64 of the 400 positions" in notice.message

@@ -11,6 +11,7 @@ import pytest
 from fusion.campaign.config import CampaignError
 from fusion.pipeline import two_records
 from fusion.pipeline.run import run_campaign
+from tests.fusion.campaign_parts import without
 
 CAMPAIGN = """\
 [campaign]
@@ -56,5 +57,18 @@ def test_a_record_beside_both_instruments_is_refused(tmp_path: Path, monkeypatch
             self.record = path.stem if path.stem == "record" else None
 
     monkeypatch.setattr(two_records, "load_campaign", Loaded)
-    with pytest.raises(CampaignError, match=r"record\.toml holds a \[record\], axis\.toml both instruments"):
+    with pytest.raises(CampaignError, match=r"record\.toml holds a \[record\], axis\.toml instruments"):
         two_records.of_one_kind([Path("axis.toml"), Path("record.toml")])
+
+
+def test_two_campaigns_without_both_instruments_are_refused_before_any_is_run(copied: Path) -> None:
+    whole = copied / "campaign.toml"
+    laser = without(whole, "thermography", "plan", "model", name="laser.toml")
+    camera = without(whole, "interferometry", "model", name="camera.toml")
+    assert two_records.of_one_kind([whole, whole]) is False
+    with pytest.raises(
+        CampaignError, match=r"laser\.toml has no \[thermography\]; two campaigns are compared by the part"
+    ):
+        two_records.of_one_kind([whole, laser])
+    with pytest.raises(CampaignError, match=r"camera\.toml has no \[interferometry\]"):
+        two_records.of_one_kind([camera, whole])

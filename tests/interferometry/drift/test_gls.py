@@ -188,3 +188,15 @@ def test_a_drift_that_settles_has_larger_process_noise_at_the_start_only(rng):
     assert settling_noise_scale(seconds, 600.0, 2.0)[15] == pytest.approx(0.25)
     wandering = np.cumsum(rng.normal(0, 0.1, 600)) + rng.normal(0, 0.4, 600)
     assert (estimate(seconds, loadings, wandering, columns, settling=True).system.step_scales == 1.0).all()
+
+
+def test_an_even_choice_of_very_many_sites_knows_the_variances_of_the_drift(rng, monkeypatch):
+    seconds, loadings, y, design = simulated_test(rng)[:4]
+    every = estimate(seconds, loadings, y, design, order=1, settling=True)
+    monkeypatch.setattr("interferometry.drift.gls._MOST_SITES", 12)
+    some = estimate(seconds, loadings, y, design, order=1, settling=True)
+    # 12 of the 16 sites: the variances differ by their own uncertainty, the profile by a small share of its own.
+    assert not np.array_equal(some.system.ratios, every.system.ratios)
+    np.testing.assert_allclose(np.sqrt(some.system.ratios / every.system.ratios), 1.0, atol=0.5)
+    assert np.abs(some.coefficients - every.coefficients).max() < 0.2 * every.coefficients_u.min()
+    assert some.sigma == pytest.approx(every.sigma, rel=0.03)
