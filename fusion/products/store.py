@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import shutil
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -92,8 +93,14 @@ def write_dataset(path: Path, product: xr.Dataset | xr.DataTree) -> Path:
         Product.
     product : Dataset or DataTree
         Described with `annotate`.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be written to, or its disk has not the room that the product may take.
     """
     tree = xr.DataTree(product) if isinstance(product, xr.Dataset) else product
+    _require_room(path, sum(node.to_dataset().nbytes for node in tree.subtree))
 
     def write_groups(temporary: Path) -> None:
         for node in tree.subtree:
@@ -105,6 +112,20 @@ def write_dataset(path: Path, product: xr.Dataset | xr.DataTree) -> Path:
             )
 
     return write_atomically(path, write_groups)
+
+
+def _require_room(path: Path, most_bytes: int) -> None:
+    """Refuse to write where a disk is almost full: HDF5 ends the process when it cannot close a file for want of room.
+
+    `most_bytes` is what the values take without compression; the file's own tables are less than a tenth and a megabyte more.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    needed, free = int(1.1 * most_bytes) + 1_000_000, shutil.disk_usage(path.parent).free
+    if free < needed:
+        raise OutputError(
+            f"{path}: may take {needed / 1e6:.0f} MB, and the disk has {free / 1e6:.0f} MB left; what was written before is whole: make "
+            "room and start again, a run with --resume, or name another folder with --out"
+        )
 
 
 def _with_own_coordinates(node: xr.DataTree) -> xr.Dataset:

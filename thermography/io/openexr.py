@@ -37,7 +37,7 @@ def write_maps(path: str | os.PathLike[str], maps: Mapping[str, NDArray[np.float
     Raises
     ------
     ExrError
-        Where there is no map, the shapes differ, a value exceeds float32, or the file does not read back bit for bit.
+        Where there is no map, the shapes differ, a value exceeds float32, the file cannot be written, or does not read back bit for bit.
     """
     path = Path(path)
     parts = {name: _as_float32(path, name, values) for name, values in maps.items()}
@@ -50,7 +50,10 @@ def write_maps(path: str | os.PathLike[str], maps: Mapping[str, NDArray[np.float
 
     def write_parts(temporary: Path) -> None:
         # The library takes no Path, and silently writes wrong values for arrays that are not contiguous (openexr issue 1929).
-        OpenEXR.File([_part(name, values) for name, values in parts.items()]).write(str(temporary))
+        try:
+            OpenEXR.File([_part(name, values) for name, values in parts.items()]).write(str(temporary))
+        except RuntimeError as error:
+            raise ExrError(f"{path}: cannot be written ({error}); make room, or name another folder") from error
         stored = read_maps(temporary)
         for name, values in parts.items():
             if name not in stored or stored[name].tobytes() != values.tobytes():

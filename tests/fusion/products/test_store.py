@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -60,6 +61,20 @@ def test_a_full_disk_is_told_with_the_remedy(tmp_path: Path) -> None:
         "and start again, a run with --resume, or name another folder with --out"
     )
     assert json.loads(path.read_text()) == {"run": 1}
+
+
+def test_a_dataset_is_not_begun_where_the_disk_has_no_room_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = xr.Dataset({"rise": ("x", np.zeros(1_000_000))})
+    for free, refused in ((9_700_000, True), (9_900_000, False)):
+        monkeypatch.setattr("shutil.disk_usage", lambda path, free=free: SimpleNamespace(free=free))
+        if refused:
+            with pytest.raises(OutputError, match=r"x\.nc: may take 10 MB, and the disk has 10 MB left"):
+                write_dataset(tmp_path / "x.nc", dataset)
+            assert list(tmp_path.iterdir()) == []
+        else:
+            assert write_dataset(tmp_path / "x.nc", dataset).exists()
 
 
 def test_datasets_come_back_equal(tmp_path: Path, rng: np.random.Generator) -> None:

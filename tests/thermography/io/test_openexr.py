@@ -1,5 +1,7 @@
 """OpenEXR maps: bit-exact, and written as a whole or not at all."""
 
+from pathlib import Path
+
 import numpy as np
 import OpenEXR
 import pytest
@@ -57,3 +59,17 @@ def test_a_file_that_does_not_read_back_is_not_left_behind(tmp_path, monkeypatch
     with pytest.raises(ExrError, match="a does not read back as it was written"):
         write_maps(tmp_path / "x.exr", {"a": np.ones((2, 2))})
     assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full:
+        def __init__(self, parts: object) -> None:
+            pass
+
+        def write(self, path: str) -> None:
+            raise RuntimeError("No space left on device.")
+
+    monkeypatch.setattr("OpenEXR.File", Full)
+    with pytest.raises(ExrError, match=r"cycle_0001\.exr: cannot be written \(No space left on device\.\); make room"):
+        write_maps(tmp_path / "cycle_0001.exr", {"rise": np.zeros((2, 3))})
+    assert list(tmp_path.iterdir()) == []
