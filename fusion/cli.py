@@ -1,4 +1,4 @@
-"""The command line: run, simulate, inspect, iso230, schema, export, plan. How it ends is in `fusion.endings`."""
+"""The command line: run, simulate, inspect, iso230, schema, export, report, plan. How it ends is in `fusion.endings`."""
 
 from __future__ import annotations
 
@@ -360,6 +360,36 @@ def export(
             errors.print(f"thermofuse: {remark}", highlight=False, markup=False)
         for path in exported.files:
             console.print(str(path), soft_wrap=True, highlight=False)
+
+
+@app.command()
+def report(
+    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Results folder of a run.")],
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Print it to PDF with an installed Chrome, Chromium or Edge.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="File to write; left out: report.html or report.pdf in RESULTS.")
+    ] = None,
+    full: Annotated[
+        bool, typer.Option("--full", help="With --pdf: also the parts that are folded on the screen.")
+    ] = False,
+    browser: Annotated[
+        str | None, typer.Option(help="With --pdf: the browser that prints; left out: one is looked for.")
+    ] = None,
+) -> None:
+    """Make the report of a finished run anew, or print it to PDF."""
+    from fusion.products.store import write_text
+    from fusion.report.html import report_of
+    from fusion.report.pdf import print_pdf
+
+    with _answering():
+        page = report_of(results)
+        if pdf:
+            written = print_pdf(page, out or results / "report.pdf", browser=browser, full=full)
+        else:
+            written = write_text(out or results / "report.html", page)
+        console.print(str(written), soft_wrap=True, highlight=False)
 
 
 @app.command()

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import xarray as xr
 
 from fusion.attribution.family_wise import LEVEL
+from fusion.errors import FusionError
 from fusion.products.grouped import group, has
-from fusion.products.results import Results
+from fusion.products.results import RecordLoop, Results, read_results
+from fusion.products.store import read_dataset, read_tree
 from fusion.report import record_section, summary_section
 from fusion.report.attribution_section import leading_region
 from fusion.report.charts import attribution, drift, iso230, neighbours, plan, prediction, readings, timeline
@@ -18,6 +22,16 @@ from fusion.report.charts.style import Chart
 from fusion.report.charts.thermal_map import plot_thermal_map
 from fusion.report.page import render_page
 from interferometry.figures import evaluate_common_start, hours_since_start
+
+_READERS: Mapping[str, Callable[[Path], Any]] = {
+    "fields": read_dataset,
+    "deviations": read_dataset,
+    "fusion": read_tree,
+}
+
+
+class ProductsError(FusionError):
+    """A folder that does not hold the products of a finished run."""
 
 
 def render_report(
@@ -83,6 +97,35 @@ def render_report(
         summary=summary_section.describe_campaign(results, provenance, datasets, joint),
         thermal_map=thermal_map,
     )
+
+
+def report_of(folder: Path) -> str:
+    """Return the report of a finished run, made anew from its products.
+
+    Parameters
+    ----------
+    folder : Path
+        Results folder.
+
+    Returns
+    -------
+    str
+        See `render_report`.
+
+    Raises
+    ------
+    ResultsError, ProductsError
+        If the folder does not hold the products of a finished run.
+    """
+    results = read_results(folder)
+    origin = folder / "provenance.json"
+    if not origin.is_file():
+        raise ProductsError(f"{origin} is missing; run the campaign again, with --resume to keep what is finished")
+    provenance = json.loads(origin.read_text(encoding="utf-8"))
+    there = {name: folder / f"{name}.nc" for name in _READERS if (folder / f"{name}.nc").is_file()}
+    if isinstance(results.loop, RecordLoop):
+        return render_report(results, provenance, {"record": read_dataset(there["fusion"])})
+    return render_report(results, provenance, {name: _READERS[name](path) for name, path in there.items()})
 
 
 def _draw_charts(results: Results, datasets: Mapping[str, Any]) -> dict[str, Chart]:

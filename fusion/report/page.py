@@ -7,6 +7,7 @@ from importlib import resources
 from typing import Any
 
 import jinja2
+from markupsafe import Markup
 
 from fusion.report.charts.embedding import chart_scripts, embed
 from fusion.report.charts.style import Chart
@@ -34,7 +35,14 @@ def render_page(template: str, charts: Mapping[str, Chart], **context: Any) -> s
     environment = jinja2.Environment(
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    environment.filters["number"] = number
+    environment.filters |= {"number": number, "css_string": _css_string}
     return environment.get_template(template).render(
         figures=embed(charts), chart_scripts=chart_scripts() if charts else "", **context
+    )
+
+
+def _css_string(text: str) -> Markup:
+    """Return a text as a string of CSS that can neither end the string nor the style element."""
+    return Markup(
+        '"' + "".join(sign if sign.isalnum() or sign in " ,.-" else f"\\{ord(sign):x} " for sign in text) + '"'
     )

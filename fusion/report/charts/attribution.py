@@ -22,7 +22,7 @@ from fusion.report.charts.style import (
     span_words,
 )
 from fusion.report.wording import CHANNELS, duration, number, p_cell, p_words
-from interferometry.figures import ARROWS, COLOURS, INK
+from interferometry.figures import COLOURS, INK
 
 #: Upper ends of the steps in which a p-value is shown, their colours, and their names; above the last one a cell is left blank.
 _P_STEPS = (0.01, 0.05, 0.1)
@@ -54,7 +54,7 @@ def _add_blank(drawn: figure, extent: tuple[float, float, float, float], name: s
     left, right, bottom, top = extent
     drawn.quad(
         left=left, right=right, bottom=bottom, top=top, fill_color="#ffffff", line_color=None, hatch_pattern="right_diagonal_line",
-        hatch_color="#9aa7ad", hatch_scale=7, hatch_weight=0.6, level="underlay", legend_label=name,
+        hatch_color="#9aa7ad", hatch_scale=7, hatch_weight=0.6, level="image", legend_label=name,
     )  # fmt: skip
 
 
@@ -84,7 +84,7 @@ def plot_sensitivity(maps: xr.Dataset, channel: str) -> Chart:
     limit = float(np.nanmax(np.abs(values[passed]))) if passed.any() else 1.0
     mapper = LinearColorMapper(palette(DIVERGING), low=-limit, high=limit, nan_color="rgba(0, 0, 0, 0)")
     drawn = new_plan(extent, title=CHANNELS.get(channel, channel), height=300)
-    _add_blank(drawn, extent, "not significant (family-wise p > 0.05)")
+    _add_blank(drawn, extent, "not significant (p > 0.05)")
     tips = [("sensitivity", "@own{0.00} µm/K"), ("family-wise p", "@p{0.000}")]
     add_cells(drawn, np.where(passed, values, np.nan), extent, mapper, tips, own=values, p=p)
     add_colour_bar(drawn, mapper, "sensitivity / (µm/K)")
@@ -248,7 +248,7 @@ def plot_region_targets(targets: xr.Dataset, region: str, position: xr.DataArray
             if not here.any():
                 continue
             add_series(
-                drawn, place[here] + shift * step, value[here], name=f"{ARROWS[direction]}, {words}", colour=COLOURS[direction],
+                drawn, place[here] + shift * step, value[here], name=f"{direction}, {words}", colour=COLOURS[direction],
                 line=False, marker=MARKERS[direction], half=half[here],
             )  # fmt: skip
             if words == "p > 0.05":

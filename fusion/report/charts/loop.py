@@ -113,9 +113,7 @@ def plot_residual_spectrum(loop: xr.Dataset) -> Chart:
         at = int(np.nanargmax(power.values))
         parts.append(f"{text} {number(float(power[at]), 2)} at {number(float(power['period'][at]), 2)} min")
         highest = max(highest, float(power[at]))
-    drawn.hspan(
-        limit, line_color=MUTED, line_dash="dashed", line_width=1.5, legend_label="strongest of noise alone, 95 %"
-    )
+    drawn.hspan(limit, line_color=MUTED, line_dash="dashed", line_width=1.5, legend_label="95 % limit of noise")
     fix_range(drawn, 0.0, 1.08 * max(highest, limit))
     seen = f"Power of the innovations over period; strongest: {'; '.join(parts)}; noise alone stays below {number(limit, 2)}."
     return Chart(drawn, seen, columns)
@@ -168,7 +166,7 @@ def plot_contributions(loop: xr.Dataset, deviations: xr.Dataset) -> Chart:
     far = int(deviations["target"][int(np.argmax(np.abs(deviations["position"].values)))])
     place = float(deviations["position"].sel(target=far))
     hours = hours_since_start(deviations).sel(target=far, direction="positive").values
-    drawn = new_figure(x=_TIME, y="contribution / µm", title=f"at {place:g} mm, positive approach")
+    drawn = new_figure(x=_TIME, y="contribution / µm", title=f"at {place:g} mm, positive approach", legend_columns=1)
     add_zero_line(drawn)
     columns: dict[str, np.ndarray] = {"cycle": loop["cycle"].values, _TIME: hours}
     parts = []

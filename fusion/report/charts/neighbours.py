@@ -36,7 +36,7 @@ def plot_scatter_comparison(comparison: xr.Dataset, position: xr.DataArray) -> C
     for name, text, dash in (("differenced", "differences", "solid"), ("conventional", "conventional", "dashed")):
         for direction in comparison["direction"].values:
             values = comparison[name].sel(direction=direction).values
-            words, colour, marker = f"{text}, {ARROWS[direction]}", COLOURS[direction], MARKERS[direction]
+            words, colour, marker = f"{text}, {direction}", COLOURS[direction], MARKERS[direction]
             add_series(drawn, place, values, name=words, colour=colour, dash=dash, marker=marker)
             columns[f"s of the {text}, {ARROWS[direction]} / µm"] = values
     seen = (
@@ -106,7 +106,7 @@ def plot_reference_chart(chart: xr.Dataset, position: xr.DataArray) -> Chart:
         add_series(drawn, place, value, name=name, colour=colour, marker=MARKERS[direction])
         for sign in (-1, 1):
             drawn.line(
-                place, value + sign * border, line_color=colour, line_dash="dashed", legend_label=f"±2 s, {name}"
+                place, value + sign * border, line_color=colour, line_dash="dashed", legend_label=f"±2 s, {direction}"
             )
         columns |= {f"deviation, {name} / µm": value, f"border ±, {name} / µm": border}
     seen = f"Deviation from the reference at {place[0]:g} mm: {span_words(chart['chart'], 'µm')} over {place.size} positions."

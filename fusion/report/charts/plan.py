@@ -184,7 +184,7 @@ def plot_rise_history(fields: xr.Dataset) -> Chart:
     shown = np.isfinite(flat).any(axis=1)
     low[shown], high[shown] = np.nanpercentile(flat[shown], [10, 90], axis=1)
     mean[shown], most[shown] = np.nanmean(flat[shown], axis=1), np.nanmax(flat[shown], axis=1)
-    drawn = new_figure(x="time since first cycle / h", y="rise / K", legend_columns=3)
+    drawn = new_figure(x="time since first cycle / h", y="rise / K")
     add_zero_line(drawn)
     add_band(drawn, hours, low, high, ACCENT, legend_label="middle 80 % of the cells")
     add_series(drawn, hours, mean, name="mean of the table", colour=ACCENT)

@@ -85,8 +85,8 @@ def plot_history(deviations: xr.Dataset, drift: xr.Dataset, target: int) -> Char
         half = 2 * drift["drift_u"].sel(chosen).values
         add_band(drawn, x, line - half, line + half, COLOURS[direction])
         name, colour = ARROWS[direction], COLOURS[direction]
-        add_series(drawn, x, line, name=f"profile and drift, {name}", colour=colour)
-        add_series(drawn, x, read, name=f"readings, {name}", colour=colour, line=False, marker=MARKERS[direction])
+        add_series(drawn, x, line, name=f"estimate, {direction}", colour=colour)
+        add_series(drawn, x, read, name=f"readings, {direction}", colour=colour, line=False, marker=MARKERS[direction])
         columns |= {
             f"time, {name} / h": x,
             f"deviation, {name} / µm": read,
@@ -111,14 +111,14 @@ def plot_windows(windows: xr.Dataset) -> Chart:
     Chart
     """
     short, whole = windows.isel(window=slice(None, -1)), windows.isel(window=-1)
-    drawn = new_figure(x="middle cycle of the window", y="A, R, B / µm", legend_columns=3)
+    drawn = new_figure(x="middle cycle of the window", y="A, R, B / µm")
     middle = short["middle_cycle"].values
     columns: dict[str, np.ndarray] = {"middle cycle": middle}
     for shift, (name, colour, text, marker) in enumerate(
         (
             ("A", INK, "accuracy A", "circle"),
             ("R", ACCENT, "repeatability R", "square"),
-            ("B", MUTED, "reversal error B", "diamond"),
+            ("B", MUTED, "reversal B", "diamond"),
         )
     ):
         value, half = short[name].values, 2 * short[f"{name}_u"].values

@@ -103,7 +103,7 @@ def _plot_spans(spans: dict[str, list[tuple[float, float]]]) -> figure:
     names = list(spans)
     every = [end for parts in spans.values() for part in parts for end in part]
     low, high = shared_range(np.array(every))
-    drawn = new_figure(x=_TIME, y="", height=90 + 24 * len(names), y_range=names[::-1], x_range=(low, high))
+    drawn = new_figure(x=_TIME, y="", height=60 + 22 * len(names), y_range=names[::-1], x_range=(low, high))
     for at, name in enumerate(names):
         parts = spans[name]
         source = {"y": [name] * len(parts), "left": [part[0] for part in parts], "right": [part[1] for part in parts]}
@@ -116,7 +116,7 @@ def _plot_series(values: xr.DataArray, hours: np.ndarray, at: int, above: figure
     """Draw one logged quantity below the bars, on the same time axis."""
     unit = print_unit(str(values.attrs.get("units", "1")))
     words = _words(str(values.name))
-    drawn = new_figure(x=_TIME, y=unit or "1", title=words, height=135)
+    drawn = new_figure(x=_TIME, y=unit or "1", title=words, height=118)
     drawn.x_range = above.x_range
     low, high = shared_range(values.values)
     fix_range(drawn, low, high)

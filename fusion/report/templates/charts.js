@@ -23,7 +23,7 @@
   figures.forEach((figure) => near.observe(figure));
   const idle = window.requestIdleCallback || ((work) => setTimeout(work, 50));
   function drawRest() {
-    const next = figures.find((figure) => !started.has(figure));
+    const next = figures.find((figure) => !started.has(figure) && figure.offsetParent);  // not what is folded away
     if (next) draw(next).then(() => idle(drawRest)); else document.documentElement.dataset.charts = "drawn";
   }
   window.addEventListener("load", () => idle(drawRest));
@@ -114,17 +114,43 @@
     menu.addEventListener("change", show);
   }
 
-  window.addEventListener("beforeprint", () => {
-    document.querySelectorAll("details:not(.unprinted)").forEach((part) => { part.open = true; });
+  // Paper: charts in the width that they have on A4, so that their text keeps its size; then each becomes a drawing in SVG.
+  const flatter = 0.74, heights = new Map();
+  const later = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
+  async function toPaper() {
+    document.documentElement.classList.add("paper");
+    for (const figure of figures) if (figure.offsetParent) await draw(figure);
+    for (const view of roots.values()) for (const plot of plots(view)) {
+      heights.set(plot.model, plot.model.height);
+      plot.model.height = Math.round(flatter * plot.model.height);
+    }
+    await later(600);
+    freeze();
+  }
+  function toScreen() {
+    document.documentElement.classList.remove("paper");
+    for (const [model, height] of heights) model.height = height;
+    heights.clear();
+    thaw();
+  }
+  function freeze() {
+    thaw();
     for (const [figure, view] of roots) {
-      const drawing = view.export("svg", false).ctx.get_svg();
-      const [width, height] = [view.bbox.width, view.bbox.height];
+      const { width, height } = view.bbox;
       if (!width) continue;
+      const drawing = view.export("svg", false).ctx.get_svg();
       drawing.setAttribute("viewBox", `0 0 ${width} ${height}`);
       drawing.removeAttribute("width"); drawing.removeAttribute("height");
       drawing.classList.add("printed"); drawing.setAttribute("aria-hidden", "true");
       figure.querySelector(".drawing").after(drawing);
     }
-  });
-  window.addEventListener("afterprint", () => document.querySelectorAll("svg.printed").forEach((drawing) => drawing.remove()));
+  }
+  const thaw = () => document.querySelectorAll("svg.printed").forEach((drawing) => drawing.remove());
+  window.addEventListener("beforeprint", () => { if (!document.documentElement.classList.contains("paper")) freeze(); });
+  window.addEventListener("afterprint", () => { if (!document.documentElement.classList.contains("paper")) thaw(); });
+  window.charts = { toPaper, toScreen };
+  if (location.hash.startsWith("#paper")) {  // opened to be printed by a program; "#paper-full" with every part that folds
+    if (location.hash === "#paper-full") document.querySelectorAll("details").forEach((part) => { part.open = true; });
+    window.addEventListener("load", () => { toPaper().then(() => { document.documentElement.dataset.paper = "ready"; }); });
+  }
 })();

@@ -6,8 +6,11 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 import pytest
+
+from fusion.report.html import ProductsError, report_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = [
@@ -146,6 +149,42 @@ def test_the_map_follows_slider_menu_and_play(opened: tuple[Page, list[str]]) ->
     page.wait_for_function("document.querySelector('#figure-thermal_map output').textContent == '3'")
     figure.get_by_role("button", name="Stop").click()
     assert faults == []
+
+
+def test_tables_have_captions_and_charts_say_what_is_seen(opened: tuple[Page, list[str]]) -> None:
+    page, _ = opened
+    assert (
+        page.evaluate("[...document.querySelectorAll('table')].filter(t => !t.caption && t.closest('.scroll')).length")
+        == 0
+    )
+    said = page.evaluate("[...document.querySelectorAll('.drawing')].map(d => d.getAttribute('aria-label'))")
+    assert len(said) >= 25
+    assert all(len(text) > 30 and text.endswith(".") for text in said), said
+    assert page.locator("a.skip").get_attribute("href") == "#main"
+    page.evaluate("document.getElementById('loop').scrollIntoView()")
+    nav = page.locator("nav.contents").bounding_box()
+    assert nav is not None and nav["y"] == 0  # it stays at hand
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_no_rule_of_accessibility_is_broken(opened: tuple[Page, list[str]], scheme: Literal["light", "dark"]) -> None:
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
+    page, _ = opened
+    page.wait_for_function("document.documentElement.dataset.charts == 'drawn'")
+    page.emulate_media(color_scheme=scheme)
+    page.set_viewport_size({"width": 390, "height": 844})
+    found = axe.Axe().run(page).response["violations"]
+    page.set_viewport_size({"width": 1280, "height": 900})
+    page.emulate_media(color_scheme="light")
+    assert [(fault["id"], [node["target"] for node in fault["nodes"]][:3]) for fault in found] == []
+
+
+def test_it_is_made_anew_from_its_products(report: Path, tmp_path: Path) -> None:
+    page = report_of(report.parent)
+    assert len(page) == pytest.approx(report.stat().st_size, rel=0.02)
+    shutil.copy(report.parent / "results.json", tmp_path / "results.json")
+    with pytest.raises(ProductsError, match=r"provenance\.json is missing; run the campaign again"):
+        report_of(tmp_path)
 
 
 def test_it_prints(opened: tuple[Page, list[str]]) -> None:

@@ -23,7 +23,7 @@ def test_significance_has_four_steps(plan_of_cells: xr.Dataset) -> None:
 def test_sensitivity_is_blank_where_it_is_not_significant(plan_of_cells: xr.Dataset) -> None:
     chart = attribution.plot_sensitivity(plan_of_cells, "common")
     np.testing.assert_allclose(picture(chart), [[0.5, 3.0, np.nan], [np.nan] * 3])
-    assert chart.figure.legend[0].items[0].label.value == "not significant (family-wise p > 0.05)"
+    assert chart.figure.legend[0].items[0].label.value == "not significant (p > 0.05)"
     assert "sensitivity 0.50 to 3.00 µm/K" in chart.seen
     assert chart.columns["sensitivity / (µm/K)"].size == 6
 
