@@ -265,7 +265,7 @@ def iso230(
     cycles: Annotated[
         str | None, typer.Option(help="Window, for example 1-5; left out: the most settled five cycles.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Write the test sheet as a page, for example sheet.html.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the test sheet as a page, sheet.html, or sheet.pdf.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
     as_csv: Annotated[bool, typer.Option("--csv", help="Print the values per target as CSV.")] = False,
 ) -> None:

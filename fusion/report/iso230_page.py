@@ -20,6 +20,7 @@ from fusion.report.charts.readings import plot_windows
 from fusion.report.charts.style import Chart
 from fusion.report.iso230_section import describe_iso230, single_run_table
 from fusion.report.page import render_page
+from fusion.report.pdf import print_pdf
 from fusion.report.tables import Table, print_table
 from fusion.report.wording import print_unit
 
@@ -96,7 +97,7 @@ def write_iso230(path: Path, page: str) -> None:
     Parameters
     ----------
     path : Path
-        A file that does not exist yet.
+        A file that does not exist yet; one that ends with ``.pdf`` is printed by an installed browser.
     page : str
         HTML text.
 
@@ -104,10 +105,15 @@ def write_iso230(path: Path, page: str) -> None:
     ------
     Iso230PageError
         If the file exists.
+    PrintError
+        If it cannot be printed.
     """
     if path.exists():
         raise Iso230PageError(f"{path} exists already; name another file with --out, or remove it")
-    write_text(path, page)
+    if path.suffix.lower() == ".pdf":
+        print_pdf(page, path)
+    else:
+        write_text(path, page)
 
 
 def iso230_tables(part: Iso230Part | None, dataset: xr.Dataset, *, title: str) -> list[rich.table.Table]:
