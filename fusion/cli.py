@@ -303,15 +303,16 @@ def iso230(
 
 @app.command()
 def schema(
-    name: Annotated[str, typer.Argument(metavar="results|campaign", help="Which file to describe.")] = "results",
+    name: Annotated[str, typer.Argument(metavar="results|campaign|recipe", help="Which file to describe.")] = "results",
 ) -> None:
     """Print the JSON Schema of a file."""
     from fusion.campaign.config import campaign_schema
     from fusion.products.results import results_schema
+    from fusion.twin.recipe_file import recipe_schema
 
-    schemas = {"results": results_schema, "campaign": campaign_schema}
+    schemas = {"results": results_schema, "campaign": campaign_schema, "recipe": recipe_schema}
     if name not in schemas:
-        errors.print(f'thermofuse: there is no schema "{name}"; write results or campaign', highlight=False)
+        errors.print(f'thermofuse: there is no schema "{name}"; write results, campaign or recipe', highlight=False)
         raise typer.Exit(ExitCode.BAD_INPUT)
     sys.stdout.write(json.dumps(schemas[name](), indent=1) + "\n")
 

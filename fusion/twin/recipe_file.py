@@ -96,6 +96,45 @@ def check_recipe(recipe: Recipe) -> Recipe:
     return recipe
 
 
+def recipe_schema() -> dict[str, Any]:
+    """Return the JSON Schema of RECIPE.toml; every effect of the library is one alternative with its own parameters.
+
+    Returns
+    -------
+    dict
+        Draft 2020-12; descriptions are those of the classes, with every key and its unit.
+    """
+    schema = _RECIPE.json_schema()
+    general = schema["$defs"]["EffectRecipe"]
+    beside = {key: value for key, value in general["properties"].items() if key not in ("name", "parameters")}
+    schema["$defs"]["EffectRecipe"] = {
+        "title": "EffectRecipe",
+        "description": "One undeclared effect; its own parameters stand beside its name.",
+        "oneOf": [
+            {
+                "type": "object",
+                "title": name,
+                "properties": {"name": {"const": name}, **beside, **_schema_of_parameters(name)},
+                "required": ["name"],
+                "additionalProperties": False,
+            }
+            for name in sorted(EFFECTS)
+        ],
+    }
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "thermofuse recipe"}
+
+
+def _schema_of_parameters(name: str) -> dict[str, dict[str, Any]]:
+    """Return the schema of every parameter of an effect: type, default and choices."""
+    types = {float: "number", int: "integer", str: "string"}
+    entry = EFFECTS[name]
+    return {
+        key: {"type": types[type(default)], "default": default}
+        | ({"enum": list(entry.choices[key])} if key in entry.choices else {})
+        for key, default in entry.parameters.items()
+    }
+
+
 def packaged_recipe(name: str) -> Path:
     """Return the path of a recipe that comes with the package.
 

@@ -97,7 +97,7 @@ def test_schemas_are_valid_and_accept_the_files(results_folder: Path, campaign_f
     result = invoke("schema", "truth")
     assert (result.exit_code, result.stderr) == (
         2,
-        'thermofuse: there is no schema "truth"; write results or campaign\n',
+        'thermofuse: there is no schema "truth"; write results, campaign or recipe\n',
     )
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
+import jsonschema
 import pytest
 
 from fusion.twin.machine.effects import EFFECTS
 from fusion.twin.machine.recipe import AnomalyRecipe, EffectRecipe, Recipe, RecipeError
-from fusion.twin.recipe_file import packaged_recipe, read_recipe
+from fusion.twin.recipe_file import packaged_recipe, read_recipe, recipe_schema
 from fusion.twin.simulate import simulate
 
 ROOT = Path(__file__).parents[3]
@@ -166,3 +168,16 @@ def test_a_recipe_that_is_no_text_is_named(tmp_path: Path) -> None:
     path.write_bytes(b'title = "\xe9"')
     with pytest.raises(RecipeError, match=r"RECIPE\.toml: byte 9 is not UTF-8; save the recipe as UTF-8 text"):
         read_recipe(path)
+
+
+def test_the_schema_accepts_every_recipe_of_the_project_and_refuses_what_the_reader_refuses() -> None:
+    schema = recipe_schema()
+    jsonschema.Draft202012Validator.check_schema(schema)
+    validator = jsonschema.Draft202012Validator(schema)
+    for path in (ROOT / "data" / "demo.toml", *(ROOT / "fusion" / "twin" / "recipes").glob("*.toml")):
+        validator.validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    for name, effect in EFFECTS.items():
+        validator.validate({"effect": [{"name": name, "amplitude_um": 1.0, **effect.parameters}]})
+        assert not validator.is_valid({"effect": [{"name": name, "colour": 1}]})
+    assert not validator.is_valid({"test": {"cycles": -1}})
+    assert not validator.is_valid({"effect": [{"name": "magnetism"}]})
