@@ -23,6 +23,8 @@ app = typer.Typer(
 )
 console = Console()
 errors = Console(stderr=True, soft_wrap=True)
+#: Characters of a line of the ISO 230-2 tables where the output is no terminal.
+_TABLE_WIDTH = 160
 
 
 class ExportFormat(StrEnum):
@@ -291,8 +293,10 @@ def iso230(
         elif as_csv:
             sys.stdout.write(iso230_csv(found.part, found.dataset))
         else:
+            # Twelve columns: a file or a pipe, which has no width of its own, gets them on one line.
+            wide = console if console.is_terminal else Console(width=_TABLE_WIDTH)
             for table in iso230_tables(found.part, found.dataset, title=found.title):
-                console.print(table)
+                wide.print(table)
             for line in (*(() if found.part else (NO_SCATTER,)), *found.remarks):
                 console.print(line, soft_wrap=True, highlight=False, markup=False)
         if out is not None:

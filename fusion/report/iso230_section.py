@@ -148,7 +148,8 @@ def single_run_table(dataset: xr.Dataset) -> Table:
     rows = []
     for target in _along(dataset["position"]):
         reading = dataset["deviation"].sel(target=target).isel(cycle=0)
-        cells = [number(float(reading.sel(direction=direction)), 4) for direction in _ARROWS]
+        values = [float(reading.sel(direction=direction)) for direction in _ARROWS]
+        cells = [f"{value:.2f}".replace("-", "−") if np.isfinite(value) else "–" for value in values]
         rows.append([str(target), f"{float(dataset['position'].sel(target=target)):g}", *cells])
     return table(["Target", place, *(f"deviation{arrow} / {unit}" for arrow in _ARROWS.values())], rows)
 

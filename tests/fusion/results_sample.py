@@ -79,6 +79,26 @@ EVIDENCE = {
     "scatter_typical_um": 0.3, "scatter_positive_um": 0.6, "scatter_negative_um": 0.6, "serial_p": 0.4,
     "approach_gain_nats": -0.5, "step_p": 0.6, "step_um": 0.1, "step_u_um": 0.1, "step_cycle": 12, "step_held_out_nats": 0.0,
 }  # fmt: skip
+AXIS_VALUES: dict[str, Any] = {
+    **{f"{name}_um": MEASURED for name in (*"BREMA", "mean_reversal")},
+    "B_of_scatter_um": 0.3,
+}
+ONE_WAY = {f"{name}_um": MEASURED for name in "ARE"}
+WINDOW: dict[str, Any] = {
+    **AXIS_VALUES,
+    "positive": ONE_WAY,
+    "negative": ONE_WAY,
+    "u_without_sampling_um": dict.fromkeys((*"BREMA", "mean_reversal"), 0.05),
+    "contributions": [
+        {
+            "contributor": "device",
+            "u": 0.25,
+            "unit": "ppm",
+            "origin": "assumed",
+            **{f"{name}_um": 0.05 for name in (*"BREMA", "mean_reversal")},
+        }
+    ],
+}
 PARTS: dict[str, Any] = {
     "registration": {
         "rms_mm": 0.1,
@@ -96,8 +116,15 @@ PARTS: dict[str, Any] = {
     "alignment": {"clock_offset_s": {"value": 0.0, "u": None}},
     "iso230": {
         "window": "cycles 1 to 5",
-        **{f"{name}_um": MEASURED for name in (*"BREMA", "mean_reversal")},
-        "B_of_scatter_um": 0.3,
+        **AXIS_VALUES,
+        "settled": {**WINDOW, "window": "cycles 6 to 10", "cycles": [6, 7, 8, 9, 10]},
+        "settled_rule": "the only window of the test",
+        "first": {**WINDOW, "window": "cycles 1 to 5", "cycles": [1, 2, 3, 4, 5]},
+        "range_um": {name: {"lowest": 0.5, "highest": 1.5} for name in "BREMA"},
+        "tolerances": [{"quantity": "A", "limit_um": 10.0, "value_um": 1.0, "expanded_u_um": 0.2, "decision": "pass"}],
+        "checks": [{"name": "5 cycles", "met": None, "evidence": "5 cycles are evaluated."}],
+        "conditions": [{"name": "Machine", "text": ""}],
+        "other_standards": [{"standard": "VDI/DGQ 3441", "name": "P", "value_um": 1.0, "definition": "range"}],
     },
     "neighbours": {"conventional_s_um": BOTH, "pair_s_um": BOTH, "ratio": BOTH},
     "drift": {"profile_um": BOTH, "profile_u_um": BOTH, "scatter_um": BOTH},

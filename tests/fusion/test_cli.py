@@ -137,11 +137,13 @@ def test_check_ends_with_0_where_a_run_would_start_and_with_2_where_not(campaign
     assert "no such campaign file" in refused.output
 
 
-def test_iso230_evaluates_a_window(campaign_folder: Path) -> None:
+def test_iso230_evaluates_a_window(campaign_folder: Path, tmp_path: Path) -> None:
     result = invoke("iso230", campaign_folder / "laser.csv", "--cycles", "1-5")
     assert result.exit_code == 0, result.output
     assert "laser.csv, cycles 1 to 5" in result.output
-    out = campaign_folder / "sheet.html"
+    # Without a terminal every row is one line.
+    assert re.search(r"Unidirectional systematic positioning error E\u2193 .* \u00b1 ", result.output)
+    out = tmp_path / "sheet.html"
     told = invoke("iso230", campaign_folder / "campaign.toml", "--json", "--out", out)
     assert told.exit_code == 0 and json.loads(told.stdout)["settled"]["cycles"][-1] > 12
     assert "Test by ISO 230-2" in out.read_text(encoding="utf-8")

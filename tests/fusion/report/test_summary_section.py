@@ -42,6 +42,6 @@ def test_results_without_products_still_make_a_summary() -> None:
     told = describe_campaign(assemble("A", PARTS, []), {"parameters": {"campaign": {}}, "inputs": {}}, {}, None)
     assert told["verdict"] == "explained"
     assert told["anomalies"][0]["title"] == "Position 3, both approaches: scatter of the structure"
-    assert told["iso230"]["axis"].rows[-1].cells[0] == "Reversal error B"
+    assert told["iso230"]["axis"].rows[-2].cells[0] == "Reversal error B"
     assert told["hotspots"].rows[0].cells[5:] == ["3", "\u2013", "\u2013"]
     assert told["positions"] is None and told["correlation"] is None

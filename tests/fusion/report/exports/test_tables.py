@@ -35,10 +35,12 @@ def test_iso230_values_are_those_of_the_standard(small_run) -> None:
 
 def test_positions_are_of_the_window_that_the_results_state(small_run) -> None:
     deviations, results = read_dataset(small_run / "deviations.nc"), read_results(small_run)
-    assert results.iso230 is not None and results.iso230.window == "cycles 1 to 5"
+    assert results.iso230 is not None and results.iso230.settled is not None
+    assert results.iso230.settled.window == "cycles 6 to 10"
     positions = tables.iso230_position_table(deviations, results)
     assert (positions["count_positive"] == 5).all()
-    np.testing.assert_allclose(positions["mean_positive_um"], deviations["deviation"].values[:5, 0].mean(axis=0))
+    np.testing.assert_allclose(positions["mean_positive_um"], deviations["deviation"].values[5:10, 0].mean(axis=0))
+    assert set(positions["window"]) == {"cycles 6 to 10"}
     whole = tables.iso230_position_table(deviations, results.model_copy(update={"iso230": None}))
     assert (whole["count_positive"] == 12).all()
 
