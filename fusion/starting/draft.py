@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from fusion.errors import FusionError
 from fusion.products.store import write_text
@@ -15,9 +18,13 @@ from fusion.starting.questions import TO_FILL, Asker
 from interferometry.errors import InterferometryError
 from interferometry.io.dates import NO_ZONE
 from interferometry.io.readers import read_deviations
+from thermography.io.frame_readers import find_reader
+from thermography.io.temperature_frames import StackOptions, TemperatureReader
 from thermography.registration.plan import Fiducial, read_fiducials
 
 _FILE = "campaign.toml"
+#: Values above this are kelvins and no temperatures of a machine table in degC.
+_WARMEST_DEGC = 150.0
 
 
 class DraftError(FusionError):
@@ -120,6 +127,9 @@ def _time_zone(readings: Sequence[Recognised], asker: Asker) -> Iterator[str]:
 def _thermography(content: FolderContent, asker: Asker) -> Iterator[str]:
     yield from ("", "[thermography]")
     yield f"frames = [{', '.join(_quoted(pattern) for pattern in content.frames)}]   # {len(content.frame_files)} files"
+    if content.of_temperatures:
+        yield from _stack(content, asker)
+        return
     emissivity = asker.text("Emissivity of the table, such as 0.95 or 0.95 +- 0.02; empty: as stored in the frames", "")
     yield (
         f"emissivity = {_quoted(emissivity)}"
@@ -133,6 +143,44 @@ def _thermography(content: FolderContent, asker: Asker) -> Iterator[str]:
     yield '# clock_offset = "0 s"                     # camera clock minus laser clock; 0 s where both follow one time server'
     yield 'table = "still"                          # every frame shows the table at axis position 0; "moving": frames during motion'
     yield from _optional("lens", content, Kind.LENS)
+
+
+def _stack(content: FolderContent, asker: Asker) -> Iterator[str]:
+    """Yield what files of temperatures do not hold themselves."""
+    first = content.frame_files[0]
+    reader = find_reader(first)
+    assert isinstance(reader, TemperatureReader)
+    stored = StackOptions(scale=np.nextafter(1.0, 2.0))
+    contents = reader.contents(first, stored)
+    yield '# camera_offset_u = "1 K"                  # accuracy in the camera\'s data sheet; left out = that of an uncooled camera'
+    yield 'table = "still"                          # every frame shows the table at axis position 0; "moving": frames during motion'
+    yield from _optional("lens", content, Kind.LENS)
+    yield from ("", "[thermography.stack]                     # temperatures of another camera: docs/formats.md")
+    values = reader.read_values(first, 0, stored)
+    if values.dtype.kind in "iu":
+        yield f'scale = {_quoted(TO_FILL)}   # of one count, for example 0.04 with unit = "K"'
+    if not contents.unit:
+        guess = "K" if np.nanmedian(values) > _WARMEST_DEGC else "degC"
+        yield f"unit = {_quoted(asker.choice('Unit of the temperatures', tuple(sorted(('degC', 'K'), key=guess.__ne__))))}"
+    if contents.times is None:
+        pattern = _time_in_name(first.name)
+        if pattern:
+            yield f"time_in_name = {_quoted(pattern)}   # local time: write its time_zone below"
+        else:
+            yield f'start = {_quoted(TO_FILL)}   # or times = "times.csv" (file,frame,time), or time_in_name = "%Y%m%d_%H%M%S"'
+    if contents.frames > 1 and contents.times is None:
+        yield f"interval = {asker.quantity('Time from one frame to the next', 's')}"
+    yield '# time_zone = "Europe/Vienna"              # of these times; left out = UTC'
+    yield "# emissivity = 0.95                        # as it was set in the camera's program, with reflected_temperature"
+
+
+def _time_in_name(name: str) -> str:
+    """Return the pattern of a date and a time of day in a name, "" where there is none."""
+    found = re.search(r"(?:19|20)\d{2}([-_]?)\d{2}\1\d{2}([-_T ]+)\d{2}([-_.]?)\d{2}\3\d{2}", name)
+    if found is None:
+        return ""
+    day, between, clock = found.groups()
+    return f"%Y{day}%m{day}%d{between}%H{clock}%M{clock}%S"
 
 
 def _plan(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterator[str]:

@@ -31,6 +31,8 @@ class FolderContent:
         All other files that are understood.
     unknown : tuple of Recognised
         Files that are not.
+    of_temperatures : bool
+        Whether the frames hold temperatures of another camera and not FLIR counts.
     """
 
     folder: Path
@@ -38,6 +40,7 @@ class FolderContent:
     frame_files: tuple[Path, ...] = ()
     files: dict[Kind, tuple[Recognised, ...]] = field(default_factory=dict)
     unknown: tuple[Recognised, ...] = ()
+    of_temperatures: bool = False
 
     def of(self, kind: Kind) -> tuple[Recognised, ...]:
         """Return the files of a kind, sorted by name."""
@@ -79,8 +82,23 @@ def scan_folder(folder: Path) -> FolderContent:
     for one in found:
         known.setdefault(one.kind, []).append(one)
     unknown = known.pop(Kind.UNKNOWN, [])
+    of_temperatures = not patterns and Kind.STACK in known
+    if of_temperatures:
+        frames = [one.path for one in known.pop(Kind.STACK)]
+        patterns = _patterns(folder, frames, paths)
     files = {kind: tuple(members) for kind, members in known.items()}
-    return FolderContent(folder, tuple(patterns), tuple(frames), files, tuple(unknown))
+    return FolderContent(folder, tuple(patterns), tuple(frames), files, tuple(unknown), of_temperatures)
+
+
+def _patterns(folder: Path, frames: list[Path], paths: list[Path]) -> list[str]:
+    """Return patterns that match these files and no others of the folder: one per folder and ending, or the names one by one."""
+    patterns = []
+    for parent, suffix in dict.fromkeys((path.parent, path.suffix) for path in frames):
+        alike = [path for path in paths if (path.parent, path.suffix) == (parent, suffix)]
+        members = [path for path in frames if (path.parent, path.suffix) == (parent, suffix)]
+        whole = [parent / f"*{suffix}"] if alike == members else members
+        patterns += [path.relative_to(folder).as_posix() for path in whole]
+    return patterns
 
 
 def input_files(folder: Path) -> Iterator[Path]:

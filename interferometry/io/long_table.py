@@ -14,14 +14,12 @@ from interferometry.io.delimited import Grid, shown
 from interferometry.io.faults import BadReading, LaserFormatError, RejectedLine
 from interferometry.io.headings import UNITS, Heading, find_direction, find_unit, read_heading
 from interferometry.io.numerals import Numerals
-from interferometry.io.readings import Kind, Reading, Readings, number_targets, turn_by_travel
+from interferometry.io.readings import FINE, Kind, Reading, Readings, number_targets, turn_by_travel
 
 _ROLES = ("cycle", "run", "direction", "target", "position", "measured", "deviation", "date", "time")
 #: A number with a word before it, such as "Cycle 1" or "P3".
 _NAMED_NUMBER = re.compile(r"[^\W\d_]+[\s.]*(\d+)")
 _NOT_FROM_ONE = "is not a whole number from 1"
-#: From mm to um, and from deg to arcsec.
-_FINE = {"length": 1e3, "angle": 3600.0}
 
 
 @dataclass(frozen=True)
@@ -314,4 +312,4 @@ def _deviation(table: LongTable, label: _Label, numerals: Numerals) -> float:
     if role == "measured":
         value -= label.position
     # Rounded to a thousandth of a nanometre: the factors of the units have no exact binary value.
-    return round(value * _FINE[unit.kind], 6)
+    return round(value * FINE[unit.kind], 6)

@@ -28,6 +28,8 @@ from interferometry.io.faults import LaserFormatError, RejectedLine, raise_if_mo
 
 #: Positions closer than this are one, mm or deg.
 POSITION_TOLERANCE = 1e-4
+#: From mm to um, and from deg to arcsec.
+FINE = {"length": 1e3, "angle": 3600.0}
 Kind = Literal["length", "angle"]
 Cell = tuple[int, str, int]
 

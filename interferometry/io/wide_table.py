@@ -12,15 +12,13 @@ from interferometry.io.delimited import Grid
 from interferometry.io.faults import BadReading, LaserFormatError, RejectedLine
 from interferometry.io.headings import UNITS, Heading, find_direction, find_unit, fold, read_heading, split_unit
 from interferometry.io.numerals import Numerals
-from interferometry.io.readings import Kind, Reading, Readings, number_targets, turn_by_travel
+from interferometry.io.readings import FINE, Kind, Reading, Readings, number_targets, turn_by_travel
 
 #: Rows above and below the one that names the positions, in which directions and numbers of runs may stand.
 _ROWS_ABOVE, _ROWS_BELOW = 2, 3
 #: Fewest targets and runs by which a table is recognised.
 _FEWEST_TARGETS = 2
 _UNIT_WORDS = {"unit", "units", "einheit", "einheiten", "unite", "unites", "unidad", "unidades", "单位"}
-#: From mm to um, and from deg to arcsec.
-_FINE = {"length": 1e3, "angle": 3600.0}
 
 
 @dataclass(frozen=True)
@@ -270,7 +268,7 @@ def read_wide_table(table: WideTable) -> Readings:
     positions = [numerals.number(text) * factor for _, text in table.positions]
     targets = number_targets(positions)
     for run, cycle in zip(table.runs, _cycles(table), strict=True):
-        fine = UNITS[run.unit or table.deviation_unit or ""].factor * _FINE[kind]
+        fine = UNITS[run.unit or table.deviation_unit or ""].factor * FINE[kind]
         for (line, text), target, position in zip(run.values, targets, positions, strict=True):
             if not text:
                 continue

@@ -13,6 +13,8 @@ from fusion.starting.check import check_campaign
 from fusion.starting.draft import DraftError, draft_lines, write_campaign
 from fusion.starting.folder import scan_folder
 from fusion.starting.questions import Asker
+from thermography.io.flir import index_frames
+from thermography.radiometry.planck import calibrate
 
 ANSWERS = {
     "Title of the report": 'The "small" one',
@@ -142,3 +144,25 @@ def test_the_public_spindle_record_is_ready_at_once(real_file: Callable[[str], P
     assert missing == [] and record is not None
     assert (len(record.temperatures), len(record.displacements), record.drivers) == (16, 5, ("spindle(RPM)",))
     assert check_campaign(path).faults == ()
+
+
+def test_frames_of_another_camera_are_ready_with_their_times_from_the_names(copied: Path) -> None:
+    frames, _ = index_frames(sorted((copied / "thermal").iterdir()))
+    for frame in frames:
+        stamp = str(frame.time.astype("datetime64[s]")).replace("-", "").replace(":", "").replace("T", "_")
+        np.save(copied / "thermal" / f"IR_{stamp}.npy", calibrate(frame.read_counts(), frame.parameters))
+        frame.path.unlink()
+    (copied / "campaign.toml").unlink()
+    path, missing = write_campaign(copied, Asker(answering))
+    assert missing == [] and check_campaign(path).faults == ()
+    written = load_campaign(path).thermography
+    assert written is not None and written.stack is not None
+    assert (written.frames, written.stack.unit) == (("thermal/*.npy",), "degC")
+    assert written.stack.time_in_name == "%Y%m%d_%H%M%S"
+
+
+def test_what_frames_of_another_camera_do_not_tell_is_marked(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.full((2, 8, 9), 7329, np.uint16))
+    text = "\n".join(draft_lines(scan_folder(tmp_path), Asker(None)))
+    for line in ('frames = ["*.npy"]', 'scale = "FILL IN"', 'unit = "K"', 'start = "FILL IN"', 'interval = "FILL IN"'):
+        assert f"\n{line}" in text
