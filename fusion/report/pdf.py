@@ -101,7 +101,7 @@ def print_pdf(page: str, out: Path, *, browser: str | None = None, full: bool = 
         file = Path(folder) / "report.html"
         file.write_text(page, encoding="utf-8")
         return write_atomically(
-            out, lambda temporary: _print(program, f"{file.as_uri()}#paper{'-full' if full else ''}", temporary, folder)
+            out, lambda temporary: _print(program, f"{file.as_uri()}#on-a4{'-full' if full else ''}", temporary, folder)
         )
 
 

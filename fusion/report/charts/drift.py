@@ -87,7 +87,7 @@ def plot_drift(drift: xr.Dataset, deviations: xr.Dataset) -> Chart:
 def _with_room(hours: np.ndarray) -> tuple[float, float]:
     """Return the range of the times, with room for names at the right."""
     first, last = float(np.nanmin(hours)), float(np.nanmax(hours))
-    return first - 0.02 * (last - first), last + 0.12 * (last - first)
+    return first - 0.02 * (last - first), last + 0.18 * (last - first)
 
 
 def _name_end(drawn: figure, x: np.ndarray, y: np.ndarray, text: str, colour: str) -> None:
@@ -152,7 +152,7 @@ def plot_reversal(drift: xr.Dataset, position: xr.DataArray) -> Chart:
     -------
     Chart
     """
-    drawn = new_figure(x="position / mm", y="positive − negative approach / µm")
+    drawn = new_figure(x="position / mm", y="positive − negative / µm")
     add_zero_line(drawn)
     x, value, half = position.values.astype(float), drift["reversal"].values, 2 * drift["reversal_u"].values
     add_series(drawn, x, value, name="reversal", colour=INK, line=False, marker="circle", half=half, legend=False)

@@ -118,6 +118,7 @@ def _plot_series(values: xr.DataArray, hours: np.ndarray, at: int, above: figure
     words = _words(str(values.name))
     drawn = new_figure(x=_TIME, y=unit or "1", title=words, height=118)
     drawn.x_range = above.x_range
+    drawn.yaxis.ticker.desired_num_ticks = 3
     low, high = shared_range(values.values)
     fix_range(drawn, low, high)
     line = drawn.line(hours, values.values, line_color=CATEGORIES[at % len(CATEGORIES)], line_width=1.7)

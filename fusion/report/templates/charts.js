@@ -149,8 +149,8 @@
   window.addEventListener("beforeprint", () => { if (!document.documentElement.classList.contains("paper")) freeze(); });
   window.addEventListener("afterprint", () => { if (!document.documentElement.classList.contains("paper")) thaw(); });
   window.charts = { toPaper, toScreen };
-  if (location.hash.startsWith("#paper")) {  // opened to be printed by a program; "#paper-full" with every part that folds
-    if (location.hash === "#paper-full") document.querySelectorAll("details").forEach((part) => { part.open = true; });
+  if (location.hash.startsWith("#on-a4")) {  // opened to be printed by a program; "#on-a4-full" with every part that folds
+    if (location.hash === "#on-a4-full") document.querySelectorAll("details").forEach((part) => { part.open = true; });
     window.addEventListener("load", () => { toPaper().then(() => { document.documentElement.dataset.paper = "ready"; }); });
   }
 })();

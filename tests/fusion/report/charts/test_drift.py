@@ -73,7 +73,7 @@ def test_reversal_and_scatter_of_a_campaign(deviations: xr.Dataset) -> None:
     drift, position = group(deviations, "drift"), deviations["position"]
     chart = plot_reversal(drift, position)
     np.testing.assert_array_equal(chart.columns["reversal / µm"], drift["reversal"])
-    assert chart.figure.yaxis.axis_label == "positive − negative approach / µm"
+    assert chart.figure.yaxis.axis_label == "positive − negative / µm"
     chart = plot_position_scatter(drift, position, {2, 5})
     shades = sorted(shade.left for shade in chart.figure.select(BoxAnnotation))
     assert shades == [30.0, 180.0]
