@@ -254,5 +254,4 @@ def contained_sentence(shown: Iso230Window) -> str:
 
 
 def _input_words(entry: Iso230Contribution) -> str:
-    u = measured(entry.u, None, entry.unit.replace("um", "µm")) if entry.u else f"0 {entry.unit.replace('um', 'µm')}"
-    return f"{_CONTRIBUTORS[entry.contributor]} {u} ({entry.origin})"
+    return f"{_CONTRIBUTORS[entry.contributor]} {number(entry.u, 2)} {print_unit(entry.unit)} ({entry.origin})"

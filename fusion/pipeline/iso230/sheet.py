@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from fusion.campaign.config import Campaign
+from fusion.campaign.config import Campaign, InterferometryTable
 from fusion.campaign.standard_test import AcceptanceTable, ReportTable
 from fusion.products.grouped import group, has
 from interferometry.drift.planning import estimate_settling
@@ -113,11 +113,19 @@ def _conditions(
             "material_temperature",
         ),
         "Places of the sensors": report.sensor_places,
-        "Expansion coefficient": "" if laser is None else f"{laser.expansion_coefficient_ppm_per_K:g} ppm/K",
-        "Dead path": "" if laser is None else f"{laser.dead_path_mm:g} mm",
+        "Expansion coefficient": _coefficient(laser),
+        "Dead path": f"{laser.dead_path_mm:g} mm" if laser and "dead_path_mm" in laser.model_fields_set else "",
         "Readings": "" if laser is None else compensation[laser.compensation],
         "Remarks": report.remarks,
     }
+
+
+def _coefficient(laser: InterferometryTable | None) -> str:
+    """Return the expansion coefficient, and whether it is assumed."""
+    if laser is None:
+        return ""
+    stated = "expansion_coefficient_ppm_per_K" in laser.model_fields_set
+    return f"{laser.expansion_coefficient_ppm_per_K:g} ppm/K{'' if stated else ' (assumed)'}"
 
 
 def _with_unit(value: float | None, unit: str) -> str:

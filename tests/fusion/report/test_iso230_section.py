@@ -44,7 +44,7 @@ def test_the_budget_ends_with_both_sums(part: Iso230Part) -> None:
 def test_what_is_assumed_and_what_is_missing_is_said(part: Iso230Part) -> None:
     assert part.settled is not None
     sentence = contained_sentence(part.settled)
-    assert "laser with its air compensation 0.250 ppm (assumed)" in sentence
+    assert "laser with its air compensation 0.25 ppm (assumed)" in sentence
     assert "can be stated under [interferometry.uncertainty]" in sentence
     assert "does not contain the environmental variation" not in sentence
     unknown = [

@@ -39,7 +39,8 @@ def test_what_is_stated_is_judged_and_shown() -> None:
     assert conditions["Machine"] == "Mill" and conditions["Axis"] == "X" and conditions["Feed"] == "2000 mm/min"
     assert conditions["Instrument 1"] == "laser, serial number not stated, calibration not stated"
     assert conditions["Air temperature before, after"] == "21.5 \u00b0C, not stated"
-    assert conditions["Operator"] == ""
+    assert conditions["Operator"] == "" and conditions["Dead path"] == ""
+    assert conditions["Expansion coefficient"] == "11.7 ppm/K (assumed)"
 
 
 def test_logged_temperatures_stand_where_none_is_stated() -> None:
