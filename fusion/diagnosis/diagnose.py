@@ -236,7 +236,7 @@ def _judge(case: _Case, direction: str) -> Diagnosis:
     runner_up = max((name for name in probability if name != leading), key=lambda name: probability[name])
     against.append(f"next best explanation: {_in_words(runner_up)}, probability {probability[runner_up]:.2f}")
     against += [
-        f"{_in_words(name)}: p = {fit.p_value:.3f}, so a random walk alone can explain it"
+        f"{_in_words(name)}: p = {fit.p_value:.2g}, ordinary slow drift would look the same"
         for name, fit in case.tested.items()
         if fit.p_value > LEVELS[name]
     ]
@@ -277,7 +277,7 @@ def _objections(case: _Case, leading: str, probability: float) -> list[str]:
                 f"{case.warm_up_share:.1%} of the local temperature's variance is one warm-up curve: collinear with any other slow cause"
             )
     if leading == "slow":
-        reasons.append(f"slow (serial p = {case.serial_p:.3f}), but neither local temperature nor a step explains it")
+        reasons.append(f"slow (serial p = {case.serial_p:.2g}), but neither local temperature nor a step explains it")
     return reasons
 
 
@@ -285,18 +285,20 @@ def _support(case: _Case, leading: str) -> list[str]:
     """Return the sentences in favour of the leading explanation."""
     residual = case.residual
     scatter = float(np.nanstd(residual.values))
-    sentences = [f"standard deviation {scatter:.2f} µm, typical of the other targets {residual.typical_um:.2f} µm"]
+    sentences = [
+        f"standard deviation {scatter:.2f} µm over both approaches, typical of the other positions {residual.typical_um:.2f} µm"
+    ]
     if leading == "step":
         fit = case.step
         sentences.append(
             f"step of {fit.coefficient:+.2f} ± {2.0 * fit.coefficient_u:.2f} µm (k = 2) at cycle {case.step_cycle} "
-            f"(p = {fit.p_value:.3f}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
+            f"(p = {fit.p_value:.2g}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
         )
     elif leading == "local_temperature" and case.temperature is not None:
         fit = case.temperature
         sentences.append(
             f"{fit.coefficient:+.3f} ± {2.0 * fit.coefficient_u:.3f} µm per K (k = 2) of local temperature rise, "
-            f"lag {LAGS_S[fit.best]:.0f} s (p = {fit.p_value:.3f}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
+            f"lag {LAGS_S[fit.best]:.0f} s (p = {fit.p_value:.2g}), hold-out log-likelihood {fit.hold_out_gain:+.1f} nats"
         )
     elif leading == "stick_slip":
         positive, negative = residual.scatter_um
@@ -314,8 +316,8 @@ def _support(case: _Case, leading: str) -> list[str]:
 def _serial_sentence(p_value: float) -> str:
     """Return what the order of the readings in time shows."""
     if p_value > _SERIAL_LEVEL:
-        return f"no significant serial correlation (p = {p_value:.3f})"
-    return f"serial correlation p = {p_value:.3f}"
+        return f"no significant serial correlation (p = {p_value:.2g})"
+    return f"serial correlation p = {p_value:.2g}"
 
 
 def _directions_sentence(residual: Residual) -> str:

@@ -147,17 +147,18 @@ def randomised_causes(correlation: CorrelationPart) -> list[str]:
 
 
 def hold_out_errors(loop: Loop) -> str:
-    """Return the errors on the hold-out of the declared and of the final model, µm.
+    """Return the errors on the hold-out of the declared model and, where effects were added, of the final one, µm.
 
     Parameters
     ----------
     loop : Loop
         The part ``loop`` of the results.
     """
-    both = (loop.errors.declared, loop.errors.final)
-    errors, lows, highs = (alike([getattr(error, name) for error in both]) for name in ("rmse_um", "low_um", "high_um"))
-    told = [f"{error} [{low} to {high}]" for error, low, high in zip(errors, lows, highs, strict=True)]
-    return f"{told[0]} -> {told[1]} µm"
+    stages = (loop.errors.declared, loop.errors.final) if loop.steps else (loop.errors.declared,)
+    told = alike(
+        [getattr(error, name) for error in stages for name in ("rmse_um", "low_um", "high_um")], distinct=False
+    )
+    return " -> ".join(f"{told[at]} [{told[at + 1]} to {told[at + 2]}]" for at in range(0, len(told), 3)) + " µm"
 
 
 def baseline_errors(loop: Loop) -> str:
@@ -169,7 +170,7 @@ def baseline_errors(loop: Loop) -> str:
         The part ``loop`` of the results.
     """
     names = dict.fromkeys(("last_value", "mean", loop.best_baseline))
-    errors = alike([getattr(loop.baselines, name).rmse_um for name in names])
+    errors = alike([getattr(loop.baselines, name).rmse_um for name in names], distinct=False)
     words = baseline_words(loop)
     return ", ".join(f"{words[name]} {error}" for name, error in zip(names, errors, strict=True)) + " µm"
 

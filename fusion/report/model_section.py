@@ -83,12 +83,10 @@ def errors_table(loop: Loop) -> Table:
     named = [("declared model", loop.errors.declared), ("with the added effects", loop.errors.final)]
     plain = [(words, getattr(loop.baselines, name)) for name, words in baseline_words(loop).items()]
     listed = [*named, *plain]
-    errors, lows, highs = (
-        alike([getattr(one, name) for _, one in listed]) for name in ("rmse_um", "low_um", "high_um")
-    )
+    told = alike([getattr(one, name) for _, one in listed for name in ("rmse_um", "low_um", "high_um")], distinct=False)
     rows = [
-        Row([name, error, f"{low} to {high}"], marked=at < len(named))
-        for at, ((name, _), error, low, high) in enumerate(zip(listed, errors, lows, highs, strict=True))
+        Row([name, told[3 * at], f"{told[3 * at + 1]} to {told[3 * at + 2]}"], marked=at < len(named))
+        for at, (name, _) in enumerate(listed)
     ]
     return table([Words("Prediction of what was held out"), "Error / µm", "95 % interval / µm"], rows)
 

@@ -180,7 +180,7 @@ def p_words(p: float | None, least: float | None = None) -> str:
     return f"p {cell}" if cell.startswith("<") else f"p = {cell}"
 
 
-def alike(values: Sequence[float | None], digits: int = 2) -> list[str]:
+def alike(values: Sequence[float | None], digits: int = 2, *, distinct: bool = True) -> list[str]:
     """Return numbers that are compared with as many decimals each, so many that the smallest has the digits.
 
     Parameters
@@ -188,7 +188,9 @@ def alike(values: Sequence[float | None], digits: int = 2) -> list[str]:
     values : sequence of float or None
         In one unit; None and values that are not finite are shown as a dash.
     digits : int
-        Significant digits of the smallest one; more where two that differ would read alike.
+        Significant digits of the smallest one.
+    distinct : bool
+        Whether there are more where two that differ would read alike.
 
     Examples
     --------
@@ -199,7 +201,7 @@ def alike(values: Sequence[float | None], digits: int = 2) -> list[str]:
     smallest = min(map(abs, known), default=1.0)
     decimals = max(0, digits - 1 - math.floor(math.log10(smallest)))
     differ = len(set(known))
-    while decimals < 4 and len({round(value, decimals) for value in known}) < differ:
+    while distinct and decimals < 4 and len({round(value, decimals) for value in known}) < differ:
         decimals += 1
     return [
         "–" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}".replace("-", "−")

@@ -91,12 +91,13 @@ def _verdict(loop: Loop, time: TimePart | None) -> str:
     declared = join([phrase(name, record=record) for name in loop.declared])
     explains = f"The declared model explains the drift ({declared})" if declared else "No effect is declared"
     last = "value" if record else "cycle"
+    size = f" ({number(loop.unexplained.rms_um, 2)} µm rms)" if loop.unexplained.shape else ""
     alone = f"{'The declared model' if declared else 'Random drift'} does not explain the drift alone:"
     return {
         "complete": f"{explains}; no missing effect can be shown.",
         "explained": f"{alone} it lacks {lacks}. With that, no further cause can be shown.",
         "partial": f"{alone} it lacks {lacks}. Even with that, a part is left that has no name.",
-        "unexplained": "A part of the drift has no explanation: no effect of the library deserves its name.",
+        "unexplained": f"A part of the drift{size} has no explanation: no effect of the library deserves its name.",
         "no_skill": f"The model predicts no better than repeating the last {last} or the mean: these data cannot tell what drives it.",
     }[loop.verdict]
 
@@ -219,7 +220,18 @@ def prediction_sentence(loop: Loop) -> str:
     )
     noun = "effect" if len(steps) == 1 else "effects"
     blocks = f"blocks of {'time' if record else 'cycles'} predicted from the others: {_block_errors(steps)}"
-    return f"With the added {noun} the error of predicting {where} {change}; {beside}; {blocks}."
+    return f"With the added {noun} the error of predicting {where} {change}; {beside}; {blocks}.{_worse_channels(loop)}"
+
+
+def _worse_channels(loop: Loop) -> str:
+    """The channels of a record whose error does not fall with the added effects, as a sentence; empty where it falls in all."""
+    channels = loop.channels if isinstance(loop, RecordLoop) else {}
+    worse = [
+        f"{name} ({' -> '.join(alike((channel.rmse_declared_um, channel.rmse_final_um)))} µm)"
+        for name, channel in channels.items()
+        if (channel.rmse_final_um or 0.0) > (channel.rmse_declared_um or 0.0)
+    ]
+    return f" It does not fall in {join(worse)}." if worse else ""
 
 
 def _block_errors(steps: list[StepPart]) -> str:

@@ -71,8 +71,9 @@ def error(rmse_um: float) -> ErrorInterval:
 
 
 def test_errors_are_stated_before_and_after_with_their_intervals() -> None:
-    loop = Loop.model_construct(errors=ModelErrors(declared=error(1.94), final=error(0.464)))
+    loop = Loop.model_construct(steps=(None,), errors=ModelErrors(declared=error(1.94), final=error(0.464)))
     assert findings.hold_out_errors(loop) == "1.94 [1.75 to 2.13] -> 0.46 [0.42 to 0.51] \u00b5m"
+    assert findings.hold_out_errors(loop.model_copy(update={"steps": ()})) == "1.9 [1.7 to 2.1] \u00b5m"
 
 
 def test_plain_predictions_are_last_value_mean_and_the_best_regression() -> None:

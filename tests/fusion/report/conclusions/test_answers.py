@@ -17,6 +17,7 @@ from fusion.products.results import (
     Unexplained,
     assemble,
 )
+from fusion.products.results_loop import ChannelErrors
 from fusion.products.results_part import AreaPart
 from fusion.report.conclusions import answers
 from tests.fusion.results_sample import PARTS
@@ -70,6 +71,10 @@ def results(found: Loop | None, **parts: Any) -> Results:
             "The declared model does not explain the drift alone: it lacks the laser's dead path. Even with that, a part is left that has "
             "no name.",
         ),
+        (
+            loop("unexplained", shape="a wave"),
+            "A part of the drift (0.20 µm rms) has no explanation: no effect of the library deserves its name.",
+        ),
         (loop("unexplained"), "A part of the drift has no explanation: no effect of the library deserves its name."),
         (
             loop("no_skill"),
@@ -113,10 +118,17 @@ def test_an_effect_that_does_not_lower_the_error_is_said_to_do_so() -> None:
 
 def test_a_record_repeats_values_and_predicts_blocks_of_time() -> None:
     record = RecordLoop.model_construct(
-        **{**vars(loop("explained", step("thermal_lag"))), "held_out": "37.0 h to 46.3 h held out; x"}
+        **{**vars(loop("explained", step("thermal_lag"))), "held_out": "37.0 h to 46.3 h held out; x", "channels": {}}
     )
     told = answers.prediction_sentence(record)
     assert "predicting 37.0 h to 46.3 h falls" in told and "repeating the last value" in told
+    channels = {
+        name: ChannelErrors.model_construct(rmse_declared_um=3.01, rmse_final_um=after)
+        for name, after in (("ch1", 2.0), ("ch2", 3.21))
+    }
+    assert answers.prediction_sentence(record.model_copy(update={"channels": channels})).endswith(
+        "It does not fall in ch2 (3.0 -> 3.2 µm)."
+    )
     assert "the noise of a block mean" in told and "blocks of time predicted from the others" in told
 
 
