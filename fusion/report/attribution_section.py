@@ -14,7 +14,7 @@ from fusion.products.results import Results
 from fusion.products.results_attribution import CorrelationPart, DutyPart, PlacePart, TestedPart
 from fusion.report.charts.attribution import caption_of, rate_text
 from fusion.report.conclusions.answers import place_sentence
-from fusion.report.findings import area_words, randomised_causes, span_words
+from fusion.report.findings import randomised_causes, span_words
 from fusion.report.tables import Row, Table, Words, table
 from fusion.report.wording import CHANNELS, conditional, duration, join, measured, number, p_cell, place, quantity
 
@@ -73,6 +73,7 @@ def describe_correlation(
         "headline": conditional(place_sentence(correlation), results.inputs, "attribution"),
         "sentences": [sentence for sentence in sentences if sentence],
         "tell": correlation.would_tell,
+        **_leading_figure(correlation),
         "captions": captions,
         "cells": _cells_table(maps.to_dataset(), correlation.least_p),
         "places": [
@@ -87,6 +88,19 @@ def describe_correlation(
         "sensors": _sensors_text(maps.children["sensors"].to_dataset(), correlation.verdict),
         "sensors_table": _sensors_table(correlation),
     }
+
+
+def _leading_figure(correlation: CorrelationPart) -> dict[str, str]:
+    """Name and caption of the chart that shows the place which the drift follows; empty where it follows none."""
+    source = correlation.source
+    if correlation.verdict != "attributable" or source.kind == "region":
+        return {"leading_figure": "", "leading_caption": ""}
+    area = f"The area {span_words(source.area)}"
+    if source.kind == "mode":
+        told = f"{area} are the cells around the cross that warm by at least half as much as it does (thermal mode {source.name})."
+        return {"leading_figure": f"mode_{source.name}", "leading_caption": told}
+    told = f"{area} are the cells that explain the drift as well as the strongest one; coloured where they are significant."
+    return {"leading_figure": "sensitivity", "leading_caption": told}
 
 
 def _leading(correlation: CorrelationPart) -> str:
@@ -120,7 +134,7 @@ def _beside(correlation: CorrelationPart) -> list[str]:
     for mode in correlation.modes:
         if mode.name == f"mode {source.name}":
             continue
-        named = f"{mode.name} ({area_words(mode.area, mode.x_mm, mode.y_mm)})"
+        named = f"{mode.name} ({span_words(mode.area) if mode.area else place(mode.x_mm, mode.y_mm)})"
         if any(_passes(tested.p_beside_leader) for tested in mode.parts.values()):
             adds.append(named)
         elif any(_passes(tested.p_value) for tested in mode.parts.values()):

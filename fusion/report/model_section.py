@@ -102,24 +102,23 @@ def steps_table(loop: Loop) -> Table:
     columns = [
         "Step",
         Words("Effect"),
-        Words("Parameters"),
         "p",
-        "Held-out error / µm, before -> after",
-        "Blocks predicted from the others / µm, before -> after",
+        "Held out / µm",
+        "Blocks / µm",
         Words("Confirmed"),
         Words("Next best effect"),
     ]
     declared = join([effect_words(name).name for name in loop.declared]) or "nothing"
-    rows = [Row(["0", f"declared: {declared}", "", "–", f"{alike([loop.rmse_declared_um])[0]}", "–", "", ""])]
+    rows = [Row(["0", f"declared: {declared}", "–", alike([loop.rmse_declared_um])[0], "–", "", ""])]
     for turn, step in enumerate(loop.steps, start=1):
         rows.append(Row([str(turn), *_step_cells(step)], marked=True))
     return table(columns, rows)
 
 
 def _step_cells(step: StepPart) -> list[str]:
+    told = parameters_with_ranges(step.parameters, step.parameter_ranges)
     return [
-        effect_words(step.effect).name,
-        parameters_with_ranges(step.parameters, step.parameter_ranges),
+        f"{effect_words(step.effect).name}{f': {told}' if told else ''}",
         p_cell(step.p_value),
         " -> ".join(alike((step.rmse_before_um, step.rmse_after_um))),
         " -> ".join(alike((step.cross_rmse_before_um, step.cross_rmse_after_um))),

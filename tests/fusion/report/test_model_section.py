@@ -16,7 +16,6 @@ def test_steps_start_with_the_declared_model() -> None:
     assert declared.cells == [
         "0",
         "declared: expansion of the axis",
-        "",
         "\u2013",
         "0.60",
         "\u2013",
@@ -24,11 +23,9 @@ def test_steps_start_with_the_declared_model() -> None:
         "",
     ]
     assert added.marked
-    assert added.cells[1:3] == [
-        "sudden step or new zero",
-        "30 min after the start (at least 28 min), shape flat (or linear)",
-    ]
-    assert added.cells[4:7] == ["0.60 -> 0.40", "0.70 -> 0.50", "yes"]
+    told = "sudden step or new zero: 30 min after the start (at least 28 min), shape flat (or linear)"
+    assert added.cells[1:3] == [told, "0.001"]
+    assert added.cells[3:6] == ["0.60 -> 0.40", "0.70 -> 0.50", "yes"]
     assert added.cells[-1] == "dead path of the laser (log-likelihood lower by 4.0)"
 
 
@@ -37,7 +34,7 @@ def test_a_name_that_is_not_confirmed_is_told_with_both_errors() -> None:
         update={"confirmed": False, "doubt": "the error is 0.4 µm without it and 0.5 µm with it"}
     )
     _, added = model_section.steps_table(LOOP.model_copy(update={"steps": (doubted,)})).rows
-    assert added.cells[6] == "not confirmed: the error is 0.4 µm without it and 0.5 µm with it"
+    assert added.cells[5] == "not confirmed: the error is 0.4 µm without it and 0.5 µm with it"
 
 
 def test_errors_stand_beside_those_of_plain_predictions() -> None:
