@@ -115,7 +115,7 @@
   }
 
   // Paper: charts in the width that they have on A4, so that their text keeps its size; then each becomes a drawing in SVG.
-  const flatter = 0.74, heights = new Map();
+  const flatter = 0.68, heights = new Map();
   const later = (milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
   async function toPaper() {
     document.documentElement.classList.add("paper");
