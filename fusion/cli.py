@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from enum import StrEnum
+from importlib import metadata
 from pathlib import Path
 from typing import Annotated
 
@@ -57,9 +58,7 @@ def _kept(folders: Sequence[Path]) -> str:
 def _print_version(asked: bool) -> None:
     """Print name and version and stop, where asked."""
     if asked:
-        from fusion.pipeline.provenance import versions
-
-        console.print(f"thermofuse {versions()['thermofuse']}", highlight=False)
+        console.print(f"thermofuse {metadata.version('thermofuse')}", highlight=False)
         raise typer.Exit
 
 
@@ -87,36 +86,54 @@ def run(
     no_plugins: Annotated[
         bool, typer.Option("--no-plugins", help="Leave out effects that other installed distributions add.")
     ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but faults.")] = False,
 ) -> None:
     """Run the whole pipeline on a campaign.
 
     Temperature maps, drift, anomalies, the closed loop, and report.html.
     """
-    from fusion.effects.plugins import leave_plugins_out
-    from fusion.pipeline.run import run_campaign
-    from fusion.pipeline.two_campaigns import join_campaigns
-    from fusion.pipeline.two_records import join_records, of_one_kind
-    from fusion.products.progress import Reporter
-    from fusion.report.terminal import summary_table
-
     if len(campaigns) > 2:
         errors.print("thermofuse: one campaign, or two of one machine, can be analysed at a time", highlight=False)
         raise typer.Exit(ExitCode.BAD_INPUT)
 
-    if no_plugins:
-        leave_plugins_out()
     folders = _folders(campaigns, out)
     with _answering([folder for _, folder in folders]):
+        # The libraries may take seconds to load: something is seen before that.
+        with _progress(quiet=quiet) as report:
+            report("start", 0, 1)
+            from fusion.effects.plugins import leave_plugins_out
+            from fusion.pipeline.run import run_campaign
+            from fusion.pipeline.two_campaigns import join_campaigns
+            from fusion.pipeline.two_records import join_records, of_one_kind
+            from fusion.report.terminal import summary_table
+
+            report("start", 1, 1)
+        if no_plugins:
+            leave_plugins_out()
         records = len(folders) == 2 and of_one_kind(campaigns)
         for campaign, folder in folders:
-            with Reporter(console) as report:
+            with _progress(quiet=quiet) as report:
                 results = run_campaign(campaign, folder, resume=resume, scheduler=scheduler, report=report)
-            console.print(summary_table(results))
-            console.print(f"report: {(folder / 'report.html').resolve()}", soft_wrap=True, highlight=False)
+            if not quiet:
+                console.print(summary_table(results))
+                console.print(f"report: {(folder / 'report.html').resolve()}", soft_wrap=True, highlight=False)
         if len(folders) == 2:
             join = join_records if records else join_campaigns
             for name, text in join([folder for _, folder in folders], folders[0][1].parent):
-                console.print(f"both campaigns, {name}: {text}", soft_wrap=True, highlight=False)
+                if not quiet:
+                    console.print(f"both campaigns, {name}: {text}", soft_wrap=True, highlight=False)
+
+
+@contextmanager
+def _progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """Show the progress of what is done within, or nothing."""
+    from fusion.products.progress import Reporter, silent
+
+    if quiet:
+        yield silent
+        return
+    with Reporter(console) as report:
+        yield report
 
 
 def _folders(campaigns: list[Path], out: Path | None) -> list[tuple[Path, Path]]:

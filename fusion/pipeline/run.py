@@ -201,13 +201,16 @@ def run_campaign(
     campaign = load_campaign(path)
     folder = Path(out)
     seen = input_states(campaign)
+    report("reading and checking", 0, 1)
     if campaign.record is not None:
         record = record_stage.read_source(campaign)
+        report("reading and checking", 1, 1)
         with open_folder(folder, resume=resume):
             return _run_record(_start_run(campaign, folder, seen, report), record)
     source = read_source(campaign)
     checks = check_source(source)
     refuse_contradictions(checks)
+    report("reading and checking", 1, 1)
     with open_folder(folder, resume=resume):
         run = _start_run(campaign, folder, seen, report)
         return _run_instruments(run, source, checks, scheduler=scheduler)

@@ -8,7 +8,15 @@ from contextlib import AbstractContextManager
 from types import TracebackType
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 #: ``report(label, done, total)``; called first with done = 0 and last with done = total.
 Report = Callable[[str, int, int], None]
@@ -53,6 +61,7 @@ class Reporter(AbstractContextManager["Reporter"]):
                 BarColumn(),
                 MofNCompleteColumn(),
                 TimeElapsedColumn(),
+                TimeRemainingColumn(compact=True),
             )
             self._bars = Progress(*columns, console=self._console)
             self._bars.start()
@@ -90,4 +99,6 @@ class Reporter(AbstractContextManager["Reporter"]):
             self._console.print(f"{label}: done in {now - self._started[label]:.1f} s", highlight=False)
         elif now - self._spoken[label] > _SECONDS_BETWEEN_LINES:
             self._spoken[label] = now
-            self._console.print(f"{label}: {done} of {total}", highlight=False)
+            left_s = (now - self._started[label]) / done * (total - done) if done else 0.0
+            left = f", about {left_s:.0f} s left" if left_s else ""
+            self._console.print(f"{label}: {done} of {total}{left}", highlight=False)

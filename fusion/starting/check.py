@@ -83,7 +83,7 @@ class CampaignCheck:
             return f"not ready: {counted(len(self.faults), 'fault')}"
         passed = len(self.checks) - len(self.doubts)
         doubted = f", {counted(len(self.doubts), 'doubt')}" if self.doubts else ""
-        return f"ready to run: {counted(passed, 'check')} passed{doubted}"
+        return f"ready to run: {counted(passed, 'check')} passed{doubted}" if self.checks else "ready to run"
 
     def as_json(self) -> dict[str, Any]:
         """Return the check as a mapping of JSON's own types."""

@@ -6,11 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from fusion.products.folder import MANIFEST
 from fusion.starting.kinds import Kind, Recognised, recognise
 from thermography.inspection import is_flir_file
 
-#: Folders that hold results, not inputs.
-_RESULTS = "results.json"
+#: Files of folders that hold results, not inputs.
+_RESULTS = ("results.json", MANIFEST)
 #: Files of a series, those of one folder and ending, that decide whether it holds thermal frames.
 _LOOKED_INTO = 3
 
@@ -113,7 +114,7 @@ def input_files(folder: Path) -> Iterator[Path]:
         if path.name.startswith("."):
             continue
         if path.is_dir():
-            if not (path / _RESULTS).is_file():
+            if not any((path / name).is_file() for name in _RESULTS):
                 yield from input_files(path)
         elif path.is_file():
             yield path

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
+import sys
 import tomllib
 from importlib import metadata
 from pathlib import Path
@@ -39,6 +41,27 @@ def test_run_ends_with_a_summary_and_the_report(results_folder: Path, campaign_f
     assert told in result.output
     assert result.output.rstrip().endswith(f"report: {out / 'report.html'}")
     assert "input files: done in" in result.output
+
+
+def test_a_quiet_run_prints_nothing(results_folder: Path, campaign_folder: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(results_folder, tmp_path / "results")
+    result = invoke("run", campaign_folder / "campaign.toml", "--out", out, "--resume", "--quiet")
+    assert (result.exit_code, result.output) == (0, "")
+
+
+def test_a_run_shows_a_sign_of_life_before_it_loads_the_libraries(campaign_folder: Path, tmp_path: Path) -> None:
+    """The first line is there while none of them is imported."""
+    code = (
+        "import sys, fusion.cli as cli\n"
+        "class Stop(Exception): pass\n"
+        "def first(text, **options):\n"
+        "    print(text, {'numpy', 'xarray', 'scipy', 'numba'} & set(sys.modules))\n"
+        "    raise SystemExit\n"
+        "cli.console.print = first\n"
+        f"cli.app(['run', {str(campaign_folder / 'campaign.toml')!r}, '--out', {str(tmp_path / 'out')!r}])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout == "start ... set()\n", done.stderr
 
 
 def test_bad_input_is_one_paragraph_without_a_traceback(

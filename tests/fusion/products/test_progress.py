@@ -44,7 +44,7 @@ def test_plain_lines_speak_up_during_a_long_step(monkeypatch: pytest.MonkeyPatch
     with Reporter(console) as report:
         for done in (0, 1, 2, 3, 10):
             report("frames", done, 10)
-    assert shown(console).splitlines() == ["frames ...", "frames: 2 of 10", "frames: done in 30.0 s"]
+    assert shown(console).splitlines() == ["frames ...", "frames: 2 of 10, about 44 s left", "frames: done in 30.0 s"]
 
 
 def test_a_terminal_gets_a_bar_per_step() -> None:

@@ -75,3 +75,9 @@ def test_a_long_recording_is_thinned_and_says_so(fields: xr.Dataset, monkeypatch
     assert found.cycles == [*range(1, 48, 2), 48]
     monkeypatch.setattr(thermal_map, "_MAP_BUDGET", 5 * cells * 20)
     assert thermal_map.plot_thermal_map(long).note.startswith("The map shows means of 2 × 2 cells")
+
+
+def test_a_recording_without_readings_has_a_map_without_a_line(fields: xr.Dataset) -> None:
+    alone = fields.drop_vars(["target", "target_x", "target_y"])
+    found = thermal_map.plot_thermal_map(alone)
+    assert found.quantities and not found.chart.figure.select(type=Arrow)

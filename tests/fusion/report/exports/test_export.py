@@ -98,6 +98,15 @@ def test_the_axis_is_a_name(unexplained, tmp_path) -> None:
     assert files[0].name == "compensation.comp" and "axis: not stated" in files[1].read_text()
 
 
+def test_a_run_of_the_camera_alone_has_its_fields(tmp_path) -> None:
+    write_fields(tmp_path)
+    assert [path.name for path in export_results(tmp_path, "csv", tmp_path / "out").files] == ["fields.csv"]
+    with pytest.raises(
+        ExportError, match=r"this campaign has no laser, so there is neither drift nor profile to write"
+    ):
+        export_results(tmp_path, "linuxcnc", tmp_path / "out")
+
+
 def test_a_folder_without_results_is_refused(tmp_path) -> None:
     with pytest.raises(
         ExportError, match=r"there is no deviations.nc in it; name the results folder of a finished run"
