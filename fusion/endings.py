@@ -29,7 +29,7 @@ from interferometry.errors import InterferometryError
 from thermography.errors import ThermographyError
 
 #: Seconds after which a process that was told to stop is ended, whatever it is in the middle of: every product is whole at any time.
-_GRACE_S = 1.5
+_GRACE_S = 1.0
 _SIGNAL_BASE = 128
 _STOPPING = (signal.SIGINT, signal.SIGTERM)
 

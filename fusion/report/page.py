@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import base64
+from collections.abc import Mapping, Sequence
+from hashlib import sha256
 from importlib import resources
 from typing import Any
 
@@ -31,14 +33,45 @@ def render_page(template: str, charts: Mapping[str, Chart], **context: Any) -> s
     str
         One HTML page. Every variable is escaped where it is shown.
     """
-    loader = jinja2.FileSystemLoader(str(resources.files("fusion.report") / "templates"))
+    templates = resources.files("fusion.report") / "templates"
+    loader = jinja2.FileSystemLoader(str(templates))
     environment = jinja2.Environment(
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
     environment.filters |= {"number": number, "css_string": _css_string}
+    own = Markup((templates / "page.js").read_text(encoding="utf-8"))
+    scripts = (*chart_scripts(), own) if charts else (own,)
     return environment.get_template(template).render(
-        figures=embed(charts), chart_scripts=chart_scripts() if charts else "", **context
+        figures=embed(charts), scripts=scripts, policy=content_security_policy(scripts), **context
     )
+
+
+def content_security_policy(scripts: Sequence[str]) -> Markup:
+    """Return what a browser may do with a page: run these scripts, draw, and nothing else; above all, load nothing.
+
+    Parameters
+    ----------
+    scripts : sequence of str
+        Texts of the page's script elements; any other script in it is not run, wherever it came from.
+
+    Returns
+    -------
+    Markup
+        For a ``meta`` element. Styles may stand in the page because the charts make theirs while they are drawn.
+
+    References
+    ----------
+    Content Security Policy Level 3, W3C Working Draft, sections 6.1 (directives) and 8.3 (hashes of scripts).
+
+    Examples
+    --------
+    >>> str(content_security_policy(["start()"])).split("; ")[1]
+    "script-src 'sha256-DIm7WJS6ZKDYe5qFLPy+h4JFI9Bol5QmYC57mt3Fb00='"
+    """
+    hashes = (base64.b64encode(sha256(text.encode()).digest()).decode() for text in scripts)
+    allowed = " ".join(f"'sha256-{one}'" for one in hashes)
+    rest = "style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'; form-action 'none'"
+    return Markup(f"default-src 'none'; script-src {allowed}; {rest}")
 
 
 def _css_string(text: str) -> Markup:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import socket
 from html.parser import HTMLParser
 from pathlib import Path
@@ -82,7 +83,7 @@ def test_names_from_files_are_text_in_the_report(record_results: Path) -> None:
     assert "&lt;script&gt;window.harmed=1" in page and "HYPERLINK" in page
     found = Elements()
     found.feed(page)
-    # BokehJS, the script that draws the charts, and that of the contents.
+    # BokehJS, the script that draws the charts, and that of the page.
     assert found.scripts <= 3
     assert found.handlers == []
     assert all(address.startswith(("#", "data:")) for address in found.addresses), found.addresses
@@ -95,3 +96,26 @@ def test_products_are_strict_json_and_lie_where_they_belong(record_results: Path
     written = {"fusion.nc", "results.json", "provenance.json", "report.html", "manifest.json", ".stages"}
     assert {path.name for path in record_results.iterdir()} == written
     assert {path.name for path in record_results.parent.iterdir()} == {"campaign.toml", "record.csv", "results"}
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium")
+def test_a_browser_runs_no_script_of_a_file_and_loads_nothing(record_results: Path, tmp_path: Path) -> None:
+    """Even what a template forgot to escape is not run: the policy of the page names its own scripts by their hashes."""
+    from playwright.sync_api import sync_playwright
+
+    page = (record_results / "report.html").read_text(encoding="utf-8")
+    forgotten = "<script>window.harmed=1</script><img src='http://localhost/x.png' onerror='window.harmed=1'></main>"
+    (tmp_path / "forgotten.html").write_text(page.replace("</main>", forgotten), encoding="utf-8")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        for path, refused in ((record_results / "report.html", 0), (tmp_path / "forgotten.html", 3)):
+            tab = browser.new_page()
+            told: list[str] = []
+            tab.on("console", lambda message, told=told: told.append(message.text) if message.type == "error" else None)
+            tab.on("pageerror", lambda error, told=told: told.append(str(error)))
+            tab.goto(path.as_uri())
+            tab.wait_for_selector("html[data-charts=drawn]")
+            assert tab.evaluate("window.harmed") is None
+            assert len(told) == refused and all("Content Security Policy" in text for text in told), told
+        browser.close()

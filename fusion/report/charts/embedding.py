@@ -51,7 +51,7 @@ def embed(charts: Mapping[str, Chart]) -> dict[str, EmbeddedChart]:
     -------
     dict of str to EmbeddedChart
         For the variable ``figures`` of a template, which puts each in its place with ``{{ draw(name, caption) }}`` of
-        ``charts.html.j2`` and ends with ``{{ chart_scripts() }}``.
+        ``charts.html.j2``; `chart_scripts` end the page.
 
     Notes
     -----
@@ -82,8 +82,8 @@ def _height(chart: Chart) -> int:
 
 
 @cache
-def chart_scripts() -> Markup:
-    """Return BokehJS and what draws the charts, as script elements; once per page, after the last chart.
+def chart_scripts() -> tuple[Markup, ...]:
+    """Return BokehJS and what draws the charts, as texts for script elements; once per page, after the last chart.
 
     Notes
     -----
@@ -93,9 +93,7 @@ def chart_scripts() -> Markup:
 
     library = (Path(bokeh.__file__).parent / "server" / "static" / "js" / "bokeh.min.js").read_text(encoding="utf-8")
     own = (resources.files("fusion.report") / "templates" / "charts.js").read_text(encoding="utf-8")
-    return Markup("").join(
-        Markup("<script>{}</script>\n").format(_in_script(text, "</script")) for text in (library, own)
-    )
+    return tuple(_in_script(text, "</script") for text in (library, own))
 
 
 def _in_script(text: str, closing: str) -> Markup:

@@ -32,7 +32,7 @@ def opened(report: Path) -> Iterator[tuple[Page, list[str]]]:
     faults: list[str] = []
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 1280, "height": 900})
+        page = browser.new_page(viewport={"width": 1280, "height": 900}, bypass_csp=True)
         page.on("pageerror", lambda error: faults.append(f"page error: {error}"))
         page.on(
             "console", lambda message: faults.append(f"console: {message.text}") if message.type == "error" else None
