@@ -22,6 +22,7 @@ from fusion.campaign.config import Campaign, relative_name
 from fusion.campaign.frame_stacks import camera_accuracy_notices, stack_options
 from fusion.campaign.logged_tables import read_drivers, split_heading
 from fusion.campaign.recompensation import RecompensationError, compensate_readings, see_material
+from fusion.campaign.sensors import read_sensors
 from fusion.campaign.sources import (
     CameraInputs,
     Cycles,
@@ -70,6 +71,7 @@ def read_source(campaign: Campaign) -> LaserInputs | CameraInputs | Source:
     """
     common: dict[str, Any] = {"campaign": campaign, "drivers": _read_drivers(campaign)}
     common["duty"] = _randomised(campaign, common["drivers"])
+    common["sensors"] = read_sensors(campaign)
     if campaign.interferometry is not None:
         common |= read_laser(campaign)
     _refuse_mixed_zones(campaign, common)
@@ -174,6 +176,8 @@ def _refuse_mixed_zones(campaign: Campaign, read: Mapping[str, Any]) -> None:
         "drivers": drivers and drivers.file,
     }
     logs = {str(file): read[name] for name, file in files.items() if read.get(name) is not None}
+    if campaign.sensors is not None and read["sensors"] is not None:
+        logs[campaign.sensors.file] = read["sensors"].temperature.to_dataset(name="temperature")
     refuse_mixed_zones(logs, source=str(campaign.path))
 
 

@@ -14,6 +14,7 @@ from fusion.attribution.randomised_duty import DutyLaw
 from fusion.attribution.thermal_modes import Region
 from fusion.campaign.config import Campaign, InterferometryTable, PlanTable, ThermographyTable
 from fusion.campaign.iso_budget import StatedBudget
+from fusion.campaign.sensors import ContactSensors
 from fusion.products.results import Notice
 from thermography.io.flir import FrameReference
 from thermography.registration.lens import Lens
@@ -104,6 +105,8 @@ class Inputs:
         The campaign file.
     environment, drivers : Dataset or None
         Logs along ``time`` (UTC); None where nothing was logged.
+    sensors : ContactSensors or None
+        Contact sensors on the table; None where there are none.
     duty : tuple or None
         Randomised loads over time and the law that they were drawn from.
     notices : list of Notice
@@ -113,6 +116,7 @@ class Inputs:
     campaign: Campaign
     environment: xr.Dataset | None = None
     drivers: xr.Dataset | None = None
+    sensors: ContactSensors | None = None
     duty: tuple[xr.DataArray, DutyLaw] | None = None
     notices: list[Notice] = field(default_factory=list)
 

@@ -20,6 +20,7 @@ from fusion.consistency.field_series import field_at, thin_fields
 from fusion.consistency.frames import check_frames
 from fusion.consistency.logs import check_contact_sensors, check_log
 from fusion.consistency.place import check_gaps, check_place
+from fusion.consistency.plan_sensors import check_sensors, compare_sensors
 from fusion.consistency.readings import check_readings
 from fusion.consistency.registration import check_registration
 from fusion.consistency.signs import check_signs
@@ -53,6 +54,8 @@ def check_source(source: Inputs) -> list[Check]:
     checks: list[Check] = []
     if isinstance(source, LaserInputs):
         checks += _check_readings_and_logs(source)
+    if source.sensors is not None:
+        checks += check_sensors(source.sensors.temperature, file=source.sensors.file)
     if isinstance(source, CameraInputs):
         checks += check_order(source.frames)
         checks += _phase(source) if isinstance(source, Source) else []
@@ -82,8 +85,30 @@ def _check_readings_and_logs(source: LaserInputs) -> list[Check]:
             file=drivers.file if drivers is not None else "the drivers' log",
             endangers="every effect that follows a load, and the verdict that none is missing",
         ),
+        *_check_coverage_of_sensors(source),
         *check_contact_sensors(source.environment, source.drivers, file=environment_file or "the environment log"),
     ]
+
+
+def _check_coverage_of_sensors(source: LaserInputs) -> list[Check]:
+    """Whether the contact sensors cover the readings, where they stand for the camera."""
+    if source.sensors is None or isinstance(source, CameraInputs):
+        return []
+    return check_log(
+        source.sensors.temperature.to_dataset(name="temperature"),
+        source.deviations["time"].values.ravel(),
+        name="sensors",
+        file=source.sensors.file,
+        endangers="every effect that follows the temperature of the table",
+    )
+
+
+def _compare_sensors(source: CameraInputs, fields: xr.Dataset) -> list[Check]:
+    """The camera's rise against that of contact sensors, where there are any."""
+    sensors = source.sensors
+    if sensors is None:
+        return []
+    return compare_sensors(fields, sensors.temperature, sensors.x_mm, sensors.y_mm, u_K=sensors.u_K)
 
 
 def _extent_along_axis(campaign: Campaign) -> float | None:
@@ -132,6 +157,7 @@ def check_fields(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> list[
         *check_load_clock(field, source.drivers, file=drivers_file),
         *check_load_scale(field, source.drivers, file=drivers_file),
         *check_material(near, source.environment, stated=place_mm is not None, file=environment_file),
+        *_compare_sensors(source, fields),
         *check_place(fields),
         *check_gaps(fields["time"].values, source.deviations["time"]),
     ]
@@ -152,6 +178,7 @@ def check_fields_alone(source: CameraInputs, fields: xr.Dataset) -> list[Check]:
     return [
         *check_load_clock(field, source.drivers, file=drivers_file),
         *check_load_scale(field, source.drivers, file=drivers_file),
+        *_compare_sensors(source, fields),
         *check_place(fields),
     ]
 

@@ -99,6 +99,9 @@ def model_drift(
         anomalies = [scale_evidence(one, source.axis, fields, deviations["position"]) for one in anomalies]
         axis_u = axis_scale_u(fields, source.axis, deviations["position"].values)
         loop = scale_coefficients(loop, effects, axis_u=axis_u, plan_u=plan_scale_u(fields))
+    elif "axis_scale_u" in fused:
+        scale_u = float(fused["axis_scale_u"])
+        loop = scale_coefficients(loop, effects, axis_u=scale_u, plan_u=scale_u)
     parts = {
         "anomalies": [
             {**one, "position_mm": float(deviations["position"].sel(target=one["target"]))} for one in anomalies
@@ -205,11 +208,18 @@ def library_for(source: Inputs) -> dict[str, Effect]:
     source : the campaign as read
     """
     effects, table = library(), source.campaign.interferometry
+    if source.campaign.thermography is None:
+        effects = {name: _without_camera(effect) if effect.errs_camera else effect for name, effect in effects.items()}
     if table is None:
         return effects
     stated_u = table.expansion_coefficient_u_ppm_per_K
     expected = Prior(table.expansion_coefficient_ppm_per_K, EXPANSION_U_PPM_PER_K if stated_u is None else stated_u)
     return {**effects, "axis_expansion": replace(effects["axis_expansion"], prior=expected)}
+
+
+def _without_camera(effect: Effect) -> Effect:
+    """An error of the camera where there is none: told as not available."""
+    return replace(effect, needs=lambda readings: "the campaign has no camera")
 
 
 def field_notices(errors: Sequence[FieldFault]) -> list[Notice]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from fusion.alignment.align import align, align_logs
+from fusion.alignment.align import AxisGeometry, align, align_logs
+from fusion.alignment.sensor_line import add_sensor_line
 from fusion.campaign.inputs import counted, listed
 from fusion.campaign.iso_budget import material_by_cycle
 from fusion.campaign.sources import LaserInputs, Source
@@ -212,7 +213,30 @@ def align_with_logs(source: LaserInputs, deviations: xr.Dataset) -> tuple[xr.Dat
     """
     used, gross = _without_gross(deviations)
     fused = align_logs(used, environment=source.environment, drivers=source.drivers)
-    return fused, _gross_notices(deviations, gross, source.campaign.zone_of("interferometry"))
+    sensors, plan = source.sensors, source.campaign.plan
+    if sensors is not None and plan is not None and plan.axis is not None:
+        axis = AxisGeometry(plan.axis.origin_mm, plan.axis.direction)
+        fused = add_sensor_line(fused, sensors.temperature, sensors.x_mm, sensors.y_mm, axis, file=sensors.file)
+    return fused, [
+        *_sensor_notices(fused),
+        *_gross_notices(deviations, gross, source.campaign.zone_of("interferometry")),
+    ]
+
+
+def _sensor_notices(fused: xr.Dataset) -> list[Notice]:
+    """Return the notice that contact sensors stand for the camera, with what the line between them misses."""
+    if "interpolation_u" not in fused:
+        return []
+    missed, share = float(fused["interpolation_u"]), float(fused["axis_scale_u"])
+    return [
+        Notice(
+            "sensors_for_the_camera",
+            "The rise along the axis comes from contact sensors, on a straight line from one to the next. A sensor is missed by the "
+            f"line through the others by {missed:.2g} K ({share:.0%} of the rise), which enters the uncertainty of every coefficient "
+            "per kelvin; a warm spot between the sensors is not seen.",
+            "Place sensors where the table warms most, evenly along the axis.",
+        )
+    ]
 
 
 def _without_gross(deviations: xr.Dataset) -> tuple[xr.Dataset, xr.DataArray]:

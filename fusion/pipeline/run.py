@@ -337,7 +337,7 @@ def _model(
     modelled = deviations.sel(target=fused["target"].values)
     return run.stage(
         "model",
-        ("plan", "interferometry", "drivers", "model"),
+        ("plan", "interferometry", "sensors", "drivers", "model"),
         after,
         lambda: drift_model.model_drift(source, fields, fused, modelled, report=run.report),
         read_dataset,

@@ -173,6 +173,8 @@ def _content(source: Inputs) -> Iterator[str]:
         yield from _readings_content(source)
     if isinstance(source, CameraInputs):
         yield from _frames_content(source)
+    if source.sensors is not None:
+        yield f"contact sensors: {', '.join(source.sensors.names)}, {counted(source.sensors.temperature.sizes['time'], 'row')}"
     for name, log in (("environment", source.environment), ("drivers", source.drivers)):
         if log is not None:
             yield f"{name}: {counted(log.sizes['time'], 'row')}, {', '.join(str(column) for column in log.data_vars)}"
@@ -206,6 +208,8 @@ def _recordings(source: Inputs) -> Iterator[Recording]:
         yield Recording("frames", camera_on_laser_clock(source.frame_times, offset_s))
     if isinstance(source, LaserInputs):
         yield Recording("readings", source.deviations["time"].values.ravel())
+    if source.sensors is not None:
+        yield Recording("contact sensors", source.sensors.temperature["time"].values)
     for name, log in (("environment", source.environment), ("drivers", source.drivers)):
         if log is not None:
             yield Recording(name, np.asarray(log["time"].values))

@@ -210,3 +210,51 @@ def test_a_very_large_test_ends(tmp_path: Path, cycles: int, targets: int) -> No
     results = run_campaign(write_laser(tmp_path / "campaign", cycles, targets, BOTH), tmp_path / "results")
     assert results.loop is not None and results.drift is not None
     assert len(results.drift.profile_um["positive"]) == targets
+
+
+def write_sensors(campaign: Path, fields: Path, *, gain: float = 1.0) -> None:
+    """Five sensors under the measured line, as the fields of the same test show their places."""
+    frames = read_dataset(fields)["frame_temperature"].interpolate_na("x", fill_value="extrapolate")
+    x = [480.0, 430.0, 380.0, 310.0, 250.0]
+    at = frames.interp(x=("sensor", x), y=("sensor", [90.0] * 5)).values
+    at = at[0] + gain * (at - at[0])
+    stamps = [f"{np.datetime_as_string(time, unit='ms')}Z" for time in frames["time"].values]
+    rows = [",".join([stamp, *(f"{value:.3f}" for value in row)]) for stamp, row in zip(stamps, at, strict=True)]
+    heading = ",".join(["time", *(f"t{k + 1} [degC]" for k in range(5))])
+    (campaign / "sensors.csv").write_text("\n".join([heading, *rows]) + "\n", encoding="utf-8")
+    places = [f"t{k + 1},{value:g},90" for k, value in enumerate(x)]
+    (campaign / "places.csv").write_text("\n".join(["name,x_mm,y_mm", *places]) + "\n", encoding="utf-8")
+
+
+SENSORS = '\n[sensors]\nfile = "sensors.csv"\nplaces = "places.csv"\ntemperature_u = "0.05 K"\n'
+
+
+def test_contact_sensors_stand_for_the_camera(folder: Path, results_folder: Path, tmp_path: Path) -> None:
+    write_sensors(folder, results_folder / "fields.nc")
+    path = without(folder / "campaign.toml", "thermography", name="sensors.toml", added=SENSORS)
+    results, both = run_campaign(path, tmp_path / "results"), read_results(results_folder)
+    assert results.loop is not None and both.loop is not None
+    assert results.loop.declared == ("axis_expansion", "table_offset")
+    (here,), (there,) = (
+        [one for one in loop.declared_coefficients if one.effect == "axis_expansion"]
+        for loop in (results.loop, both.loop)
+    )
+    # The same rise, from five places instead of all cells: the coefficients agree within their uncertainties.
+    assert abs(here.value - there.value) < 2.0 * np.hypot(here.u, there.u)
+    assert "the campaign has no camera" in results.loop.not_tried["camera_offset"]
+    (notice,) = [warning for warning in results.warnings if warning.code == "sensors_for_the_camera"]
+    assert "which enters the uncertainty of every coefficient per kelvin" in notice.message
+    assert results.inputs is not None
+    codes = {check.code: check.passed for check in results.inputs.checks}
+    assert codes["plan_sensors"] and codes["sensors_coverage"] and "sensors_rise" not in codes
+
+
+def test_contact_sensors_beside_the_camera_tell_a_wrong_rise(
+    folder: Path, results_folder: Path, tmp_path: Path
+) -> None:
+    write_sensors(folder, results_folder / "fields.nc", gain=1.5)
+    path = without(folder / "campaign.toml", "interferometry", "drivers", "model", name="beside.toml", added=SENSORS)
+    results = run_campaign(path, tmp_path / "results")
+    assert results.inputs is not None and results.inputs.state == "doubted"
+    (doubt,) = [check for check in results.inputs.doubts if check.code == "sensors_rise"]
+    assert "the camera shows a rise of" in doubt.evidence

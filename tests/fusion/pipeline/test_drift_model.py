@@ -60,16 +60,16 @@ def test_camera_errors_that_were_taken_out_are_noted():
 
 def test_the_expected_expansion_is_that_of_the_campaign_file():
     table = SimpleNamespace(expansion_coefficient_ppm_per_K=8.0, expansion_coefficient_u_ppm_per_K=None)
-    effects = library_for(SimpleNamespace(campaign=SimpleNamespace(interferometry=table)))
+    effects = library_for(SimpleNamespace(campaign=SimpleNamespace(interferometry=table, thermography=True)))
     assert effects["axis_expansion"].prior == Prior(8.0, 2.0)
     measured = SimpleNamespace(expansion_coefficient_ppm_per_K=8.0, expansion_coefficient_u_ppm_per_K=0.3)
-    campaign = SimpleNamespace(interferometry=measured)
+    campaign = SimpleNamespace(interferometry=measured, thermography=True)
     assert library_for(SimpleNamespace(campaign=campaign))["axis_expansion"].prior == Prior(8.0, 0.3)
     others = {name: effect for name, effect in effects.items() if name != "axis_expansion"}
     assert others == {name: effect for name, effect in library().items() if name != "axis_expansion"}
     assert list(effects) == list(library())
     assert library()["axis_expansion"].prior == Prior(11.7, 2.0)
-    assert library_for(SimpleNamespace(campaign=SimpleNamespace(interferometry=None))) == library()
+    assert library_for(SimpleNamespace(campaign=SimpleNamespace(interferometry=None, thermography=True))) == library()
 
 
 def test_a_camera_that_did_not_err_is_not_corrected():
