@@ -285,8 +285,9 @@ def _window_notice(source: CameraInputs) -> Notice:
     return Notice(
         "cycles_from_windows",
         f"No laser gives cycles: the frames are divided into {counted(len(bounds), 'window')} of {minutes:g} min"
-        f"{', as thermography.window states' if stated else ', a usual length for a recording this long'}; each counts as a cycle.",
-        "" if stated else 'Write thermography.window, for example "5 min", for windows of another length.',
+        f"{', as thermography.window states' if stated else ', a usual length here (thermography.window sets another)'}; "
+        "each counts as a cycle.",
+        "",
     )
 
 

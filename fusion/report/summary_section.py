@@ -410,15 +410,14 @@ def _surfaces_table(part: RadiometryPart) -> Table:
 
 def _hotspots_table(results: Results) -> Table:
     """Return name, area, peak, rise, and the positions whose drift goes with every hotspot."""
+    tested = results.drift is not None
     columns = [
         Words("Hotspot"),
         Words("Area"),
         Words("Peak at"),
         Words("Middle of the area"),
         "Peak rise / K (k = 2)",
-        Words("Positions whose drift goes with it"),
-        "p (family-wise)",
-        "Lag",
+        *((Words("Positions whose drift goes with it"), "p (family-wise)", "Lag") if tested else ()),
     ]
     least = results.correlation.least_p if results.correlation else None
     rows = [
@@ -428,9 +427,15 @@ def _hotspots_table(results: Results) -> Table:
             place(spot.x_mm, spot.y_mm),
             place(spot.centroid_x_mm, spot.centroid_y_mm),
             measured(spot.peak_rise_K, spot.peak_rise_u_K),
-            ", ".join(map(str, spot.targets)) or "none shown by these data",
-            p_cell(spot.p_value, least),
-            duration(spot.lag_s),
+            *(
+                (
+                    ", ".join(map(str, spot.targets)) or "none shown by these data",
+                    p_cell(spot.p_value, least),
+                    duration(spot.lag_s),
+                )
+                if tested
+                else ()
+            ),
         ]
         for spot in results.hotspots or ()
     ]

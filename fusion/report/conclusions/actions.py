@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from fusion.products.results import Results
-from fusion.products.results_loop import RecordLoop
 from fusion.report.conclusions.answers import position_words
 from fusion.report.conclusions.effects import action
 from fusion.report.findings import area_words, randomised_causes
@@ -25,7 +24,7 @@ def next_steps(results: Results) -> list[str]:
     steps = [check.remedy for check in results.inputs.doubts] if results.inputs else []
     loop = results.loop
     if loop is not None:
-        steps += [action(step, results.time, record=isinstance(loop, RecordLoop)) for step in loop.steps]
+        steps += [action(step, results.time, record=results.registration is None) for step in loop.steps]
         if loop.verdict in {"partial", "unexplained", "no_skill"}:
             steps.append(_log_more(loop.unexplained.shape))
     steps += [

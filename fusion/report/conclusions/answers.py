@@ -82,15 +82,16 @@ def headline(results: Results) -> str:
     """
     if results.loop is None:
         return conditional("Evaluated without a model of the drift.", results.inputs, "causes")
-    return conditional(_verdict(results.loop, results.time), results.inputs, "causes")
+    return conditional(
+        _verdict(results.loop, results.time, record=results.registration is None), results.inputs, "causes"
+    )
 
 
-def _verdict(loop: Loop, time: TimePart | None) -> str:
-    record = isinstance(loop, RecordLoop)
+def _verdict(loop: Loop, time: TimePart | None, *, record: bool) -> str:
     lacks = join([step_phrase(step, time, record=record) for step in loop.steps if step.confirmed])
     declared = join([phrase(name, record=record) for name in loop.declared])
     explains = f"The declared model explains the drift ({declared})" if declared else "No effect is declared"
-    last = "value" if record else "cycle"
+    last = "value" if isinstance(loop, RecordLoop) else "cycle"
     size = f" ({number(loop.unexplained.rms_um, 2)} µm rms)" if loop.unexplained.shape else ""
     alone = f"{'The declared model' if declared else 'Random drift'} does not explain the drift alone:"
     return {
