@@ -170,8 +170,8 @@ def build_chart(
     reference : {"time", "first_cycle"}
         Where the value at position 1 is taken: in the first cycle that reaches ``reference_s``, or in the first cycle.
     reference_s : float
-        Time since the first reading, s. The paper advises two hours, when changes have become slow. In a shorter test the last cycle
-        is taken.
+        Time since the first reading, s. The paper advises two hours, when changes have become slow. In a shorter test, and
+        without times, the last cycle is taken.
 
     Returns
     -------
@@ -389,14 +389,16 @@ def _repeat_first(values: np.ndarray) -> np.ndarray:
 def _reference_cycles(deviations: xr.Dataset, x: xr.DataArray, reference: str, reference_s: float) -> list[int]:
     """Return, per direction, the index of the cycle that gives the value at position 1; -1 where none was measured."""
     first = int(np.argmin(deviations["position"].values))
-    times = deviations["time"].values[:, :, first]
+    times = deviations["time"].values
+    seconds = np.full(times.shape, np.nan)
+    if not np.isnat(times).all():
+        seconds = (times - np.nanmin(times)) / np.timedelta64(1, "s")
     chosen = []
     for direction in range(x.sizes["direction"]):
         usable = np.flatnonzero(np.isfinite(x.values[:, direction, 0]))
         late = np.empty(0, dtype=int)
         if reference == "time":
-            since = (times[usable, direction] - np.nanmin(deviations["time"].values)) / np.timedelta64(1, "s")
-            late = usable[since >= reference_s]
+            late = usable[seconds[usable, direction, first] >= reference_s]
             usable = usable[::-1]
         chosen.append(int(late[0]) if late.size else int(usable[0]) if usable.size else -1)
     return chosen

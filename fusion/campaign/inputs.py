@@ -92,6 +92,12 @@ def _read_both(campaign: Campaign, common: Mapping[str, Any]) -> Source:
     """Read the frames of a campaign beside its readings, and refuse clocks that cannot both be right."""
     plan = campaign.plan
     assert plan is not None and plan.axis is not None
+    if not _is_timed(common["deviations"]):
+        assert campaign.interferometry is not None
+        raise AlignmentError(
+            f"{campaign.interferometry.deviations}: no reading has a time, so readings and frames cannot be brought together; give a table "
+            "with times, or leave [thermography] out: the readings alone are evaluated by ISO 230-2"
+        )
     axis = AxisGeometry(plan.axis.origin_mm, plan.axis.direction)
     cycles = cycles_of_readings(common["deviations"])
     source = Source(**common, **_read_camera(campaign, cycles), axis=axis)
@@ -145,7 +151,8 @@ def read_laser(campaign: Campaign) -> dict[str, Any]:
     deviations = bring_to_utc(deviations, zone, file=interferometry.deviations)
     check(deviations, DEVIATIONS, name=laser.name)
     _raise_if_too_few_readings(deviations, file=interferometry.deviations)
-    cycles_of_readings(deviations)
+    if _is_timed(deviations):
+        cycles_of_readings(deviations)
     environment = None
     if interferometry.environment is not None:
         environment = read_environment(campaign.resolve(interferometry.environment))
@@ -165,6 +172,11 @@ def read_laser(campaign: Campaign) -> dict[str, Any]:
             'write "logged", or add the frames'
         )
     return {**read, "deviations": deviations, "iso_budget": compensated.budget, "notices": []}
+
+
+def _is_timed(deviations: xr.Dataset) -> bool:
+    """Whether any reading has a time."""
+    return not bool(np.isnat(deviations["time"].values).all())
 
 
 def _refuse_mixed_zones(campaign: Campaign, read: Mapping[str, Any]) -> None:
@@ -307,7 +319,16 @@ def _laser_notices(source: LaserInputs) -> list[Notice]:
         *_as_read_notices(source),
         *_log_notices(source),
     ]
-    if source.environment is None:
+    if not _is_timed(source.deviations):
+        notices.append(
+            Notice(
+                "no_times",
+                f"{source.interferometry.deviations} gives no times: ISO 230-2 and neighbour differences are evaluated; drift, positions "
+                "that stand out and causes need the time of every reading.",
+                "Export one reading per line with its time.",
+            )
+        )
+    elif source.environment is None:
         notices.append(
             Notice(
                 "no_environment",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 
@@ -46,13 +48,14 @@ def evaluate_interferometry(source: LaserInputs) -> Outcome:
         Content of deviations.nc; parts ``iso230``, ``neighbours`` and ``drift``.
     """
     deviations = source.deviations
-    drift = estimate_drift(deviations)
-    deviations = flag_outliers(deviations, drift)
+    times = deviations["time"].values[np.isfinite(deviations["deviation"].values)]
+    drift = None if np.isnat(times).all() else estimate_drift(deviations)
+    deviations = deviations if drift is None else flag_outliers(deviations, drift)
     comparison = neighbours.compare(deviations, drift)
     windows, settled, standard = evaluate_standard(
         deviations,
         source.iso_budget,
-        drift=drift["drift"],
+        drift=None if drift is None else drift["drift"],
         material_degC=material_by_cycle(deviations, source.environment),
     )
     dataset = joined(
@@ -63,26 +66,20 @@ def evaluate_interferometry(source: LaserInputs) -> Outcome:
         chart=neighbours.build_chart(deviations),
         iso=windows,
         settled=settled,
-        drift=drift,
+        **({} if drift is None else {"drift": drift}),
     )
-    time = deviations["time"].values[np.isfinite(deviations["deviation"].values)]
     zone = source.campaign.zone_of("interferometry")
-    parts = {
-        "time": {"first": utc(time.min()), "last": utc(time.max()), "zone": zone},
+    parts: dict[str, Any] = {
         "iso230": standard,
         "neighbours": {
             "conventional_s_um": by_direction(comparison["conventional"]),
             "pair_s_um": by_direction(comparison["differenced"]),
             "ratio": by_direction(comparison["ratio"]),
         },
-        "drift": {
-            "profile_um": by_direction(drift["profile"]),
-            "profile_u_um": by_direction(drift["profile_u"]),
-            "scatter_um": by_direction(drift["scatter"]),
-            "position_mm": deviations["position"].values.tolist(),
-            **_drift_ranges(drift),
-        },
     }
+    if drift is not None:
+        parts["time"] = {"first": utc(times.min()), "last": utc(times.max()), "zone": zone}
+        parts["drift"] = _drift_part(deviations, drift)
     return Outcome(dataset, parts, tuple(_reading_notices(deviations, drift, zone)))
 
 
@@ -95,6 +92,17 @@ def utc(time: np.datetime64) -> str:
         UTC.
     """
     return f"{np.datetime_as_string(time, unit='s')}Z"
+
+
+def _drift_part(deviations: xr.Dataset, drift: xr.Dataset) -> dict[str, Any]:
+    """Return the part ``drift`` of results.json."""
+    return {
+        "profile_um": by_direction(drift["profile"]),
+        "profile_u_um": by_direction(drift["profile_u"]),
+        "scatter_um": by_direction(drift["scatter"]),
+        "position_mm": deviations["position"].values.tolist(),
+        **_drift_ranges(drift),
+    }
 
 
 def _drift_ranges(drift: xr.Dataset) -> dict[str, list[float]]:
@@ -121,26 +129,25 @@ def _approach_notices(deviations: xr.Dataset) -> list[Notice]:
     ]
 
 
-def _reading_notices(deviations: xr.Dataset, drift: xr.Dataset, zone: str | None) -> list[Notice]:
+def _reading_notices(deviations: xr.Dataset, drift: xr.Dataset | None, zone: str | None) -> list[Notice]:
     """Return notices for missing readings, with what they cost the profile, and for readings that were given little weight."""
     notices = _approach_notices(deviations)
     approached = deviations["deviation"].notnull().any(("cycle", "target")).values
     gaps = np.isnan(deviations["deviation"].values) & approached[:, None]
     if gaps.any():
         cycles = [str(cycle) for cycle in deviations["cycle"].values[gaps.any(axis=(1, 2))]]
-        share = np.sqrt(1.0 - gaps.mean(axis=0))
-        wider = float(np.nanmax(drift["profile_u"].values * (1.0 - share)))
-        notices.append(
-            Notice(
-                "readings_missing",
-                f"{counted(int(gaps.sum()), 'reading')} of {gaps[:, approached].size} missing, in {counted(len(cycles), 'cycle')}: "
-                f"{listed(cycles)}. "
-                f"This widens the profile's standard uncertainty by up to {wider:.3f} µm. The joint estimate allows for gaps; conventional "
-                "values use the remaining readings.",
-                remedy="",
-                effect_um=wider,
-            )
+        missing = (
+            f"{counted(int(gaps.sum()), 'reading')} of {gaps[:, approached].size} missing, in {counted(len(cycles), 'cycle')}: "
+            f"{listed(cycles)}."
         )
+        if drift is None:
+            notices.append(Notice("readings_missing", f"{missing} The values use the remaining readings.", remedy=""))
+        else:
+            share = np.sqrt(1.0 - gaps.mean(axis=0))
+            wider = float(np.nanmax(drift["profile_u"].values * (1.0 - share)))
+            effect = f"This widens the profile's standard uncertainty by up to {wider:.3f} µm."
+            remaining = "The joint estimate allows for gaps; conventional values use the remaining readings."
+            notices.append(Notice("readings_missing", f"{missing} {effect} {remaining}", remedy="", effect_um=wider))
     outliers = (deviations["quality_flag"] & OUTLIER.mask) > 0
     if outliers.any():
         named = _names(outliers, deviations, zone)

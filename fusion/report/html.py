@@ -135,7 +135,8 @@ def _draw_charts(results: Results, datasets: Mapping[str, Any]) -> dict[str, Cha
     if fields is not None:
         charts |= {"registration": plan.plot_registration(fields), "rise_history": plan.plot_rise_history(fields)}
     if deviations is not None:
-        charts |= _drift_charts(results, deviations)
+        charts |= _reading_charts(deviations)
+        charts |= _drift_charts(results, deviations) if has(deviations, "drift") else {}
     if fused is not None:
         root = fused.to_dataset()
         if "time" in root:
@@ -151,37 +152,47 @@ def _draw_charts(results: Results, datasets: Mapping[str, Any]) -> dict[str, Cha
     return charts
 
 
-def _drift_charts(results: Results, deviations: xr.Dataset) -> dict[str, Chart]:
-    """The charts that need the readings alone."""
-    joint, position = group(deviations, "drift"), deviations["position"]
-    flagged = {anomaly.target for anomaly in results.anomalies or ()}
-    shown = min(flagged, default=int(deviations["target"][min(3, deviations.sizes["target"] - 1)]))
-    shifted = evaluate_common_start(deviations)
-    read = deviations["deviation"].notnull().any(("cycle", "target"))
-    sides = [str(side) for side in read["direction"].values[read.values]]
-    windows = group(deviations, "iso")
-    both: dict[str, Chart] = {}
-    if len(sides) == 2:
-        both["reversal"] = drift.plot_reversal(joint, position)
-        # The last window is the whole test.
-        both |= {"windows": readings.plot_windows(windows)} if windows.sizes["window"] > 1 else {}
+def _reading_charts(deviations: xr.Dataset) -> dict[str, Chart]:
+    """The charts that need neither the times of the readings nor their drift."""
+    position, shifted, sides = deviations["position"], evaluate_common_start(deviations), _sides(deviations)
     return {
         **{f"deviations_{side}": readings.plot_cycles(deviations, side) for side in sides},
         **{
             f"common_start_{side}": readings.plot_cycles(shifted, side, quantity="deviation from a common start")
             for side in sides
         },
+        "scatter": neighbours.plot_scatter_comparison(group(deviations, "comparison"), position),
+        "mean_differences": neighbours.plot_mean_differences(group(deviations, "neighbours"), position),
+        "chart": neighbours.plot_reference_chart(group(deviations, "chart"), position),
+        **({"iso230": iso230.plot_test(group(deviations, "settled"), position)} if has(deviations, "settled") else {}),
+    }
+
+
+def _sides(deviations: xr.Dataset) -> list[str]:
+    """The directions of approach in which readings were taken."""
+    read = deviations["deviation"].notnull().any(("cycle", "target"))
+    return [str(side) for side in read["direction"].values[read.values]]
+
+
+def _drift_charts(results: Results, deviations: xr.Dataset) -> dict[str, Chart]:
+    """The charts of the drift of the readings."""
+    joint, position = group(deviations, "drift"), deviations["position"]
+    flagged = {anomaly.target for anomaly in results.anomalies or ()}
+    shown = min(flagged, default=int(deviations["target"][min(3, deviations.sizes["target"] - 1)]))
+    windows = group(deviations, "iso")
+    both: dict[str, Chart] = {}
+    if len(_sides(deviations)) == 2:
+        both["reversal"] = drift.plot_reversal(joint, position)
+        # The last window is the whole test.
+        both |= {"windows": readings.plot_windows(windows)} if windows.sizes["window"] > 1 else {}
+    return {
         "deviation_map": drift.plot_deviation_map(deviations),
         "drift_map": drift.plot_drift_map(joint, position),
         "history": readings.plot_history(deviations, joint, shown),
         "drift": drift.plot_drift(joint, deviations),
         "profile": drift.plot_profile(joint, position),
-        "scatter": neighbours.plot_scatter_comparison(group(deviations, "comparison"), position),
-        "mean_differences": neighbours.plot_mean_differences(group(deviations, "neighbours"), position),
-        "chart": neighbours.plot_reference_chart(group(deviations, "chart"), position),
         **both,
         "anomalies": drift.plot_position_scatter(joint, position, flagged),
-        **({"iso230": iso230.plot_test(group(deviations, "settled"), position)} if has(deviations, "settled") else {}),
     }
 
 

@@ -11,7 +11,7 @@ import xarray as xr
 from fusion.attribution.family_wise import LEVEL as ATTRIBUTION_LEVEL
 from fusion.diagnosis.remainder import LEVEL as REMAINDER_LEVEL
 from fusion.loop.axis import ENTRY_LEVEL, SEARCH_LEVEL, SECOND_LEVEL
-from fusion.products.grouped import group
+from fusion.products.grouped import group, has
 from fusion.products.results import Results
 from fusion.products.results_axis import NeighboursPart
 from fusion.products.results_inputs import Figures
@@ -178,7 +178,7 @@ def describe_campaign(
         if results.radiometry and results.radiometry.edge_cells
         else None,
         "hotspots": _hotspots_table(results) if results.hotspots else None,
-        "positions": None if deviations is None else _positions_table(deviations),
+        "positions": None if results.drift is None or deviations is None else _positions_table(deviations),
         "neighbours": "" if results.neighbours is None else _neighbours_text(results.neighbours),
         "comparison": None if deviations is None else _comparison_table(deviations),
         "iso230": None if results.iso230 is None else describe_iso230(results.iso230, deviations),
@@ -199,7 +199,10 @@ def _titles(results: Results, sections: tuple[tuple[str, str, str], ...]) -> lis
 
 def _subtitle(provenance: Mapping[str, Any], deviations: xr.Dataset | None, zone: str | None) -> str:
     axis = provenance["parameters"]["campaign"].get("axis", "")
-    parts = [f"{axis} axis" if axis else "", moment(time_span(deviations)[0], zone) if deviations is not None else ""]
+    start = ""
+    if deviations is not None and has(deviations, "drift"):
+        start = moment(time_span(deviations)[0], zone)
+    parts = [f"{axis} axis" if axis else "", start]
     return ", ".join(part for part in parts if part)
 
 
@@ -207,10 +210,13 @@ def _measured(deviations: xr.Dataset | None, fields: xr.Dataset | None) -> str:
     """What was measured, in one sentence."""
     if deviations is not None:
         sizes = deviations.sizes
-        first, last = time_span(deviations)
+        lasted = "of unknown duration"
+        if has(deviations, "drift"):
+            first, last = time_span(deviations)
+            lasted = f"{duration(float((last - first) / np.timedelta64(1, 's')))} in all"
         return (
             f"Measured: {sizes['target']} positions over {np.ptp(deviations['position'].values):g} mm, approached "
-            f"{_approaches(deviations)} in {sizes['cycle']} cycles, {duration(float((last - first) / np.timedelta64(1, 's')))} in all."
+            f"{_approaches(deviations)} in {sizes['cycle']} cycles, {lasted}."
         )
     if fields is None:
         return ""
@@ -289,8 +295,8 @@ def _data_rows(
         readings = int(np.isfinite(deviations["deviation"]).sum())
         origin = deviations["time"].attrs.get("origin", "recorded")
         rows.append(("Readings", f"{readings} of {deviations['deviation'].size} possible; times {origin}"))
-        first, last = time_span(deviations)
-        rows.append(("Time", _span(first, last, results)))
+        if has(deviations, "drift"):
+            rows.append(("Time", _span(*time_span(deviations), results)))
     if fields is not None:
         first, last = fields["time"].values[[0, -1]]
         clock = ", on the laser's clock" if results.alignment is not None else ""
@@ -462,19 +468,25 @@ def _positions_table(deviations: xr.Dataset) -> Table:
 def _comparison_table(deviations: xr.Dataset) -> Table:
     """Return conventional, differenced, their ratio and the joint estimate's own standard deviation, per position and approach."""
     comparison = group(deviations, "comparison")
+    headings = {
+        "conventional": "Conventional s {} / µm",
+        "differenced": "Of differences s {} / µm",
+        "ratio": "Ratio {}",
+        "joint": "Joint estimate s {} / µm",
+    }
+    columns = [name for name in headings if name in comparison]
     rows = [
         [
             str(link),
             *(
                 f"{float(comparison[name].sel(link=link, direction=direction)):.2f}"
                 for direction in _SIGNS
-                for name in ("conventional", "differenced", "ratio", "joint")
+                for name in columns
             ),
         ]
         for link in comparison["link"].values
     ]
-    headings = ("Conventional s {} / µm", "Of differences s {} / µm", "Ratio {}", "Joint estimate s {} / µm")
-    return table(["Position", *(text.format(sign) for sign in _SIGNS.values() for text in headings)], rows)
+    return table(["Position", *(headings[name].format(sign) for sign in _SIGNS.values() for name in columns)], rows)
 
 
 def _neighbours_text(part: NeighboursPart) -> str:

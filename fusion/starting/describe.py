@@ -86,7 +86,9 @@ def _describe_deviations(path: Path, deviations: xr.Dataset) -> list[str]:
         origin = deviations["time"].attrs["origin"]
         lines.append(f"  {moment(timed.min())} to {moment(timed.max())}, times {origin}{_zone(deviations)}")
     else:
-        lines.append("  no times: thermofuse run needs one per reading")
+        lines.append(
+            "  no times: thermofuse run evaluates them by ISO 230-2, and needs one per reading for drift and causes"
+        )
     return [*lines, *(f"  {line}" for line in describe_test(deviations)), *_warnings(deviations)]
 
 

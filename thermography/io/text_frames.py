@@ -14,6 +14,8 @@ from thermography.io.temperature_frames import StackContents, StackOptions, Temp
 _DELIMITERS = (";", "\t", ",", " ")
 #: Fewest rows and columns of a frame: a table with a few columns is none.
 _FEWEST = 8
+#: Largest share of the pixels of a frame that hold no number: with more it is a table with words.
+_MOST_MISSING = 0.25
 #: Largest ratio of the sides of a frame: a log of a few columns over many lines is none.
 _LONGEST = 4
 #: A text frame of a large camera has about 10 MB.
@@ -100,7 +102,9 @@ class TextReader(TemperatureReader):
 
 def _is_a_frame(block: list[list[float]]) -> bool:
     rows, columns = len(block), len(block[0]) if block else 0
-    return min(rows, columns) >= _FEWEST and max(rows, columns) <= _LONGEST * min(rows, columns)
+    if min(rows, columns) < _FEWEST or max(rows, columns) > _LONGEST * min(rows, columns):
+        return False
+    return bool(np.isnan(block).mean() <= _MOST_MISSING)
 
 
 def _longest_block(lines: list[str], delimiter: str) -> list[list[float]]:

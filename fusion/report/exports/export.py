@@ -11,6 +11,7 @@ from pathlib import Path
 import pandas as pd
 import xarray as xr
 
+from fusion.products.grouped import has
 from fusion.products.results import Results, read_results
 from fusion.products.store import read_dataset, write_atomically
 from fusion.report.exports import tables
@@ -122,6 +123,11 @@ def export_results(
 
         content = {"results.xlsx": lambda path: write_workbook(path, found, deviations)}
         return Exported(_write(out, content, overwrite=overwrite))
+    if not has(deviations, "drift"):
+        raise ExportError(
+            f"{results}: the readings have no times, so there is neither drift nor profile to write; --format csv and xlsx give the values "
+            "by ISO 230-2"
+        )
     run = _Run(results, found, deviations, read_origin(results, found, read_thermal_state(results, deviations)))
     texts, notes = (
         _temperature_text(run, axis, reference_mm, force=force)
@@ -274,9 +280,10 @@ def _export_camera(results: Path, format: str, out: Path, *, overwrite: bool) ->
 
 def _csv_files(folder: Path, results: Results, deviations: xr.Dataset, *, with_fields: bool) -> dict[str, Writer]:
     """Return the writers of the CSV tables by file name."""
+    timed = has(deviations, "drift")
     frames = {
-        "drift.csv": tables.readings_table(deviations),
-        "profile.csv": tables.profile_table(deviations),
+        "drift.csv" if timed else "readings.csv": tables.readings_table(deviations),
+        **({"profile.csv": tables.profile_table(deviations)} if timed else {}),
         "iso230.csv": tables.iso230_axis_table(deviations),
         "iso230_positions.csv": tables.iso230_position_table(deviations, results),
     }

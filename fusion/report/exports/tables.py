@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 import xarray as xr
 
-from fusion.products.grouped import group
+from fusion.products.grouped import group, has
 from fusion.products.results import Results
 from fusion.products.store import read_dataset
 from fusion.report.findings import quoted_window
@@ -19,23 +19,25 @@ _FIELD_ROW_BYTES = 38
 
 
 def readings_table(deviations: xr.Dataset) -> pd.DataFrame:
-    """Return every reading with its drift and the standard uncertainty of that.
+    """Return every reading with its drift and the standard uncertainty of that; of readings without times, the readings alone.
 
     Parameters
     ----------
     deviations : Dataset
         Product ``deviations.nc``.
     """
-    drift = group(deviations, "drift")
-    readings = xr.Dataset(
-        {
-            "position_mm": deviations["position"],
-            "time_utc": deviations["time"],
-            "deviation_um": deviations["deviation"],
-            "drift_um": drift["drift"],
-            "drift_u_um": drift["drift_u"],
-        }
-    )
+    readings = xr.Dataset({"position_mm": deviations["position"], "deviation_um": deviations["deviation"]})
+    if has(deviations, "drift"):
+        drift = group(deviations, "drift")
+        readings = xr.Dataset(
+            {
+                "position_mm": deviations["position"],
+                "time_utc": deviations["time"],
+                "deviation_um": deviations["deviation"],
+                "drift_um": drift["drift"],
+                "drift_u_um": drift["drift_u"],
+            }
+        )
     return readings.to_dataframe().dropna(subset=["deviation_um"]).reset_index()
 
 

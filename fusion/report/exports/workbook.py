@@ -14,6 +14,7 @@ from openpyxl.cell import WriteOnlyCell
 from openpyxl.cell.cell import ILLEGAL_CHARACTERS_RE
 from openpyxl.styles import Font
 
+from fusion.products.grouped import has
 from fusion.products.results import Results
 from fusion.report.exports.tables import iso230_axis_table, iso230_position_table, profile_table, readings_table
 from fusion.report.terminal import summary_rows
@@ -41,7 +42,7 @@ def write_workbook(path: Path, results: Results, deviations: xr.Dataset) -> None
     for title, frame in (
         ("ISO 230-2 axis", iso230_axis_table(deviations)),
         ("ISO 230-2 positions", iso230_position_table(deviations, results)),
-        ("Profile", profile_table(deviations)),
+        *((("Profile", profile_table(deviations)),) if has(deviations, "drift") else ()),
         ("Readings", readings_table(deviations)),
     ):
         columns = [str(name) for name in frame.columns]

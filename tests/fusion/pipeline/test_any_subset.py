@@ -10,12 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fusion.alignment.align import AlignmentError
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.pipeline.run import run_campaign
 from fusion.products.results import Results, read_results
 from fusion.products.store import read_dataset, read_tree
 from fusion.report.exports.export import ExportError, export_results
 from fusion.report.terminal import summary_rows
+from fusion.starting.check import check_campaign
 from tests.fusion.campaign_parts import without
 
 CAMERA_CHECKS = ("camera", "fiducial", "plan", "frames", "frozen", "scene", "material", "axis_line")
@@ -259,3 +261,50 @@ def test_contact_sensors_beside_the_camera_tell_a_wrong_rise(
     assert results.inputs is not None and results.inputs.state == "doubted"
     (doubt,) = [check for check in results.inputs.doubts if check.code == "sensors_rise"]
     assert "the camera shows a rise of" in doubt.evidence
+
+
+WIDE = (
+    "Deviations in µm\nPosition [mm];1 +;1 -;2 +;2 -;3 +;3 -\n0;1.0;2.5;1.5;2.0;0.5;3.0\n100;2.0;4.0;2.5;3.5;3.0;4.5\n"
+)
+
+
+@pytest.fixture(scope="module")
+def untimed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The products of a table of position by run, which holds no times."""
+    folder = tmp_path_factory.mktemp("untimed")
+    (folder / "laser.csv").write_text(WIDE, encoding="utf-8")
+    (folder / "campaign.toml").write_text(
+        '[campaign]\ntitle = "wide"\naxis = "X"\n[interferometry]\ndeviations = "laser.csv"\n', encoding="utf-8"
+    )
+    assert check_campaign(folder / "campaign.toml").as_json()["ready"]
+    run_campaign(folder / "campaign.toml", folder / "results")
+    return folder / "results"
+
+
+def test_readings_without_times_are_evaluated_by_the_standard(untimed: Path) -> None:
+    results = read_results(untimed)
+    assert results.iso230 is not None and results.drift is None and results.loop is None and results.time is None
+    # Means of the approaches: 1.0, 2.5 and 2.5, 4.0 µm.
+    assert results.iso230.B_um.value == pytest.approx(1.5)
+    assert results.iso230.E_um.value == pytest.approx(3.0)
+    assert [warning.code for warning in results.warnings] == ["no_times"]
+    assert "iso230" in sections(untimed)
+    assert not {"drift", "anomalies", "loop"} & set(sections(untimed))
+
+
+def test_readings_without_times_are_exported_without_drift(untimed: Path, tmp_path: Path) -> None:
+    names = [path.name for path in export_results(untimed, "csv", tmp_path).files]
+    assert names == ["readings.csv", "iso230.csv", "iso230_positions.csv"]
+    assert export_results(untimed, "xlsx", tmp_path).files
+    with pytest.raises(ExportError, match="the readings have no times, so there is neither drift nor profile"):
+        export_results(untimed, "linuxcnc", tmp_path, force=True)
+
+
+def test_readings_without_times_beside_a_camera_are_refused(folder: Path) -> None:
+    text = (folder / "campaign.toml").read_text(encoding="utf-8")
+    (folder / "wide.csv").write_text(WIDE, encoding="utf-8")
+    path = folder / "untimed.toml"
+    path.write_text(text.replace('"laser.csv"', '"wide.csv"'), encoding="utf-8")
+    with pytest.raises(AlignmentError, match=r"wide.csv: no reading has a time.*leave \[thermography\] out"):
+        run_campaign(path, folder / "never")
+    assert not (folder / "never").exists()

@@ -53,6 +53,12 @@ def test_single_pixels_without_a_number_are_missing(tmp_path: Path) -> None:
     assert np.isfinite(values).sum() == values.size - 1
 
 
+def test_a_table_with_words_is_no_frame(tmp_path: Path) -> None:
+    path = tmp_path / "report.md"
+    path.write_text("\n".join(f"word | 1 | 2 | {row} | 3 | word | 4 | word" for row in range(9)).replace("|", ";"))
+    assert not TextReader().holds_a_frame(path)
+
+
 def test_a_table_is_no_frame(tmp_path: Path) -> None:
     path = tmp_path / "laser.csv"
     path.write_text("time,a,b\n1,2,3\n" * 20)
