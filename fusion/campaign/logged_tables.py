@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import io
 import json
 import re
 import warnings
@@ -20,7 +21,10 @@ from fusion.campaign.time_zones import bring_to_utc
 from fusion.errors import FusionError
 from interferometry.io.dates import describe_time_zone, parse_time
 from interferometry.io.delimited import delimiter_of, find_header, read_table, read_timed_rows
+from interferometry.io.encodings import decode_text
 from interferometry.io.faults import BadReading, RejectedLine, raise_if_mostly_invalid
+from interferometry.io.headings import CHINESE_WORDS
+from interferometry.io.numerals import Numerals
 from interferometry.io.workbook import refuse_bomb
 
 #: Warning of pandas about a line with more fields than the header.
@@ -153,7 +157,7 @@ def read_run(campaign: Campaign, path: Path) -> xr.Dataset:
         names, units, values = [], [], []
         for column in match_columns(patterns, others):
             name, given = split_heading(path, column)
-            numbers = pd.to_numeric(frame[column], errors="coerce").to_numpy(dtype="f8")[keep][order]
+            numbers = _numbers(frame[column])[keep][order]
             if np.isnan(numbers).all():
                 raise TableError(
                     f'{path}: the column "{column}" holds no number; name another one in the campaign file'
@@ -215,13 +219,13 @@ def _read_sheet(path: Path, record: RecordTable) -> pd.DataFrame:
 
 def _read_text(path: Path) -> tuple[pd.DataFrame, list[RejectedLine]]:
     """Read delimited text with the dialect that its header line shows."""
-    with path.open(encoding="utf-8-sig") as file:
-        before, header = find_header(file)
+    text = decode_text(path, path.read_bytes(), chinese_words=CHINESE_WORDS)
+    before, header = find_header(io.StringIO(text))
     delimiter = delimiter_of(header)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", pd.errors.ParserWarning)
         frame = pd.read_csv(
-            path,
+            io.StringIO(text),
             sep=delimiter,
             # Spreadsheets that part fields by semicolons write decimal commas.
             decimal="," if delimiter == ";" else ".",
@@ -229,7 +233,6 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, list[RejectedLine]]:
             skipinitialspace=True,
             index_col=False,
             on_bad_lines="warn",
-            encoding="utf-8-sig",
         )
     if any("loss of data" in str(warning.message) for warning in caught):
         raise FusionError("the lines hold more fields than the header names; name every column")
@@ -241,9 +244,28 @@ def _read_text(path: Path) -> tuple[pd.DataFrame, list[RejectedLine]]:
     ]
 
 
+def _numbers(column: pd.Series) -> np.ndarray:
+    """Return the numbers of a column, NaN where a row has none.
+
+    One mark for "no reading" leaves a whole column as text; its decimal commas and typographic minus signs are read all the same.
+    """
+    if pd.api.types.is_numeric_dtype(column):
+        return column.to_numpy(dtype="f8", na_value=np.nan)
+    texts = column.astype(str).tolist()
+    numerals = Numerals.of(texts)
+
+    def number(text: str) -> float:
+        try:
+            return numerals.number(text)
+        except BadReading:
+            return float("nan")
+
+    return np.array([number(text) for text in texts])
+
+
 def _times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarray, str, list[RejectedLine]]:
     """Return times, NaT where a row has none, how they came to UTC in words, and the list of the rows without a time."""
-    seconds = pd.to_numeric(column, errors="coerce")
+    seconds = pd.Series(_numbers(column), column.index)
     left_out: list[RejectedLine] = []
     zones: dict[str, int] = {}
     if seconds.notna().mean() > 0.5:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import re
 import tomllib
@@ -13,6 +14,9 @@ from fusion.campaign.quantities import unit_name
 from interferometry.errors import InterferometryError
 from interferometry.io.delimited import read_grids
 from interferometry.io.ecmc import is_ecmc_log
+from interferometry.io.encodings import decode_text
+from interferometry.io.faults import LaserFormatError
+from interferometry.io.headings import CHINESE_WORDS
 from interferometry.io.long_table import find_long_table
 from interferometry.io.readers import is_environment_log, read_deviations
 from interferometry.io.wide_table import find_wide_table
@@ -27,7 +31,6 @@ from thermography.io.text_frames import TextReader
 _START = 65_536
 #: Longest reason why a file is not understood, characters.
 _LONGEST_REASON = 160
-_ENCODINGS = ("utf-8-sig", "utf-16", "cp1252")
 _TABLES = ("thermography", "plan", "interferometry", "record", "drivers", "sensors")
 _RECIPE = ("test", "duty", "laser", "effect", "camera", "material")
 _HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
@@ -189,16 +192,17 @@ def _text_start(path: Path) -> str | None:
     """Return the beginning of a text; None where the file is no text."""
     with path.open("rb") as file:
         start = file.read(_START)
-    if b"\0" in start and not start.startswith((b"\xff\xfe", b"\xfe\xff")):
+    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return start.decode("utf-16", errors="ignore")
+    if b"\0" in start:
         return None
-    for encoding in _ENCODINGS:
-        try:
-            return start.decode(encoding)
-        except UnicodeDecodeError:
-            # A character may be cut in two by the end of what was read.
-            if len(start) == _START and encoding == "utf-8-sig":
-                return start.decode(encoding, errors="ignore")
-    return None
+    if len(start) == _START and b"\n" in start:
+        # A character may be cut in two by the end of what was read.
+        start = start[: start.rindex(b"\n")]
+    try:
+        return decode_text(path, start, chinese_words=CHINESE_WORDS)
+    except LaserFormatError:
+        return None
 
 
 def _headings(text: str) -> tuple[str, ...]:

@@ -173,3 +173,21 @@ def test_damaged_spreadsheets_are_named_whatever_their_reader_raises(
     (tmp_path / "damaged.xlsx").write_bytes(whole.tobytes())
     with pytest.raises(LaserFormatError, match=r"damaged\.xlsx: unpacks to 0\.0 GB, at most 1e-06 GB are read"):
         read_record(load_campaign(tmp_path / "campaign.toml"))
+
+
+def test_one_mark_for_no_reading_costs_one_reading(tmp_path: Path) -> None:
+    """A column with such a mark is text; its decimal commas and typographic minus signs are numbers all the same."""
+    rows = ["Zeit [s];T1 [°C];Z [µm]", "0;20,5;1,5", "30;21;---", "60;22,5;\u22122,5", "90;n/a;3"]
+    path = tmp_path / "campaign.toml"
+    path.write_text(
+        '[campaign]\ntitle = "Record"\n[record]\nfile = "log.csv"\ntime = "Zeit [s]"\ntemperatures = ["T1 [°C]"]\n'
+        'displacements = ["Z [µm]"]\n',
+        encoding="utf-8",
+    )
+    for encoding in ("utf-8", "utf-16"):
+        (tmp_path / "log.csv").write_text("\n".join(rows) + "\n", encoding=encoding)
+        table = read_record(load_campaign(path))
+        np.testing.assert_array_equal(table["temperature"].values.ravel(), [20.5, 21.0, 22.5, np.nan])
+        np.testing.assert_array_equal(table["displacement"].values.ravel(), [1.5, np.nan, -2.5, 3.0])
+    (tmp_path / "log.csv").write_text("\n".join(rows).replace("\u2212", "-") + "\n", encoding="cp1252")
+    assert read_record(load_campaign(path))["temperature"].values[2, 0] == 22.5

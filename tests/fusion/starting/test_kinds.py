@@ -45,6 +45,15 @@ def test_the_content_decides(tmp_path: Path, name: str, text: str, kind: Kind) -
     assert bool(found.reason) is (kind is Kind.UNKNOWN) and len(found.reason) < 180
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "cp1252"])
+def test_a_record_is_known_in_every_encoding(tmp_path: Path, encoding: str) -> None:
+    rows = ["Zeit [s];T1 [°C];Z [µm]", *(f"{30 * row};20,5;1,25" for row in range(9000))]
+    for count in (3, 4, len(rows)):
+        (tmp_path / "a.csv").write_text("\n".join(rows[:count]) + "\n", encoding=encoding)
+        found = recognise(tmp_path / "a.csv")
+        assert (found.kind, found.headings) == (Kind.RECORD, ("Zeit [s]", "T1 [°C]", "Z [µm]"))
+
+
 def test_a_workbook_is_looked_into(tmp_path: Path) -> None:
     pd.DataFrame({"time (s)": [0, 1], "t1(°C)": [20, 20], "ch1(um)": [0, 1]}).to_excel(tmp_path / "a.xlsx", index=False)
     assert recognise(tmp_path / "a.xlsx").kind is Kind.RECORD
