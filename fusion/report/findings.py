@@ -44,6 +44,35 @@ def iso230_values(iso: Iso230Part | Iso230Window) -> dict[str, str]:
     return {symbol: quantity(getattr(iso, f"{symbol}_um"), "µm") for symbol in ISO230_TERMS}
 
 
+def approach_of(iso: Iso230Part | Iso230Window) -> str:
+    """Return the only direction of approach that a window holds, "positive" or "negative"; empty where it holds both.
+
+    Parameters
+    ----------
+    iso : Iso230Part or Iso230Window
+        A window of the part ``iso230`` of the results.
+    """
+    if not isinstance(iso, Iso230Window) or iso.A_um.value is not None:
+        return ""
+    return next((side for side in ("positive", "negative") if getattr(iso, side).A_um.value is not None), "")
+
+
+def quoted_values(iso: Iso230Part | Iso230Window) -> dict[str, str]:
+    """Return the axis values to quote with their expanded uncertainty (k = 2) by symbol, µm: A, R and B, of one approach A and R.
+
+    Parameters
+    ----------
+    iso : Iso230Part or Iso230Window
+        A window of the part ``iso230`` of the results.
+    """
+    side = approach_of(iso)
+    if not side:
+        values = iso230_values(iso)
+        return {symbol: values[symbol] for symbol in ("A", "R", "B")}
+    arrow = {"positive": "↑", "negative": "↓"}[side]
+    return {f"{symbol}{arrow}": quantity(getattr(getattr(iso, side), f"{symbol}_um"), "µm") for symbol in "AR"}
+
+
 def reversal_note(iso: Iso230Part | Iso230Window) -> str:
     """Return what B means beside the scatter of the readings; empty where the approaches were not compared.
 
@@ -70,7 +99,9 @@ def scatter_range(drift: DriftPart) -> str:
         The part ``drift`` of the results.
     """
     scatter = drift.scatter_um.values()
-    return f"{min(scatter):.2f} to {max(scatter):.2f} µm, median {np.median(scatter):.2f} µm"
+    # A variance that comes out negative beside the drift is kept as zero: no position has no scatter.
+    span = f"{min(scatter):.2f} to" if min(scatter) > 0.0 else "up to"
+    return f"{span} {max(scatter):.2f} µm, median {np.median(scatter):.2f} µm"
 
 
 def anomaly_place(anomaly: AnomalyPart) -> str:

@@ -214,7 +214,7 @@ def _budget_table(shown: Iso230Window, unit: str) -> Table:
         Row(
             [
                 _CONTRIBUTORS.get(entry.contributor, entry.contributor),
-                "–" if entry.u is None else f"{number(entry.u, 2)} {entry.unit.replace('um', 'µm')}",
+                "–" if entry.u is None else f"{number(entry.u, 2)} {unit if entry.unit == 'um' else entry.unit}",
                 entry.origin,
                 *(number(getattr(entry, f"{symbol}_um"), 2) for symbol in _BUDGETED),
             ]

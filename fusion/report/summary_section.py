@@ -25,7 +25,7 @@ from fusion.report.findings import (
     ISO230_TERMS,
     anomaly_cause,
     anomaly_place,
-    iso230_values,
+    quoted_values,
     quoted_window,
     span_words,
 )
@@ -125,8 +125,6 @@ _RESTS_ON: dict[str, tuple[Figures, ...]] = {
     "cause": ("causes",),
     "loop": ("causes",),
 }
-#: Axis values among the key figures.
-_KEY_VALUES = ("A",)
 _SIGNS = {"positive": "+", "negative": "−"}
 #: Actions in the summary; all remedies stand with what was left out.
 _MOST_STEPS = 6
@@ -250,13 +248,9 @@ def _numbers(results: Results, deviations: xr.Dataset | None, fields: xr.Dataset
         )
     if results.iso230 is not None:
         quoted = quoted_window(results.iso230)
-        values = iso230_values(quoted)
-        for symbol in _KEY_VALUES:
-            add(
-                ISO230_TERMS[symbol],
-                values[symbol],
-                f"{quoted.window} {condition(results.inputs, 'positions')}".rstrip(),
-            )
+        symbol, value = next(iter(quoted_values(quoted).items()))
+        term = ISO230_TERMS.get(symbol, f"Unidirectional positioning accuracy {symbol}")
+        add(term, value, f"{quoted.window} {condition(results.inputs, 'positions')}".rstrip())
     if fields is not None:
         rise = fields["temperature_rise"].isel(cycle=-1)
         # The noise of single cells averages out over the plan; what all share does not.

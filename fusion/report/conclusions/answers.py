@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from fusion.products.results import Results
 from fusion.products.results_attribution import CorrelationPart
 from fusion.products.results_axis import AnomalyPart
 from fusion.products.results_loop import Loop, RecordLoop, StepPart
 from fusion.products.results_part import TimePart
 from fusion.report.conclusions.effects import phrase, step_phrase
-from fusion.report.findings import anomaly_figures, area_words, iso230_values, quoted_window, randomised_causes
+from fusion.report.findings import anomaly_figures, area_words, quoted_values, quoted_window, randomised_causes
 from fusion.report.wording import (
     alike,
     conditional,
@@ -21,6 +23,8 @@ from fusion.report.wording import (
     p_words,
 )
 
+#: A drift of less than this share of the median scatter is none that readings can show.
+_SHARE_OF_SCATTER = 0.01
 #: Effects that the seen temperatures of the table drive.
 _SEEN = {"axis_expansion", "table_offset", "thermal_lag"}
 #: Anomalies in words: what the position does, and what that speaks for.
@@ -107,15 +111,25 @@ def _how_much(results: Results) -> list[str]:
     """Size of the drift, and the accuracy by the standard."""
     sentences = []
     if results.drift is not None and results.drift.range_um:
-        largest, least = _extreme_position(results, largest=True), _extreme_position(results, largest=False)
-        sentences.append(f"During the test the deviation drifted by {largest}, and least by {least}.")
+        sentences.append(
+            f"During the test the deviation drifted by {_extreme_position(results, largest=True)}, {_least_drift(results)}."
+        )
     if results.iso230 is not None:
         quoted = quoted_window(results.iso230)
-        values = iso230_values(quoted)
-        sentences.append(
-            f"By ISO 230-2, {quoted.window}: A = {values['A']}, R = {values['R']}, B = {values['B']} (k = 2)."
-        )
+        values = ", ".join(f"{symbol} = {value}" for symbol, value in quoted_values(quoted).items())
+        sentences.append(f"By ISO 230-2, {quoted.window}: {values} (k = 2).")
     return [conditional(" ".join(sentences), results.inputs, "positions")] if sentences else []
+
+
+def _least_drift(results: Results) -> str:
+    """The smallest drift with its position; of far less than the scatter it is not told as a number."""
+    drift = results.drift
+    assert drift is not None
+    known = [k for k, value in enumerate(drift.range_um) if value is not None]
+    at = min(known, key=lambda k: drift.range_um[k] or 0.0)
+    if (drift.range_um[at] or 0.0) < _SHARE_OF_SCATTER * float(np.median(drift.scatter_um.values())):
+        return f"and not noticeably at position {at + 1} ({drift.position_mm[at]:g} mm)"
+    return f"and least by {_extreme_position(results, largest=False)}"
 
 
 def _extreme_position(results: Results, *, largest: bool) -> str:

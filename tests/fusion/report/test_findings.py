@@ -13,6 +13,7 @@ from fusion.products.results import (
     Quantity,
     SourcePart,
 )
+from fusion.products.results_axis import Iso230Direction, Iso230Window
 from fusion.products.results_loop import Baselines, ErrorInterval, ModelErrors, StepPart
 from fusion.products.results_part import AreaPart
 from fusion.report import findings
@@ -43,6 +44,17 @@ def test_axis_values_bear_the_terms_of_the_standard() -> None:
 def test_scatter_leaves_out_what_is_not_determined() -> None:
     drift = DriftPart.model_construct(scatter_um=ByDirection(positive=(0.4, None), negative=(0.2, 0.3)))
     assert findings.scatter_range(drift) == "0.20 to 0.40 \u00b5m, median 0.30 \u00b5m"
+    none = DriftPart.model_construct(scatter_um=ByDirection(positive=(0.4, 0.0), negative=(0.2, 0.3)))
+    assert findings.scatter_range(none) == "up to 0.40 \u00b5m, median 0.25 \u00b5m"
+
+
+def test_of_one_approach_the_unidirectional_values_are_quoted() -> None:
+    known, unknown = Quantity(value=9.9017, u=1.378), Quantity(value=None, u=None)
+    side = Iso230Direction(A_um=known, R_um=known, E_um=known)
+    other = Iso230Direction(A_um=unknown, R_um=unknown, E_um=unknown)
+    window = Iso230Window.model_construct(A_um=unknown, positive=other, negative=side)
+    assert findings.quoted_values(window) == {"A\u2193": "9.9 \u00b1 2.8 \u00b5m", "R\u2193": "9.9 \u00b1 2.8 \u00b5m"}
+    assert list(findings.quoted_values(ISO)) == ["A", "R", "B"]
 
 
 def test_anomalies_are_named_with_their_cause() -> None:

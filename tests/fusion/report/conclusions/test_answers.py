@@ -205,3 +205,6 @@ def test_how_much_names_the_position_with_the_largest_drift() -> None:
     assert told.startswith(
         "During the test the deviation drifted by 11.13 ± 0.34 µm at position 2 (150 mm), and least by 3.10 ± 0.20 µm at position 1 (0 mm)."
     )
+    still = {**drift, "range_um": [0.0, 11.127]}
+    told = dict(answers.conclude(assemble("A", {**PARTS, "drift": still}, [])))["How much"]
+    assert "and not noticeably at position 1 (0 mm)." in told
