@@ -293,10 +293,11 @@ def _camera_notices(source: CameraInputs) -> list[Notice]:
 def _window_notice(source: CameraInputs) -> Notice:
     """Return the notice that says what stands for cycles."""
     bounds, stated = source.cycles.bounds, source.thermography.window_s is not None
-    minutes = float((bounds[0, 1] - bounds[0, 0]) / np.timedelta64(1, "m"))
+    seconds = float((bounds[0, 1] - bounds[0, 0]) / np.timedelta64(1, "s"))
+    length = f"{seconds / 60.0:g} min" if seconds >= 60.0 else f"{seconds:g} s"
     return Notice(
         "cycles_from_windows",
-        f"No laser gives cycles: the frames are divided into {counted(len(bounds), 'window')} of {minutes:g} min"
+        f"No laser gives cycles: the frames are divided into {counted(len(bounds), 'window')} of {length}"
         f"{', as thermography.window states' if stated else ', a usual length here (thermography.window sets another)'}; "
         "each counts as a cycle.",
         "",
@@ -345,7 +346,8 @@ def _raise_if_too_few_readings(deviations: xr.Dataset, *, file: str) -> None:
     if sizes["cycle"] < _LEAST_CYCLES or sizes["target"] < _LEAST_TARGETS:
         raise SourceError(
             f"{file}: {counted(sizes['cycle'], 'cycle')} at {counted(sizes['target'], 'target')}; "
-            f"scatter and drift need at least {_LEAST_CYCLES} cycles at {_LEAST_TARGETS} targets"
+            f"scatter and drift need at least {_LEAST_CYCLES} cycles at {_LEAST_TARGETS} targets; measure more, or look at the readings "
+            f"with thermofuse iso230 {file}"
         )
 
 

@@ -204,6 +204,9 @@ def _plan(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterator
     yield f"cell_size = {asker.quantity('Size of a cell of the field; it divides both sides', 'mm', '5 mm')}"
     name = _quoted(content.relative(listed[0].path) if listed else TO_FILL)
     yield f"fiducials = {name}   # name,x_mm,y_mm,diameter_mm[,column_px,row_px]"
+    if not listed:
+        yield "# a table of at least four places that are known in mm: discs on the table, or points picked by hand with their pixel"
+        yield "# (column_px,row_px) and an empty diameter; init finds it in the folder"
     yield from _others("fiducials", content, listed)
     yield from _optional("regions", content, Kind.REGIONS)
     if not along_axis:

@@ -263,7 +263,9 @@ def _parse(path: Path, line: int, row: dict[str, str]) -> Fiducial:
     x_mm, y_mm = (_number(path, line, column, row[column]) for column in _REQUIRED_COLUMNS[1:3])
     diameter_mm = 0.0 if point else _number(path, line, "diameter_mm", row["diameter_mm"])
     if diameter_mm <= 0 and not point:
-        raise FiducialError(f"{path}:{line}: diameter_mm = {row['diameter_mm']}; a disc has a positive diameter")
+        raise FiducialError(
+            f"{path}:{line}: diameter_mm = {row['diameter_mm']}; a disc has a positive diameter, a point picked by hand an empty one"
+        )
     marker = (row.get(_MARKER_COLUMN) or "").strip()
     if marker:
         if not marker.isdecimal() or int(marker) >= _MARKER_COUNT:

@@ -12,6 +12,7 @@ from fusion.alignment.align import AlignmentError
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import SourceError, counted, listed, read_source
 from fusion.pipeline.interferometry import evaluate_interferometry
+from tests.fusion.campaign_parts import without
 
 
 def shift_frames(folder: Path, hours: float) -> None:
@@ -79,11 +80,18 @@ def test_a_single_frame_is_not_enough(copied: Path) -> None:
         read_source(load_campaign(copied / "campaign.toml"))
 
 
+def test_windows_shorter_than_a_minute_are_told_in_seconds(copied: Path) -> None:
+    path = without(copied / "campaign.toml", "interferometry", "plan.axis", "model", "drivers", name="camera.toml")
+    path.write_text(path.read_text().replace('table = "still"', 'window = "40 s"\ntable = "still"'))
+    (notice,) = [one for one in read_source(load_campaign(path)).notices if one.code == "cycles_from_windows"]
+    assert "windows of 40 s, as" in notice.message
+
+
 def test_a_short_test_is_refused_before_the_long_work(copied: Path) -> None:
     lines = (copied / "laser.csv").read_text().splitlines()
     short = [line for line in lines if line.split(",")[0] in {"cycle", "1"}]
     (copied / "laser.csv").write_text("\n".join(short) + "\n")
-    message = r"laser.csv: 1 cycle at 6 targets; scatter and drift need at least 2 cycles at 2 targets"
+    message = r"laser.csv: 1 cycle at 6 targets; scatter and drift need at least 2 cycles at 2 targets; measure more"
     with pytest.raises(SourceError, match=message):
         read_source(load_campaign(copied / "campaign.toml"))
 
