@@ -395,7 +395,10 @@ def _seconds(deviations: xr.Dataset) -> Array:
     time = deviations["time"].values.astype("datetime64[ns]")
     has_time = ~np.isnat(time)
     if not has_time.any():
-        raise CompensationError("no reading has a time; compensation needs the conditions at each reading")
+        raise CompensationError(
+            f"{deviations.attrs.get('source', 'the deviations')}: no reading has a time; a compensation needs the conditions at each "
+            "reading: leave compensation and dead path as recorded, or export the readings with their times"
+        )
     return np.where(has_time, (time - time[has_time].min()).astype("f8") * 1e-9, np.nan)
 
 

@@ -325,7 +325,7 @@ def _laser_notices(source: LaserInputs) -> list[Notice]:
             Notice(
                 "no_times",
                 f"{source.interferometry.deviations} gives no times: ISO 230-2 and neighbour differences are evaluated; drift, positions "
-                "that stand out and causes need the time of every reading.",
+                "that stand out and causes need the time of every reading, and no log can be set beside them.",
                 "Export one reading per line with its time.",
             )
         )

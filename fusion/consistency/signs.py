@@ -33,14 +33,16 @@ def check_signs(deviations: xr.Dataset) -> list[Check]:
     Returns
     -------
     list of Check
-        ``travel_order``, ``target_order`` and ``mirrored_readings``.
+        ``travel_order`` (where the readings have times), ``target_order`` and ``mirrored_readings``.
 
     Notes
     -----
     Approach in positive direction means that the position grows (ISO 230-2:2014, clause 3). In a step cycle both approaches go through the
     targets in one order, so that only a cycle in which both passes run against their label contradicts it.
     """
-    return [_travel_order(deviations), _target_order(deviations), _mirrored_readings(deviations)]
+    timed = not np.isnat(deviations["time"].values).all()
+    travel = [_travel_order(deviations)] if timed else []
+    return [*travel, _target_order(deviations), _mirrored_readings(deviations)]
 
 
 def _travel_order(deviations: xr.Dataset) -> Check:
