@@ -80,6 +80,9 @@ class Effect:
         ``near`` is None in the search, and the chosen candidate when its neighbourhood is looked at more closely.
     needs : callable
         ``needs(readings)`` says why the effect cannot be tried with these readings, or returns None.
+    masked_by : callable
+        ``masked_by(readings)`` says what in these readings would look the same, so that the search must not name the effect, or returns
+        None. A campaign may still declare it.
     excited_by : str
         ``"field"`` or ``"driver"`` where the effect is identified by switching of that kind only, else ``""``.
     prior : Prior or None
@@ -121,6 +124,7 @@ class Effect:
     source: str
     candidates: Offer
     needs: Callable[[Readings], str | None] = field(default=lambda readings: None)
+    masked_by: Callable[[Readings], str | None] = field(default=lambda readings: None)
     excited_by: str = ""
     prior: Prior | None = None
     declarable: bool = False

@@ -9,7 +9,7 @@ import numpy as np
 from fusion._typing import Array
 from fusion.alignment.readings import Readings
 from fusion.effects.effect import Candidate, Effect, Parameters
-from fusion.effects.states import thermal_states, unit_of_state
+from fusion.effects.states import thermal_states, unit_of_state, unmeasured_expansion
 
 #: Shortest lead of a screw that is tried where the targets are spaced unevenly.
 SHORTEST_LEAD_MM = 4.0
@@ -119,6 +119,7 @@ ANGULAR_GROWTH = Effect(
     physics="Guide or table bends as it warms; the Abbe offset turns the growing angle into an error that is quadratic along the axis.",
     source="Abbe principle, Bryan 1979: 1 arcsec x 100 mm = 0.48 um",
     candidates=_angular_growth,
+    masked_by=unmeasured_expansion,
     patterned=True,
     label="growing pitch or yaw of the axis",
     remedy="Measure pitch and yaw while the machine warms up; keep the Abbe offset short.",

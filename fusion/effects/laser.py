@@ -10,7 +10,7 @@ from fusion._typing import Array
 from fusion.alignment.readings import Readings
 from fusion.effects.effect import Candidate, Effect, Parameters
 from fusion.effects.jumps import sensor_jumps, stuck_sensors
-from fusion.effects.states import values_near, warm_up
+from fusion.effects.states import unmeasured_expansion, values_near, warm_up
 from interferometry.compensation import air_index
 
 _AIR = ("air_temperature", "air_pressure", "relative_humidity")
@@ -102,6 +102,7 @@ MATERIAL_COMPENSATION = Effect(
     source="ISO 230-2, 7.1; ISO/TR 16015",
     candidates=_material_compensation,
     needs=_needs_material,
+    masked_by=unmeasured_expansion,
     declarable=True,
     label="material compensation",
     remedy="Check the coefficient that was entered and where the material probe sat.",
@@ -111,6 +112,7 @@ LASER_WARM_UP = Effect(
     physics="The laser's wavelength settles during the first minutes: a stretch, and a shift by the dead path, that die away.",
     source="frequency stabilisation of a He-Ne laser",
     candidates=_laser_warm_up,
+    masked_by=unmeasured_expansion,
     label="warm-up of the laser",
     remedy="Let the laser warm up longer before the first cycle.",
 )

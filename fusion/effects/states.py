@@ -121,6 +121,23 @@ def thermal_states(readings: Readings, near: Candidate | None) -> Iterator[tuple
         yield warm_up(readings, minutes), {"follows": "warm_up", "time_constant_min": minutes}
 
 
+def unmeasured_expansion(readings: Readings) -> str | None:
+    """Say that the axis' own expansion was not measured, which looks like any smooth shape along it that follows a thermal state.
+
+    Parameters
+    ----------
+    readings : with the series of the field, if there is one
+
+    Returns
+    -------
+    str or None
+        None where the rise of the table is known.
+    """
+    if "mean_rise" in readings.series:
+        return None
+    return "without a temperature along the axis its own expansion looks the same"
+
+
 def unit_of_state(readings: Readings, parameters: Mapping[str, float | str]) -> str:
     """Unit of the coefficient of a state.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from fusion.alignment.readings import Readings
 from fusion.effects.effect import Candidate, Effect, Parameters, Prior
-from fusion.effects.states import LAGS_MIN, first_order_responses, um_per, values_near
+from fusion.effects.states import LAGS_MIN, first_order_responses, um_per, unmeasured_expansion, values_near
 
 #: Standard uncertainty of an expansion coefficient from a table: steels and cast irons lie between 9 and 14 ppm/K.
 EXPANSION_U_PPM_PER_K = 2.0
@@ -140,6 +140,7 @@ UNSEEN_HEAT_SOURCE = Effect(
     source="Mayr et al. 2012, CIRP Annals 61, 771",
     candidates=_unseen_heat_source,
     needs=_needs_driver,
+    masked_by=unmeasured_expansion,
     excited_by="driver",
     label="unseen heat source",
     remedy=(

@@ -148,7 +148,11 @@ class AxisProblem:
 
     def start(self, declared: Sequence[Term]) -> AxisState:
         """The state before the search: the declared model, and the effects that these readings cannot show."""
-        missing = {name: effect.needs(self.readings) for name, effect in self.effects.items()}
+        present = {term.effect for term in declared}
+        missing = {
+            name: effect.needs(self.readings) or (None if name in present else effect.masked_by(self.readings))
+            for name, effect in self.effects.items()
+        }
         return AxisState(fit_model(self.readings, declared, used=self.used)).decide(
             *(
                 Decision(name, Reason.NOT_AVAILABLE, {"because": because})

@@ -13,6 +13,7 @@ from fusion.effects.states import (
     thermal_states,
     um_per,
     unit_of_state,
+    unmeasured_expansion,
     values_near,
     warm_up,
 )
@@ -118,6 +119,11 @@ def test_every_state_is_told_by_what_it_follows():
 
 def test_without_field_and_load_only_warm_ups_are_left():
     assert {parameters["follows"] for _, parameters in thermal_states(campaign(), None)} == {"warm_up"}
+
+
+def test_the_expansion_of_the_axis_is_unmeasured_without_a_temperature_of_the_table():
+    assert unmeasured_expansion(campaign(series={"mean_rise": logged(np.arange(60.0), "K")})) is None
+    assert "its own expansion looks the same" in str(unmeasured_expansion(campaign()))
 
 
 def test_the_unit_of_a_coefficient_follows_from_what_drives_it():

@@ -68,14 +68,14 @@ def test_a_state_that_fits_as_well_is_told_and_does_not_widen_the_numbers():
 @pytest.mark.parametrize(
     ("ranges", "words"),
     [
-        ({}, "follows duty, time constant / min 20.0"),
+        ({}, "follows duty, time constant 20.0 min"),
         (
             {"follows": ["warm_up"], "time_constant_min": [10.0, 30.0]},
-            "follows duty (or warm up), time constant / min 20.0 (10.0 to 30.0)",
+            "follows duty (or warm up), time constant 20.0 min (10.0 to 30.0)",
         ),
-        ({"time_constant_min": [None, 30.0]}, "follows duty, time constant / min 20.0 (at most 30.0)"),
-        ({"time_constant_min": [10.0, None]}, "follows duty, time constant / min 20.0 (at least 10.0)"),
-        ({"time_constant_min": [None, None]}, "follows duty, time constant / min 20.0 (not determined)"),
+        ({"time_constant_min": [None, 30.0]}, "follows duty, time constant 20.0 min (at most 30.0)"),
+        ({"time_constant_min": [10.0, None]}, "follows duty, time constant 20.0 min (at least 10.0)"),
+        ({"time_constant_min": [None, None]}, "follows duty, time constant 20.0 min (not determined)"),
     ],
 )
 def test_ranges_are_printed_beside_the_values(ranges, words):

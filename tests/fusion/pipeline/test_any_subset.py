@@ -80,6 +80,8 @@ def test_the_report_of_the_laser_has_no_section_of_the_camera(laser_results: Pat
 def test_effects_of_the_field_are_named_as_not_available_without_camera(laser_results: Path) -> None:
     loop = json.loads((laser_results / "results.json").read_text(encoding="utf-8"))["loop"]
     assert "the campaign holds no temperature of the table" in loop["not_tried"]["axis_expansion"]
+    for name in ("unseen_heat_source", "laser_warm_up", "angular_growth", "material_compensation"):
+        assert "its own expansion looks the same" in loop["not_tried"][name]
 
 
 def test_an_effect_of_the_field_cannot_be_declared_without_one(copied: Path) -> None:
