@@ -87,5 +87,5 @@ def test_the_noise_of_a_slow_series_is_found_in_spite_of_outliers(rng):
 
 
 def test_too_few_targets_are_refused():
-    with pytest.raises(ReadingsError, match="4 cycles and 2 targets have readings within the frames' time"):
+    with pytest.raises(ReadingsError, match="4 cycles and 2 targets have readings"):
         read_fused(fused(targets=2))

@@ -118,15 +118,15 @@ def test_the_camera_gives_the_mean_temperature_between_zero_and_the_target(readi
     assert seen.u_K == pytest.approx(0.7)
 
 
-def test_a_campaign_with_the_camera_as_thermometer(campaign_folder: Path, results_folder: Path) -> None:
-    text = (campaign_folder / "campaign.toml").read_text()
+def test_a_campaign_with_the_camera_as_thermometer(copied: Path, results_folder: Path) -> None:
+    text = (copied / "campaign.toml").read_text()
     asked = text.replace(
         "[interferometry]\n", '[interferometry]\ncompensation = "redo"\nmaterial_temperature = "camera"\n'
     )
-    other = campaign_folder / "camera.toml"
+    other = copied / "camera.toml"
     other.write_text(asked)
     source = read_source(load_campaign(other))
-    recorded = read_source(load_campaign(campaign_folder / "campaign.toml"))
+    recorded = read_source(load_campaign(copied / "campaign.toml"))
     assert source.deviations.identical(recorded.deviations)
     source, notices = compensate_by_camera(source, read_dataset(results_folder / "fields.nc"))
     assert "the temperature that the camera measured along the axis" in notices[0].message

@@ -85,7 +85,7 @@ def test_the_report_says_it_in_words(outcome) -> None:
     whole = join_fusion(fused, fused, maps, xr.Dataset())
     xr.testing.assert_equal(whole["correlation/duty"].to_dataset(inherit=False), maps["duty"].to_dataset(inherit=False))
     assert whole["correlation"].attrs["verdict"] == maps.attrs["verdict"]
-    said = describe_correlation(whole, assemble("x", parts, []).correlation, None)
+    said = describe_correlation(whole, assemble("x", parts, []), None)
     assert said is not None
     assert said["duty"].rows[0].cells[0] == "spindle" and said["duty"].rows[0].cells[-1] == "not shown"
     assert "False alarms of this map" in said["captions"]["cells"]

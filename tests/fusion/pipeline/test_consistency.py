@@ -64,8 +64,8 @@ def test_a_doubt_is_named_first_and_makes_the_verdict_conditional(
     assert "Doubted input." in page and "Only if " in page
     conditional = {figure for check in results.inputs.doubts for figure in check.conditional}
     assert "causes" in conditional
-    iso = next(text for name, text in summary_rows(results) if name.startswith("A ("))
-    assert ("only if" in iso) is ("positions" in conditional)
+    sizes = dict(summary_rows(results))["how much"]
+    assert ("only if" in sizes.lower()) is ("positions" in conditional)
 
 
 def test_a_doubt_can_be_accepted_and_an_unknown_one_is_refused(copied: Path, tmp_path: Path) -> None:
@@ -96,4 +96,4 @@ def test_one_error_of_reading_changes_neither_the_verdict_on_the_field_nor_the_c
     assert [step.effect for step in spoilt.loop.steps] == [step.effect for step in sound.loop.steps]
     assert spoilt.loop.rmse_final_um == pytest.approx(sound.loop.rmse_final_um, rel=0.02)
     (notice,) = (warning for warning in spoilt.warnings if warning.code == "gross_readings")
-    assert "cycle 9 positive target 5; left out" in notice.message
+    assert "cycle 9, position 5 (200 mm), positive approach" in notice.message and "left out" in notice.message
