@@ -90,6 +90,20 @@ def reversal_note(iso: Iso230Part | Iso230Window) -> str:
     )
 
 
+def drift_u_note(iso: Iso230Part | None) -> str:
+    """Return what the ± of profile and drift contains, and where the rest stands.
+
+    Parameters
+    ----------
+    iso : Iso230Part or None
+        The part ``iso230`` of the results; None: the run has no budget.
+    """
+    rest = "laser, material temperature and expansion coefficient"
+    if iso is None or iso.settled is None:
+        return f"± from scatter and estimate alone, without {rest}"
+    return f"± from scatter and estimate alone; {rest}: see the ISO 230-2 budget"
+
+
 def scatter_range(drift: DriftPart) -> str:
     """Return smallest, largest and median scatter over targets and directions, µm.
 

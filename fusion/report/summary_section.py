@@ -25,6 +25,7 @@ from fusion.report.findings import (
     ISO230_TERMS,
     anomaly_cause,
     anomaly_place,
+    drift_u_note,
     quoted_values,
     quoted_window,
     span_words,
@@ -177,6 +178,7 @@ def describe_campaign(
         else None,
         "hotspots": _hotspots_table(results) if results.hotspots else None,
         "positions": None if results.drift is None or deviations is None else _positions_table(deviations),
+        "drift_u_note": drift_u_note(results.iso230),
         "neighbours": "" if results.neighbours is None else _neighbours_text(results.neighbours),
         "comparison": None if deviations is None else _comparison_table(deviations),
         "iso230": None if results.iso230 is None else describe_iso230(results.iso230, deviations),
@@ -244,7 +246,7 @@ def _numbers(results: Results, deviations: xr.Dataset | None, fields: xr.Dataset
         add(
             "Largest drift",
             measured(results.drift.range_um[at], results.drift.range_u_um[at], "µm"),
-            f"at position {at + 1} ({results.drift.position_mm[at]:g} mm), during the test",
+            f"at position {at + 1} ({results.drift.position_mm[at]:g} mm), during the test; {drift_u_note(results.iso230)}",
         )
     if results.iso230 is not None:
         quoted = quoted_window(results.iso230)

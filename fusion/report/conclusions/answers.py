@@ -12,7 +12,14 @@ from fusion.products.results_axis import AnomalyPart
 from fusion.products.results_loop import Loop, RecordLoop, StepPart
 from fusion.products.results_part import TimePart
 from fusion.report.conclusions.effects import phrase, step_phrase
-from fusion.report.findings import anomaly_figures, area_words, quoted_values, quoted_window, randomised_causes
+from fusion.report.findings import (
+    anomaly_figures,
+    area_words,
+    drift_u_note,
+    quoted_values,
+    quoted_window,
+    randomised_causes,
+)
 from fusion.report.wording import (
     alike,
     conditional,
@@ -112,7 +119,8 @@ def _how_much(results: Results) -> list[str]:
     sentences = []
     if results.drift is not None and results.drift.range_um:
         sentences.append(
-            f"During the test the deviation drifted by {_extreme_position(results, largest=True)}, {_least_drift(results)}."
+            f"During the test the deviation drifted by {_extreme_position(results, largest=True)}, {_least_drift(results)} "
+            f"({drift_u_note(results.iso230)})."
         )
     if results.iso230 is not None:
         quoted = quoted_window(results.iso230)

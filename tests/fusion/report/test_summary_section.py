@@ -45,3 +45,12 @@ def test_results_without_products_still_make_a_summary() -> None:
     assert told["iso230"]["axis"].rows[-2].cells[0] == "Reversal error B"
     assert told["hotspots"].rows[0].cells[5:] == ["3", "\u2013", "\u2013"]
     assert told["positions"] is None and told["correlation"] is None
+
+
+def test_what_the_uncertainty_of_the_drift_leaves_out_stands_at_the_tile_and_under_the_table(
+    results_folder: Path,
+) -> None:
+    page = (results_folder / "report.html").read_text(encoding="utf-8")
+    told = "± from scatter and estimate alone; laser, material temperature and expansion coefficient: see the ISO 230-2 budget"
+    assert f"during the test; {told}</div>" in page
+    assert f"± is the expanded uncertainty (k = 2): {told}." in page

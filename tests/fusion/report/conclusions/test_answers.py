@@ -203,8 +203,13 @@ def test_how_much_names_the_position_with_the_largest_drift() -> None:
     drift = {**PARTS["drift"], "position_mm": [0.0, 150.0], "range_um": [3.1, 11.127], "range_u_um": [0.1, 0.17]}
     told = dict(answers.conclude(assemble("A", {**PARTS, "drift": drift}, [])))["How much"]
     assert told.startswith(
-        "During the test the deviation drifted by 11.13 ± 0.34 µm at position 2 (150 mm), and least by 3.10 ± 0.20 µm at position 1 (0 mm)."
+        "During the test the deviation drifted by 11.13 ± 0.34 µm at position 2 (150 mm), and least by 3.10 ± 0.20 µm at position 1 (0 mm) "
+        "(± from scatter and estimate alone; laser, material temperature and expansion coefficient: see the ISO 230-2 budget)."
     )
     still = {**drift, "range_um": [0.0, 11.127]}
     told = dict(answers.conclude(assemble("A", {**PARTS, "drift": still}, [])))["How much"]
-    assert "and not noticeably at position 1 (0 mm)." in told
+    assert "and not noticeably at position 1 (0 mm) (± from" in told
+    told = dict(answers.conclude(assemble("A", {**PARTS, "drift": drift, "iso230": None}, [])))["How much"]
+    assert told.endswith(
+        "(± from scatter and estimate alone, without laser, material temperature and expansion coefficient)."
+    )
