@@ -109,6 +109,8 @@ class Iso230Contribution(ResultPart):
     """Contribution to the standard uncertainty of B, um."""
     mean_reversal_um: Number
     """Contribution to the standard uncertainty of the mean reversal error, um."""
+    one_way_um: Mapping[str, Number] = Field(default_factory=dict)
+    """Contribution to the standard uncertainty of A, R and E of each direction that was measured, by ``A_positive`` and so on, um."""
 
 
 class Iso230Direction(ResultPart):
@@ -148,7 +150,8 @@ class Iso230Window(ResultPart):
     negative: Iso230Direction
     """Values of the approach in negative direction."""
     u_without_sampling_um: Mapping[str, Number]
-    """Standard uncertainty of A, R, E, M, B and mean_reversal without the sampling of the cycles, um; that of each value holds it."""
+    """Standard uncertainty of A, R, E, M, B and mean_reversal, and of A, R and E of each direction that was measured (``A_positive``),
+    without the sampling of the cycles, um; that of each value holds it."""
     contributions: tuple[Iso230Contribution, ...]
     """Inputs of the budget."""
 

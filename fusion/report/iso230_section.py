@@ -10,7 +10,7 @@ import xarray as xr
 
 from fusion.products.grouped import group, has
 from fusion.products.results_axis import Iso230Contribution, Iso230Part, Iso230Window
-from fusion.report.findings import ISO230_TERMS, reversal_note
+from fusion.report.findings import ISO230_TERMS, approach_of, reversal_note
 from fusion.report.tables import Row, Table, Words, table
 from fusion.report.wording import decimals_of, join, measured, number, print_unit, quantity
 from interferometry.deviations import REGISTRY
@@ -24,7 +24,7 @@ _CONTRIBUTORS = {
     "sampling": "scatter of the readings",
     "extremes": "largest of noisy values",
 }
-#: Columns of the budget.
+#: Columns of the budget, of a test from both sides.
 _BUDGETED = ("A", "R", "E", "M", "B", "mean_reversal")
 #: Values of each direction, in the terms of the standard.
 _ONE_WAY = {
@@ -209,24 +209,33 @@ def _values_table(part: Iso230Part, shown: Iso230Window, unit: str) -> Table:
 
 
 def _budget_table(shown: Iso230Window, unit: str) -> Table:
-    """Return the budget: every input with its contributions, and the expanded uncertainty without and with the sampling."""
+    """Return the budget: every input with its contributions, and the expanded uncertainty without and with the sampling.
+
+    Of a test from one side the columns are the quantities of that approach.
+    """
+    side = approach_of(shown)
+    titles = (
+        [f"{symbol}{_ARROWS[side]}" for symbol in _ONE_WAY] if side else [name.replace("_", " ") for name in _BUDGETED]
+    )
+    names = [f"{symbol}_{side}" for symbol in _ONE_WAY] if side else _BUDGETED
     rows: list[Row] = [
         Row(
             [
                 _CONTRIBUTORS.get(entry.contributor, entry.contributor),
                 "–" if entry.u is None else f"{number(entry.u, 2)} {unit if entry.unit == 'um' else entry.unit}",
                 entry.origin,
-                *(number(getattr(entry, f"{symbol}_um"), 2) for symbol in _BUDGETED),
+                *(number(entry.one_way_um.get(name) if side else getattr(entry, f"{name}_um"), 2) for name in names),
             ]
         )
         for entry in shown.contributions
     ]
-    without = [shown.u_without_sampling_um.get(symbol) for symbol in _BUDGETED]
-    with_it = [getattr(shown, f"{symbol}_um").u for symbol in _BUDGETED]
+    without = [shown.u_without_sampling_um.get(name) for name in names]
+    values = [getattr(getattr(shown, side), f"{symbol}_um") for symbol in _ONE_WAY] if side else []
+    with_it = [value.u for value in values or (getattr(shown, f"{symbol}_um") for symbol in _BUDGETED)]
     for name, sums in (("U (k = 2) without the sampling of the cycles", without), ("U (k = 2)", with_it)):
         cells = (number(None if u is None else 2 * u, 2) for u in sums)
         rows.append(Row([name, "", "", *cells], marked=True))
-    columns = [f"{symbol.replace('_', ' ')} / {unit}" for symbol in _BUDGETED]
+    columns = [f"{title} / {unit}" for title in titles]
     return table([Words("Contribution"), "Standard uncertainty u", Words("u is"), *columns], rows)
 
 

@@ -70,7 +70,8 @@ def evaluate_iso230(
         - Of the axis: ``B`` reversal error; ``B_of_scatter``, what scatter alone gives in half of such tests of an axis without reversal
           error (B is the largest of noisy values; no uncertainty); ``mean_reversal`` (signed), ``R`` bidirectional repeatability, ``E``
           bidirectional systematic positioning error, ``M`` mean bidirectional positioning error, ``A`` bidirectional accuracy.
-        - Of the budget: ``contribution`` (quantity, contributor) to the standard uncertainty of each quantity of the axis;
+        - Of the budget: ``contribution`` (quantity, contributor) to the standard uncertainty of each quantity of the axis,
+          ``<name>_contribution`` (direction, contributor) to that of each quantity per direction;
           ``environmental_variation`` that was used, ``drift_variation``, the standard deviation of the drift at the position where it is
           largest (NaN where not known), and ``temperature_difference`` (K), that of the material from 20 degC.
 

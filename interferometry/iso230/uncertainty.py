@@ -15,6 +15,8 @@ from interferometry.iso230.quantities import axis_quantities
 #: error, mean bidirectional positioning error, bidirectional accuracy, signed mean of the reversal errors.
 AXIS = ("B", "R", "E", "M", "A", "mean_reversal")
 ONE_WAY = ("R_unidirectional", "E_unidirectional", "A_unidirectional")
+#: Contributions to a quantity that was not measured.
+_UNKNOWN = [np.nan] * len(CONTRIBUTIONS)
 #: Tests that are drawn to see by how much the largest of noisy values is too large: enough to know it to a tenth of itself.
 _DRAWS, _SEED = 400, 230
 
@@ -176,10 +178,12 @@ class UncertainTest:
         for name in ONE_WAY:
             u = [GTC.uncertainty(values[name]) if values else np.nan for values in by_direction]
             variables[f"{name}_u"] = (("direction",), np.array(u, dtype=float))
+            shares = [_contributions(values[name]) if values else _UNKNOWN for values in by_direction]
+            variables[f"{name}_contribution"] = (("direction", "contributor"), np.array(shares, dtype=float))
         axis = self.axis()
         for name in AXIS:
             variables[f"{name}_u"] = ((), np.array(GTC.uncertainty(axis[name]) if axis else np.nan, dtype=float))
-        shares = [_contributions(axis[name]) if axis else [np.nan] * len(CONTRIBUTIONS) for name in AXIS]
+        shares = [_contributions(axis[name]) if axis else _UNKNOWN for name in AXIS]
         variables["contribution"] = (("quantity", "contributor"), np.array(shares, dtype=float))
         return variables
 

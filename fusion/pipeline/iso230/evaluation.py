@@ -118,15 +118,28 @@ def _window_part(result: xr.Dataset, cycles: list[int], budget: StatedBudget, me
     }
     other = [name for name in CONTRIBUTIONS if name not in SAMPLING]
     without = (result["contribution"].sel(contributor=other) ** 2).sum("contributor", skipna=False) ** 0.5
+    one_way = {
+        name: float((found.sel(contributor=other) ** 2).sum() ** 0.5) for name, found in _one_way_shares(result).items()
+    }
     return {
         "window": result.attrs["window"],
         "cycles": cycles,
         **{f"{name}_um": _quantity(result, name) for name in _AXIS},
         "B_of_scatter_um": float(result["B_of_scatter"]),
         **by_direction,
-        "u_without_sampling_um": {name: float(without.sel(quantity=name)) for name in _AXIS},
+        "u_without_sampling_um": {name: float(without.sel(quantity=name)) for name in _AXIS} | one_way,
         "contributions": [_contribution(result, name, budget, measured) for name in CONTRIBUTIONS],
     }
+
+
+def _one_way_shares(result: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Return the contributions to A, R and E of every direction that was measured."""
+    shares = {
+        f"{name}_{direction}": result[f"{name}_unidirectional_contribution"].sel(direction=direction)
+        for direction in ("positive", "negative")
+        for name in "ARE"
+    }
+    return {name: found for name, found in shares.items() if found.notnull().all()}
 
 
 def _contribution(result: xr.Dataset, name: str, budget: StatedBudget, measured: _Measured) -> dict[str, Any]:
@@ -146,4 +159,5 @@ def _contribution(result: xr.Dataset, name: str, budget: StatedBudget, measured:
         origin = budget.origins.get(name, found)
     elif name == "extremes":
         origin = "mean excess of tests drawn like this one"
-    return {"contributor": name, "u": u, "unit": unit, "origin": origin, **parts}
+    one_way = {key: float(found.sel(contributor=name)) for key, found in _one_way_shares(result).items()}
+    return {"contributor": name, "u": u, "unit": unit, "origin": origin, **parts, "one_way_um": one_way}

@@ -189,3 +189,26 @@ def test_a_rotary_axis_has_tables_and_csv_alone() -> None:
     ):
         with pytest.raises(Iso230PageError, match="a rotary one"):
             write()
+
+
+def test_the_budget_of_one_approach_has_its_own_quantities() -> None:
+    x = X.copy()
+    x[:, 0] = np.nan
+    deviations = test_made(x)
+    windows, settled, part = evaluate_standard(deviations, ASSUMED, drift=None, material_degC=None)
+    found = Iso230Part.model_validate(plain(part))
+    dataset = joined(deviations, iso=windows, settled=settled)
+    budget = describe_iso230(found, dataset)["budget"]
+    assert [column.title for column in budget.columns[3:]] == [
+        "A\u2193 / \u00b5m",
+        "R\u2193 / \u00b5m",
+        "E\u2193 / \u00b5m",
+    ]
+    assert found.settled is not None
+    for column, symbol in enumerate("ARE", start=3):
+        shares = [as_number(row.cells[column]) for row in budget.rows[:7]]
+        without, whole = (as_number(row.cells[column]) for row in budget.rows[7:])
+        assert without == pytest.approx(2 * math.hypot(*shares[:5]), rel=0.06, abs=1e-3)
+        assert whole == pytest.approx(2 * math.hypot(*shares), rel=0.06)
+        assert whole == pytest.approx(2 * getattr(found.settled.negative, f"{symbol}_um").u, rel=0.06)
+    assert iso230_tables(found, dataset, title="A")[2].columns[3].header == "A\u2193 / \u00b5m"
