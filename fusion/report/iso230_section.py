@@ -199,12 +199,12 @@ def _values_table(part: Iso230Part, shown: Iso230Window, unit: str) -> Table:
                 continue
             of_shown = quantity(getattr(getattr(shown, direction), f"{symbol}_um"))
             of_first = quantity(getattr(getattr(part.first, direction), f"{symbol}_um")) if part.first else "–"
-            rows.append(Row([f"{_ONE_WAY[symbol]}{arrow}", of_shown, *([of_first, ""] if several else [])]))
-    mean = [quantity(shown.mean_reversal_um), *([quantity(part.mean_reversal_um), ""] if several else [])]
+            rows.append(Row([f"{_ONE_WAY[symbol]}{arrow}", of_shown, *([of_first, "–"] if several else [])]))
+    mean = [quantity(shown.mean_reversal_um), *([quantity(part.mean_reversal_um), "–"] if several else [])]
     rows.append(Row(["Mean reversal error, with its sign", *mean]))
     columns = [f"{shown.window} / {unit}"]
     if several:
-        columns += [f"First window, {part.window} / {unit}", f"Range over the windows / {unit}"]
+        columns += [f"First window, {part.window} / {unit}", f"Range over windows without overlap / {unit}"]
     return table([Words("Quantity of the axis (± U, k = 2)"), *columns], rows)
 
 

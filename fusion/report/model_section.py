@@ -109,18 +109,21 @@ def steps_table(loop: Loop) -> Table:
         Words("Next best effect"),
     ]
     declared = join([effect_words(name).name for name in loop.declared]) or "nothing"
-    rows = [Row(["0", f"declared: {declared}", "–", alike([loop.rmse_declared_um])[0], "–", "", ""])]
+    errors = [error for step in loop.steps for error in (step.rmse_before_um, step.rmse_after_um)]
+    told = alike([loop.rmse_declared_um, *errors])
+    rows = [Row(["0", f"declared: {declared}", "–", told[0], "–", "", ""])]
     for turn, step in enumerate(loop.steps, start=1):
-        rows.append(Row([str(turn), *_step_cells(step)], marked=True))
+        held_out = " -> ".join(told[2 * turn - 1 : 2 * turn + 1])
+        rows.append(Row([str(turn), *_step_cells(step, held_out)], marked=True))
     return table(columns, rows)
 
 
-def _step_cells(step: StepPart) -> list[str]:
+def _step_cells(step: StepPart, held_out: str) -> list[str]:
     told = parameters_with_ranges(step.parameters, step.parameter_ranges)
     return [
         f"{effect_words(step.effect).name}{f': {told}' if told else ''}",
         p_cell(step.p_value),
-        " -> ".join(alike((step.rmse_before_um, step.rmse_after_um))),
+        held_out,
         " -> ".join(alike((step.cross_rmse_before_um, step.cross_rmse_after_um))),
         f"not confirmed: {step.doubt}" if step.doubt else "yes",
         _runner_up(step.runner_up),
@@ -299,7 +302,7 @@ def describe_candidates(loop: AxisLoop) -> Table:
 
 
 def _nats(gain: float | None) -> str:
-    return "–" if gain is None else f"{gain:.1f}".replace("-", "−")
+    return "–" if gain is None else f"{gain:z.1f}".replace("-", "−")
 
 
 def describe_residual(declared: ResidualPart, final: ResidualPart) -> Table:

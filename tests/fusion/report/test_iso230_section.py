@@ -26,6 +26,9 @@ def test_the_settled_window_stands_beside_the_first_one(part: Iso230Part) -> Non
     titles = [column.title for column in told["axis"].columns]
     assert titles[1].startswith(part.settled.window)  # type: ignore[union-attr]
     assert titles[2].startswith("First window, cycles 1 to 5")
+    assert titles[3].startswith("Range over windows without overlap")
+    ranges = [row.cells[3] for row in told["axis"].rows]
+    assert " to " in ranges[0] and ranges[1] == ranges[2] == ranges[-1] == "\u2013"
     terms = [row.cells[0] for row in told["axis"].rows]
     assert terms[:3] == [
         "Bidirectional positioning accuracy A",

@@ -109,3 +109,15 @@ def test_every_coefficient_has_a_name_of_its_own() -> None:
     assert named("thermal_lag", "flat and linear", 2) == ["shift", "stretch at the far end"]
     assert named("periodic_disturbance", "flat", 2) == ["sine part", "cosine part"]
     assert named("step_event", "flat", 1) == [""] and named("bed_bending", "", 2) == ["coefficient 1", "coefficient 2"]
+
+
+def test_errors_of_all_steps_have_the_same_decimals() -> None:
+    step = LOOP.steps[0].model_copy(update={"rmse_before_um": 1.938, "rmse_after_um": 0.4643})
+    rows = model_section.steps_table(LOOP.model_copy(update={"rmse_declared_um": 1.938, "steps": (step,)})).rows
+    assert [row.cells[3] for row in rows] == ["1.94", "1.94 -> 0.46"]
+
+
+def test_a_gain_that_rounds_to_zero_has_no_sign() -> None:
+    score = LOOP.search[0][0].model_copy(update={"gain": -0.04, "excess_gain": -0.06})
+    (row,) = model_section.describe_candidates(LOOP.model_copy(update={"search": ((score,),)})).rows
+    assert row.cells[3:5] == ["0.0", "\u22120.1"]
