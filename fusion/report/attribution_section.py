@@ -75,6 +75,7 @@ def describe_correlation(
         "tell": correlation.would_tell,
         **_leading_figure(correlation),
         "captions": captions,
+        "mode_captions": {mode.name.replace(" ", "_"): _mode_caption(mode) for mode in correlation.modes},
         "cells": _cells_table(maps.to_dataset(), correlation.least_p),
         "places": [
             _place_tables(heading, title, listed, maps, correlation.least_p)
@@ -101,6 +102,12 @@ def _leading_figure(correlation: CorrelationPart) -> dict[str, str]:
         return {"leading_figure": f"mode_{source.name}", "leading_caption": told}
     told = f"{area} are the cells that explain the drift as well as the strongest one; coloured where they are significant."
     return {"leading_figure": "sensitivity", "leading_caption": told}
+
+
+def _mode_caption(mode: PlacePart) -> str:
+    """What a chart of a thermal mode shows, with its area."""
+    where = span_words(mode.area) if mode.area else place(mode.x_mm, mode.y_mm)
+    return f"Thermal {mode.name}, {where}: a part of the field that warms by itself, usually one heat source with its halo."
 
 
 def _leading(correlation: CorrelationPart) -> str:

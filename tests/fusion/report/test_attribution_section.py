@@ -63,3 +63,13 @@ def test_nothing_is_told_where_nothing_was_tested(parts: tuple[xr.DataTree, Resu
     fused, results = parts
     assert describe_correlation(fused, results.model_copy(update={"correlation": None}), None) is None
     assert json.dumps(correlation_of(results).would_tell)
+
+
+def test_every_chart_of_a_mode_names_mode_and_area(parts: tuple[xr.DataTree, Results]) -> None:
+    fused, results = parts
+    told = describe_correlation(fused, results, None)
+    assert told is not None
+    modes = fused.children["correlation"].children["modes"]["mode"].values
+    assert list(told["mode_captions"]) == [f"mode_{mode}" for mode in modes]
+    for mode, caption in zip(modes, told["mode_captions"].values(), strict=True):
+        assert caption.startswith(f"Thermal mode {mode}, x ")
