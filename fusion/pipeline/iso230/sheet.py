@@ -12,7 +12,9 @@ import xarray as xr
 from fusion.campaign.config import Campaign, InterferometryTable
 from fusion.campaign.standard_test import AcceptanceTable, ReportTable
 from fusion.products.grouped import group, has
+from fusion.report.wording import moment
 from interferometry.drift.planning import estimate_settling
+from interferometry.figures import time_span
 from interferometry.iso230 import evaluate_other_standards
 from interferometry.iso230.acceptance import decide
 from interferometry.iso230.conditions import check_conditions
@@ -83,6 +85,7 @@ def _conditions(
         "redo": "compensated again with the logged conditions",
     }
     return {
+        "Date of the test": _date(dataset, None if campaign is None else campaign.zone_of("interferometry")),
         "Machine": report.machine,
         "Serial number of the machine": report.machine_serial_number,
         "Control": report.control,
@@ -118,6 +121,14 @@ def _conditions(
         "Readings": "" if laser is None else compensation[laser.compensation],
         "Remarks": report.remarks,
     }
+
+
+def _date(dataset: xr.Dataset, zone: str | None) -> str:
+    """Return from when to when readings were taken, in local time where the zone is stated, else in UTC."""
+    if np.isnat(dataset["time"].values).all():
+        return ""
+    first, last = time_span(dataset)
+    return f"{moment(first, zone)} to {moment(last, zone)}"
 
 
 def _coefficient(laser: InterferometryTable | None) -> str:

@@ -13,6 +13,7 @@ from fusion.pipeline.iso230.sheet import complete_sheet
 from fusion.products.grouped import joined
 from fusion.products.results_axis import Iso230Part
 from fusion.products.store import plain
+from fusion.report.wording import moment
 from tests.fusion.pipeline.iso230.test_evaluation import ASSUMED
 from tests.interferometry.simulated_campaigns import simulate
 
@@ -59,3 +60,12 @@ def test_a_bare_file_has_conditions_checked_and_nothing_judged() -> None:
     part = sheet(None)
     assert part.tolerances == () and len(part.checks) == 6 and len(part.other_standards) == 9
     assert all(row.text == "" for row in part.conditions if row.name != "Measured travel")
+
+
+def test_the_date_of_the_test_is_that_of_its_readings() -> None:
+    stated = {**STATED, "campaign": {**STATED["campaign"], "time_zone": "Asia/Tokyo"}}
+    time = simulate(np.random.default_rng(3), cycles=12)[0]["time"].values
+    for campaign, zone in ((None, None), (Campaign.model_validate({**stated, "path": Path("a.toml")}), "Asia/Tokyo")):
+        (date,) = (row.text for row in sheet(campaign).conditions if row.name == "Date of the test")
+        assert date == f"{moment(time.min(), zone)} to {moment(time.max(), zone)}"
+        assert date.endswith("UTC" if zone is None else "JST")
