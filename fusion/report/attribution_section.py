@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -82,7 +83,7 @@ def describe_correlation(
             for heading, title, listed in places
             if listed
         ],
-        "region": leading_region(maps) if "target_regions" in maps.children else "",
+        "region": region_words(leading_region(maps)) if "target_regions" in maps.children else "",
         "region_targets": _region_targets(maps) if "target_regions" in maps.children else "",
         "session": _session(maps),
         "duty": _duty_table(correlation.randomised_duty) if correlation.randomised_duty else None,
@@ -114,7 +115,7 @@ def _leading(correlation: CorrelationPart) -> str:
     """Size and lag of the leading candidate, and what cannot be told from it."""
     source = correlation.source
     attributable = correlation.verdict == "attributable"
-    what = {"cell": "a cell", "mode": f"thermal mode {source.name}", "region": source.name}[source.kind]
+    what = {"cell": "a cell", "mode": f"thermal mode {source.name}", "region": region_words(source.name)}[source.kind]
     behind = f"with a lag of {duration(source.lag_s)}" if source.lag_s else "without lag"
     size = quantity(source.sensitivity_um_per_K, "µm/K")
     part = CHANNELS.get(source.part, source.part)
@@ -237,7 +238,7 @@ def _place_tables(
 def _place_row(candidate: PlacePart, part: str, tested: TestedPart, modes: bool, least_p: float | None) -> Row:
     x, y = ("–" if value is None else f"{value:.0f}" for value in (candidate.x_mm, candidate.y_mm))
     cells = [
-        candidate.name,
+        region_words(candidate.name),
         span_words(candidate.area),
         f"{x}, {y}",
         _SHORT.get(part, part),
@@ -249,6 +250,17 @@ def _place_row(candidate: PlacePart, part: str, tested: TestedPart, modes: bool,
     if modes:
         cells.append(p_cell(tested.p_beside_leader, least_p))
     return Row(cells, marked=_passes(tested.p_value))
+
+
+def region_words(name: str) -> str:
+    """Return the name of a region in the report: the disc about a hotspot is not the area of the hotspot itself.
+
+    Parameters
+    ----------
+    name : str
+        Name in the results.
+    """
+    return re.sub(r"^hotspot (?=\d+$)", "disc about hotspot ", name)
 
 
 def leading_region(maps: xr.DataTree) -> str:
@@ -272,7 +284,7 @@ def _region_targets(maps: xr.DataTree) -> str:
         passed = [str(name) for name in p["series"].values[(p.sel(region=region) <= LEVEL).values]]
         if passed:
             more = ", …" if len(passed) > 6 else ""
-            named.append(f"{region}: {len(passed)} of {p.sizes['series']} ({join(passed[:6])}{more})")
+            named.append(f"{region_words(region)}: {len(passed)} of {p.sizes['series']} ({join(passed[:6])}{more})")
     return "; ".join(named) or "none"
 
 

@@ -11,7 +11,7 @@ import xarray as xr
 
 from fusion.products.results import CorrelationPart, Results, read_results
 from fusion.products.store import read_tree
-from fusion.report.attribution_section import describe_correlation
+from fusion.report.attribution_section import describe_correlation, region_words
 
 
 @pytest.fixture
@@ -73,3 +73,14 @@ def test_every_chart_of_a_mode_names_mode_and_area(parts: tuple[xr.DataTree, Res
     assert list(told["mode_captions"]) == [f"mode_{mode}" for mode in modes]
     for mode, caption in zip(modes, told["mode_captions"].values(), strict=True):
         assert caption.startswith(f"Thermal mode {mode}, x ")
+
+
+def test_the_disc_about_a_hotspot_is_not_called_as_the_hotspot(parts: tuple[xr.DataTree, Results]) -> None:
+    assert region_words("hotspot 12") == "disc about hotspot 12" and region_words("hotspot plate") == "hotspot plate"
+    fused, results = parts
+    told = describe_correlation(fused, results, None)
+    assert told is not None
+    regions = next(place for place in told["places"] if place.title.startswith("Regions"))
+    named = [row.cells[0] for row in regions.strongest.rows]
+    assert named == [region_words(region.name) for region in correlation_of(results).regions]
+    assert not any(name.startswith("hotspot") for name in named)
