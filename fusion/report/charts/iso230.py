@@ -86,10 +86,11 @@ def _mark_spans(drawn: figure, settled: xr.Dataset, end: float, room: float) -> 
         drawn.segment([at], [bottom], [at], [top], line_color=INK, line_width=1.4)
         for level in (bottom, top):
             drawn.segment([end], [level], [at], [level], line_color=MUTED, line_dash="dashed", line_width=0.8)
+        # A above its span, which is the longer one, and E beside its own: at one height they would be written over each other.
+        y, shift = (top, (-18, 4)) if symbol == "A" else ((bottom + top) / 2, (4, -8))
         drawn.add_layout(
             Label(
-                x=at, y=(bottom + top) / 2, text=f"{symbol} {top - bottom:.2f}", text_color=INK, text_font_size="12px", x_offset=4,
-                y_offset=-8,
+                x=at, y=y, text=f"{symbol} {top - bottom:.2f}", text_color=INK, text_font_size="12px", x_offset=shift[0], y_offset=shift[1],
             )
         )  # fmt: skip
 

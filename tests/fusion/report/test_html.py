@@ -190,3 +190,16 @@ def test_it_is_made_anew_from_its_products(report: Path, tmp_path: Path) -> None
 def test_it_prints(opened: tuple[Page, list[str]]) -> None:
     page, _ = opened
     assert page.pdf(format="A4").startswith(b"%PDF")
+
+
+def test_no_link_of_the_contents_hides_behind_the_button(opened: tuple[Page, list[str]]) -> None:
+    page, _ = opened
+    for width in (700, 1400):
+        page.set_viewport_size({"width": width, "height": 900})
+        boxes = page.evaluate(
+            "[...document.querySelectorAll('nav.contents > *')].map(e => { const r = e.getBoundingClientRect(); "
+            "return [r.left, r.right, r.top, r.bottom]; })"
+        )
+        left, _, top, bottom = boxes[-1]
+        assert all(right <= left or low <= top or high >= bottom for _, right, high, low in boxes[:-1])
+        assert max(right for _, right, _, _ in boxes) <= width

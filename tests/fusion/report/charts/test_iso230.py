@@ -36,3 +36,13 @@ def test_a_single_run_shows_its_readings() -> None:
     x = np.arange(12.0).reshape(1, 2, 6)
     chart = plot_single_runs(test_made(x))
     assert chart.columns["cycle 1, negative approach / \u00b5m"] == pytest.approx(np.arange(6.0, 12.0))
+
+
+def test_the_labels_of_both_spans_stand_apart() -> None:
+    test = test_made(np.random.default_rng(5).normal(0, 0.1, (5, 2, 6)) + 3.0 * np.arange(6))
+    labels = {
+        label.text[0]: label
+        for label in plot_test(evaluate_iso230(test), test["position"]).figure.select({"type": Label})
+    }
+    assert labels["A"].y > 15.0 and labels["A"].y_offset > 0
+    assert 7.0 < labels["E"].y < 8.0
