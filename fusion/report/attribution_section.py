@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +16,18 @@ from fusion.report.charts.attribution import caption_of, rate_text
 from fusion.report.conclusions.answers import place_sentence
 from fusion.report.findings import randomised_causes, span_words
 from fusion.report.tables import Row, Table, Words, table
-from fusion.report.wording import CHANNELS, conditional, duration, join, measured, number, p_cell, place, quantity
+from fusion.report.wording import (
+    CHANNELS,
+    conditional,
+    duration,
+    join,
+    measured,
+    number,
+    p_cell,
+    place,
+    quantity,
+    region_words,
+)
 
 _SHORT = {"common": "common", "proportional": "growing", "reversal": "reversal", "joint": "common and growing"}
 _SENSITIVITY = "Sensitivity / (µm/K)"
@@ -250,17 +260,6 @@ def _place_row(candidate: PlacePart, part: str, tested: TestedPart, modes: bool,
     if modes:
         cells.append(p_cell(tested.p_beside_leader, least_p))
     return Row(cells, marked=_passes(tested.p_value))
-
-
-def region_words(name: str) -> str:
-    """Return the name of a region in the report: the disc about a hotspot is not the area of the hotspot itself.
-
-    Parameters
-    ----------
-    name : str
-        Name in the results.
-    """
-    return re.sub(r"^hotspot (?=\d+$)", "disc about hotspot ", name)
 
 
 def leading_region(maps: xr.DataTree) -> str:

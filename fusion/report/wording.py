@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from functools import cache
@@ -259,6 +260,17 @@ def place(x_mm: float | None, y_mm: float | None) -> str:
     """
     x, y = ("–" if value is None else f"{value:.0f}" for value in (x_mm, y_mm))
     return f"x {x} mm, y {y} mm"
+
+
+def region_words(name: str) -> str:
+    """Return the name of a region in the report: the disc about a hotspot is not the area of the hotspot itself.
+
+    Parameters
+    ----------
+    name : str
+        Name in the results.
+    """
+    return re.sub(r"^hotspot (?=\d+$)", "disc about hotspot ", name)
 
 
 def join(items: Sequence[str]) -> str:

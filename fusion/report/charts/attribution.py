@@ -21,7 +21,7 @@ from fusion.report.charts.style import (
     palette,
     span_words,
 )
-from fusion.report.wording import CHANNELS, duration, number, p_cell, p_words
+from fusion.report.wording import CHANNELS, duration, number, p_cell, p_words, region_words
 from interferometry.figures import COLOURS, INK
 
 #: Upper ends of the steps in which a p-value is shown, their colours, and their names; above the last one a cell is left blank.
@@ -237,7 +237,7 @@ def plot_region_targets(targets: xr.Dataset, region: str, position: xr.DataArray
     """
     chosen = targets.sel(region=region)
     step = float(np.median(np.diff(np.sort(position.values)))) if position.size > 1 else 1.0
-    drawn = new_figure(x="position / mm", y="sensitivity / (µm/K)", title=region)
+    drawn = new_figure(x="position / mm", y="sensitivity / (µm/K)", title=region_words(region))
     add_zero_line(drawn)
     place = position.sel(target=chosen["series_target"].values).values.astype(float)
     value, half = chosen["sensitivity"].values, 2 * chosen["sensitivity_u"].values
@@ -254,8 +254,8 @@ def plot_region_targets(targets: xr.Dataset, region: str, position: xr.DataArray
             if words == "p > 0.05":
                 drawn.renderers[-1].glyph.fill_color = "#ffffff"
     seen = (
-        f"Sensitivity of {value.size} series to {region}: {span_words(value, 'µm/K')}; {int(passed.sum())} of them are significant by "
-        "themselves."
+        f"Sensitivity of {value.size} series to {region_words(region)}: {span_words(value, 'µm/K')}; {int(passed.sum())} of them are "
+        "significant by themselves."
     )
     columns = {
         "position / mm": place, "approach": side, "sensitivity / (µm/K)": value, "95 % interval ± / (µm/K)": half,

@@ -11,7 +11,8 @@ import xarray as xr
 
 from fusion.products.results import CorrelationPart, Results, read_results
 from fusion.products.store import read_tree
-from fusion.report.attribution_section import describe_correlation, region_words
+from fusion.report.attribution_section import describe_correlation
+from fusion.report.wording import region_words
 
 
 @pytest.fixture
