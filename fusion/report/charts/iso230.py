@@ -80,17 +80,17 @@ def _mark_spans(drawn: figure, settled: xr.Dataset, end: float, room: float) -> 
     mean, s = settled["mean_unidirectional"].values, settled["standard_deviation"].values
     if not np.isfinite(mean).any():
         return
-    spans = (("A", mean - 2 * s, mean + 2 * s, 0.25), ("E", mean, mean, 0.62))
-    for symbol, low, high, share in spans:
+    # Labels stand beside their spans at two heights: at one height they would be written over each other.
+    spans = (("A", mean - 2 * s, mean + 2 * s, 0.15, 0.3), ("E", mean, mean, 0.62, 0.6))
+    for symbol, low, high, share, height in spans:
         at, bottom, top = end + share * room, float(np.nanmin(low)), float(np.nanmax(high))
         drawn.segment([at], [bottom], [at], [top], line_color=INK, line_width=1.4)
         for level in (bottom, top):
             drawn.segment([end], [level], [at], [level], line_color=MUTED, line_dash="dashed", line_width=0.8)
-        # A above its span, which is the longer one, and E beside its own: at one height they would be written over each other.
-        y, shift = (top, (-18, 4)) if symbol == "A" else ((bottom + top) / 2, (4, -8))
         drawn.add_layout(
             Label(
-                x=at, y=y, text=f"{symbol} {top - bottom:.2f}", text_color=INK, text_font_size="12px", x_offset=shift[0], y_offset=shift[1],
+                x=at, y=bottom + height * (top - bottom), text=f"{symbol} {top - bottom:.2f}", text_color=INK, text_font_size="12px",
+                x_offset=4, y_offset=-8,
             )
         )  # fmt: skip
 

@@ -44,5 +44,6 @@ def test_the_labels_of_both_spans_stand_apart() -> None:
         label.text[0]: label
         for label in plot_test(evaluate_iso230(test), test["position"]).figure.select({"type": Label})
     }
-    assert labels["A"].y > 15.0 and labels["A"].y_offset > 0
-    assert 7.0 < labels["E"].y < 8.0
+    # Text of 12 px is a fifteenth of the chart's height.
+    assert labels["E"].y - labels["A"].y > 15.0 / 15
+    assert labels["A"].x < labels["E"].x
