@@ -1,4 +1,4 @@
-"""The command line: run, simulate, inspect, iso230, schema, export, report, plan. How it ends is in `fusion.endings`."""
+"""The command line, a function for each command. How it ends is in `fusion.endings`."""
 
 from __future__ import annotations
 

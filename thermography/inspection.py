@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from thermography.errors import ThermographyError
-from thermography.io.flir import FlirFrameReference, index_frames, read_frame
+from thermography.io.flir import FlirFrameReference, FlirReader, index_frames, read_frame
 from thermography.io.frame import CameraParameters, FlirFormatError, Frame, FrameReference, RejectedFrame
 from thermography.io.frame_readers import find_reader
 from thermography.io.temperature_frames import StackOptions, TemperatureReader
@@ -130,7 +130,7 @@ def is_flir_file(path: Path) -> bool:
     """
     with Path(path).open("rb") as file:
         start = file.read(4)
-    return start[:2] == b"\xff\xd8" or start == b"FFF\0"
+    return FlirReader().recognises(path, start)
 
 
 def inspect_file(path: Path) -> FlirInspection:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -171,7 +173,9 @@ class NetcdfReader(TemperatureReader):
         zarr = path.name in _ZARR_METADATA or (path.is_dir() and any((path / name).exists() for name in _ZARR_METADATA))
         return zarr or start[:4] == b"\x89HDF"
 
-    def _variable(self, path: Path, options: StackOptions) -> xr.DataArray:
+    @contextmanager
+    def _variable(self, path: Path, options: StackOptions) -> Iterator[xr.DataArray]:
+        """Open the store for as long as its variable is read."""
         try:
             store = path.parent if path.name in _ZARR_METADATA else path
             zarr = store.is_dir()
@@ -182,15 +186,15 @@ class NetcdfReader(TemperatureReader):
             )
         except Exception as error:
             raise ThermographyError(f"{path}: cannot be opened ({error}); write it again") from None
-        stacks = [name for name, values in dataset.data_vars.items() if values.ndim == 3]
-        name = options.variable if options.variable is not None else stacks[0] if len(stacks) == 1 else None
-        if name not in dataset.data_vars or dataset[name].ndim != 3:
-            dataset.close()
-            raise StackError(
-                f'{path}: holds the variables {", ".join(map(str, stacks)) or "none"} over three dimensions; write variable = "..." '
-                "for the one with the temperatures (time, row, column)"
-            )
-        return dataset[name]
+        with dataset:
+            stacks = [name for name, values in dataset.data_vars.items() if values.ndim == 3]
+            name = options.variable if options.variable is not None else stacks[0] if len(stacks) == 1 else None
+            if name not in dataset.data_vars or dataset[name].ndim != 3:
+                raise StackError(
+                    f'{path}: holds the variables {", ".join(map(str, stacks)) or "none"} over three dimensions; write variable = "..." '
+                    "for the one with the temperatures (time, row, column)"
+                )
+            yield dataset[name]
 
     def contents(self, path: Path, options: StackOptions) -> StackContents:
         """Return what a store holds.
@@ -207,12 +211,12 @@ class NetcdfReader(TemperatureReader):
         ThermographyError
             The store is damaged.
         """
-        values = self._variable(path, options)
-        first = values.dims[0]
-        stamps = values[first].values if first in values.coords else np.empty(0)
-        times = tuple(stamps.astype("datetime64[ns]")) if stamps.dtype.kind == "M" else None
-        unit = _UNITS.get(str(values.attrs.get("units", "")), "")
-        return StackContents(values.shape[0], (values.shape[1], values.shape[2]), unit, times, zoned=True)
+        with self._variable(path, options) as values:
+            first = values.dims[0]
+            stamps = values[first].values if first in values.coords else np.empty(0)
+            times = tuple(stamps.astype("datetime64[ns]")) if stamps.dtype.kind == "M" else None
+            unit = _UNITS.get(str(values.attrs.get("units", "")), "")
+            return StackContents(values.shape[0], (values.shape[1], values.shape[2]), unit, times, zoned=True)
 
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
         """Return the values of a time, (row, column).
@@ -229,13 +233,11 @@ class NetcdfReader(TemperatureReader):
         ThermographyError
             The store is damaged.
         """
-        values = self._variable(path, options)
-        try:
-            return np.asarray(values[index].values)
-        except Exception as error:
-            raise ThermographyError(f"{path}: frame {index} is damaged ({error}); write it again") from None
-        finally:
-            values.close()
+        with self._variable(path, options) as values:
+            try:
+                return np.asarray(values[index].values)
+            except Exception as error:
+                raise ThermographyError(f"{path}: frame {index} is damaged ({error}); write it again") from None
 
 
 def _require_scale(path: Path, kind: np.dtype[Any], options: StackOptions) -> None:
