@@ -172,14 +172,19 @@ def test_scatter_rmse(kind: str, bar_um: float) -> None:
 
 
 def noise(
-    rng: np.random.Generator, *, extra: float = 0.0, tails: float | None = None, spread: float = 0.0
+    rng: np.random.Generator,
+    *,
+    extra: float = 0.0,
+    tails: float | None = None,
+    spread: float = 0.0,
+    approaches: int = 2,
 ) -> np.ndarray:
     shape = (CYCLES, 2, TARGETS)
     unit = rng.standard_normal(shape)
     if tails is not None:
         unit = rng.standard_t(tails, shape) / np.sqrt(tails / (tails - 2))
     made = SIGMA_UM * unit * np.exp(spread * rng.standard_normal(TARGETS))
-    made[:, :, 2] += extra * rng.standard_normal((CYCLES, 2))
+    made[:, :approaches, 2] += extra * rng.standard_normal((CYCLES, approaches))
     return made
 
 
@@ -219,14 +224,21 @@ def test_false_alarms_under_heavy_tails() -> None:
     assert found["stands out"][0] <= 0.05
 
 
+# An extra of 0.30 um: 0.90 would need all of the error probability for both approaches together; either alone is looked for as well.
 @pytest.mark.parametrize(
-    ("extra", "found_at_least", "stands_out_at_least"), [(0.25, 0.55, 0.0), (0.3, 0.90, 0.60), (0.5, 0.95, 0.95)]
+    ("extra", "found_at_least", "stands_out_at_least"), [(0.25, 0.55, 0.0), (0.3, 0.80, 0.65), (0.5, 0.95, 0.95)]
 )
 def test_power(extra: float, found_at_least: float, stands_out_at_least: float) -> None:
     found = rates(30_000, extra=extra)
     assert found["target 3"][1] >= found_at_least
     assert found["target 3 stands out"][1] >= stands_out_at_least
     assert found["elsewhere"][0] <= 0.05
+
+
+def test_power_in_one_approach() -> None:
+    found = rates(130_000, extra=0.3, approaches=1)
+    assert found["target 3"][1] >= 0.45
+    assert found["target 3 stands out"][1] >= 0.20
 
 
 @pytest.mark.parametrize("spread", [0.1, 0.2])
