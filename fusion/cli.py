@@ -179,6 +179,30 @@ def init(
             console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
+@app.command("app")
+def application(
+    folder: Annotated[
+        Path | None,
+        typer.Argument(metavar="FOLDER", help="Folder that it may read and write; left out: the present one."),
+    ] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine; 0: a free one.")] = 0,
+    open_browser: Annotated[bool, typer.Option("--open", help="Open it in the browser of this system.")] = False,
+) -> None:
+    """Set a campaign up and run it in the browser.
+
+    The application answers on this machine only, to whoever opens the printed address; it uses no network.
+    """
+    from fusion.app.server import serve
+
+    with _answering():
+        serve(
+            folder or Path.cwd(),
+            port=port,
+            open_browser=open_browser,
+            say=lambda address: console.print(f"app: {address}", soft_wrap=True, highlight=False, markup=False),
+        )
+
+
 @app.command()
 def check(
     campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN.toml", help="The campaign file.")],

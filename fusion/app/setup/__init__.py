@@ -1,0 +1,1 @@
+"""Set up: from a folder of files to a campaign file."""

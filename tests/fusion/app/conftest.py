@@ -1,0 +1,117 @@
+"""The application as a user starts it, in a process of its own, and a browser in front of it."""
+
+from __future__ import annotations
+
+import http.client
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+@contextmanager
+def started(folder: Path) -> Iterator[str]:
+    """Start `thermofuse app` for a folder; yields the address that it prints."""
+    command = [sys.executable, "-m", "fusion.cli", "app", str(folder)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"}
+    ) as process:
+        assert process.stdout is not None
+        try:
+            yield process.stdout.readline().strip().removeprefix("app: ")
+        finally:
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(10) == 128 + signal.SIGTERM
+
+
+@pytest.fixture(scope="session")
+def app(
+    campaign_folder: Path, results_folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[str, Path]]:
+    """Address of an application, and its folder: a finished campaign, and a file outside to which a link leads."""
+    above = tmp_path_factory.mktemp("app")
+    folder = above / "folder"
+    shutil.copytree(campaign_folder, folder)
+    shutil.copytree(results_folder, folder / "results")
+    (above / "outside").mkdir()
+    (above / "outside" / "report.html").write_text("secret")
+    (above / "outside" / "results.json").write_text("{}")
+    (folder / "linked").symlink_to(above / "outside")
+    with started(folder) as address:
+        yield address, folder
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a server answers, read whole."""
+
+    status: int
+    headers: http.client.HTTPMessage
+    body: bytes
+
+
+@pytest.fixture(scope="session")
+def ask() -> Callable[..., Answer]:
+    """Return a function that asks a server without a browser; headers are keyword arguments with _ in place of -."""
+
+    def request(address: str, path: str, *, method: str = "GET", body: bytes = b"", **headers: str) -> Answer:
+        fields = {name.replace("_", "-"): value for name, value in headers.items()}
+        with closing(http.client.HTTPConnection(urlsplit(address).netloc, timeout=10)) as connection:
+            connection.request(method, path, body=body or None, headers=fields)
+            answer = connection.getresponse()
+            return Answer(answer.status, answer.headers, answer.read())
+
+    return request
+
+
+@pytest.fixture(scope="session")
+def cookie(app: tuple[str, Path], ask: Callable[..., Answer]) -> str:
+    """The cookie that the application gives for its token."""
+    return ask(app[0], f"/?{urlsplit(app[0]).query}").headers["Set-Cookie"].split(";")[0]
+
+
+@pytest.fixture(scope="module")
+def new_page() -> Iterator[Callable[..., object]]:
+    """Return a function that opens an address in a new browser session; nothing may leave this machine or fail in a script."""
+    if CHROMIUM is None:
+        pytest.skip("chromium is not installed (Debian: apt-get install chromium)")
+    from playwright.sync_api import Page, sync_playwright
+
+    faults: list[str] = []
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+
+        def open_page(address: str, *, width: int = 1280) -> Page:
+            host = address.split("?")[0]
+            page = browser.new_context(viewport={"width": width, "height": 900}).new_page()
+            page.set_default_timeout(15_000)
+            page.on("pageerror", lambda error: faults.append(f"page error: {error}"))
+            page.on(
+                "console",
+                lambda message: faults.append(f"console: {message.text}") if message.type == "error" else None,
+            )
+            page.on(
+                "request",
+                lambda request: (
+                    None
+                    if request.url.startswith((host, "data:", "blob:"))
+                    else faults.append(f"request: {request.url}")
+                ),
+            )
+            page.goto(address)
+            return page
+
+        yield open_page
+        browser.close()
+    assert not faults
