@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -13,7 +13,7 @@ from thermography._typing import Array
 from thermography.fields.cycle_fields import noise_of_differences
 from thermography.fields.inputs import FrameSeries
 from thermography.fields.resampling import PlanWeights
-from thermography.io.frame import CameraParameters, FrameReference
+from thermography.io.frame import CameraParameters, StoredPixels
 from thermography.io.window_reader import WindowReader
 from thermography.radiometry.averaging import (
     AVERAGING_LIMIT_K,
@@ -26,7 +26,7 @@ from thermography.radiometry.averaging import (
 from thermography.radiometry.planck import calibrate
 from thermography.registration.displacement import FiducialMonitor, RegistrationSpan
 
-#: Largest number of frames of one block: the unit of work of a cluster, and what is lost when a run is interrupted.
+#: Largest number of frames of one block.
 BLOCK_FRAMES = 512
 #: About this number of pixels, evenly spread over the table, is compared from frame to frame.
 _SAMPLED_PIXELS = 250
@@ -109,11 +109,34 @@ class BlockResult:
     noise_K: float
     statistics: CountStatistics | None = None
 
+    @property
+    def view(self) -> BlockView:
+        """The result without what is kept per pixel."""
+        return BlockView(self.cells, self.displacement_px, self.samples, self.noise_K)
+
+
+@dataclass(frozen=True)
+class BlockView:
+    """What a block shows of the table, small beside its sums; the attributes are those of `BlockResult`.
+
+    Attributes
+    ----------
+    cells : (y, x) ndarray, degC
+    displacement_px : (frames, 4) ndarray, px
+    samples : (frames, points) ndarray, degC
+    noise_K : float, K
+    """
+
+    cells: Array
+    displacement_px: Array
+    samples: Array
+    noise_K: float
+
 
 def cut_blocks(
     frames: FrameSeries, spans: Sequence[RegistrationSpan], *, block_s: float, first: int = 0
 ) -> list[Block]:
-    """Cut frames into blocks: the unit of memory, of `frame_temperature`, and of the work of a cluster.
+    """Cut frames into blocks: the unit of memory and of `frame_temperature`.
 
     Parameters
     ----------
@@ -130,30 +153,35 @@ def cut_blocks(
     list of Block
         In order, without gaps, up to the last frame.
     """
-    times, correction_K = frames.times, frames.correction_K
     starts = np.array([span.first_frame for span in spans])
     span_of = np.searchsorted(starts, np.arange(len(frames)), side="right") - 1
-    longest = np.timedelta64(round(block_s * 1e9), "ns")
+    longest = round(block_s * 1e9)
+    # Plain numbers: a day of video is a million frames, and each is compared once.
+    nanoseconds, corrections = frames.times.astype(np.int64).tolist(), np.asarray(frames.correction_K, float).tolist()
+    cycles, span_numbers = frames.cycles.tolist(), span_of.tolist()
     blocks: list[Block] = []
+    start, of_block = first, None
     for i in range(first, len(frames)):
         parameters = frames.override(frames.references[i])
-        single = Block(i, i + 1, int(frames.cycles[i]), int(span_of[i]), parameters)
-        last = blocks[-1] if blocks else None
         if (
-            last is not None
-            and (last.cycle, last.span, last.parameters) == (single.cycle, single.span, single.parameters)
-            and i - last.first < BLOCK_FRAMES
-            and times[i] - times[last.first] < longest
-            and abs(correction_K[i] - correction_K[last.first]) <= _CORRECTION_STEP_K
+            of_block is None
+            or cycles[i] != cycles[start]
+            or span_numbers[i] != span_numbers[start]
+            or i - start >= BLOCK_FRAMES
+            or nanoseconds[i] - nanoseconds[start] >= longest
+            or abs(corrections[i] - corrections[start]) > _CORRECTION_STEP_K
+            or (parameters is not of_block and parameters != of_block)
         ):
-            blocks[-1] = replace(last, stop=i + 1)
-        else:
-            blocks.append(single)
+            if of_block is not None:
+                blocks.append(Block(start, i, cycles[start], span_numbers[start], of_block))
+            start, of_block = i, parameters
+    if of_block is not None:
+        blocks.append(Block(start, len(frames), cycles[start], span_numbers[start], of_block))
     return blocks
 
 
 def reduce_block(
-    frames: Sequence[FrameReference],
+    frames: Sequence[StoredPixels],
     parameters: CameraParameters,
     sensor: RegisteredSensor,
     keep_statistics: bool = False,
@@ -164,7 +192,7 @@ def reduce_block(
 
     Parameters
     ----------
-    frames : sequence of FrameReference
+    frames : sequence of StoredPixels
         Of one block.
     parameters : CameraParameters
         To calibrate them with.
@@ -221,7 +249,7 @@ def _kelvin_per_count(counts: Array, parameters: CameraParameters) -> float:
 def _calibrate_per_frame(
     mean: MeanTemperature,
     varying: Array,
-    frames: Sequence[FrameReference],
+    frames: Sequence[StoredPixels],
     parameters: CameraParameters,
     window: tuple[slice, slice],
 ) -> None:

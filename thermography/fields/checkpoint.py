@@ -201,9 +201,13 @@ def describe_reduction(
         As JSON.
     """
     digest = hashlib.sha256()
-    parameters = [frames.override(reference) for reference in frames.references]
-    for reference, camera in zip(frames.references, parameters, strict=True):
-        digest.update(f"{reference.path.name}#{reference.index}@{reference.time}|{camera}".encode())
+    # Most frames share their parameters: their text is made once.
+    texts: dict[CameraParameters, str] = {}
+    for reference in frames.references:
+        camera = frames.override(reference)
+        if camera not in texts:
+            texts[camera] = str(camera)
+        digest.update(f"{reference.path.name}#{reference.index}@{reference.time}|{texts[camera]}".encode())
     digest.update(np.ascontiguousarray(frames.correction_K, float).tobytes())
     registrations = [
         {"first": span.first_frame, "plan_to_sensor": span.registration.projection.plan_to_sensor.tolist()}

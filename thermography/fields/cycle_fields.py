@@ -166,6 +166,15 @@ class CyclePart:
         self.frames += reduced.frames
         self.seconds += float(((times - self.first_time) / np.timedelta64(1, "ns")).sum()) / 1e9
 
+    def join(self, later: CyclePart) -> None:
+        """Add frames after these of the same cycle and registration, whose pixels are there too."""
+        assert self.pixels is not None
+        assert later.pixels is not None
+        apart_s = float((later.first_time - self.first_time) / np.timedelta64(1, "ns")) / 1e9
+        self.pixels = self.pixels.merge(later.pixels)
+        self.frames += later.frames
+        self.seconds += later.seconds + later.frames * apart_s
+
     def finish(self, weights: PlanWeights) -> None:
         """Average pixels over the cells of the plan and release them."""
         assert self.pixels is not None

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermography._typing import Array
-from thermography.fields.blocks import Block, BlockResult, RegisteredSensor
+from thermography.fields.blocks import Block, BlockView, RegisteredSensor
 from thermography.fields.cycle_fields import position_covariance
 from thermography.fields.inputs import FrameSeries
 from thermography.fields.resampling import plan_weights, plan_window
@@ -325,7 +325,7 @@ class Obstructions:
         self._state = np.empty(0)
         self._until = 0
 
-    def examine(self, block: Block, result: BlockResult) -> None:
+    def examine(self, block: Block, result: BlockView) -> None:
         """Compare the frames of a block with the last frame that shows the table, and with later ones where they differ."""
         if result.samples.shape[1] < _LEAST_PIXELS:
             return

@@ -20,6 +20,8 @@ from thermography.fields.inputs import NO_CYCLE, FrameSeries, Override, Reductio
 from thermography.fields.moving_sampling import CellSums, Samples, add_frame, on_plan, sample_points
 from thermography.fields.scheduling import in_order, open_pool
 from thermography.fields.still import BLOCK_S
+from thermography.fields.tasks.frame_run import FrameRun
+from thermography.fields.tasks.stretches import cut_stretches
 from thermography.io.frame import CameraParameters, FrameReference
 from thermography.io.window_reader import WindowReader
 from thermography.radiometry.averaging import CHUNK_FRAMES
@@ -211,32 +213,41 @@ def _reduce_blocks(
     results = store.load(blocks) if store is not None else []
     if progress is not None and results:
         progress(blocks[len(results) - 1].stop)
+    left = blocks[len(results) :]
     with open_pool(scheduler) as pool:
         shared = pool.share(prepared)
-        tasks = (
-            (
-                block,
-                (
-                    _reduce_block,
-                    frames.references[block.first : block.stop],
-                    block.parameters,
-                    shared,
-                    frames.correction_K[block.first : block.stop],
-                ),
-            )
-            for block in blocks[len(results) :]
+        stretches = (
+            [block for portion in stretch for block in portion.blocks]
+            for stretch in cut_stretches(left, total=len(frames))
         )
-        for block, result in in_order(pool, tasks):
-            results.append(result)
-            if store is not None:
-                store.save(blocks, results)
-            if progress is not None:
-                progress(block.stop - block.first)
+        tasks = ((stretch, (_reduce_stretch, _with_corrections(frames, stretch), shared)) for stretch in stretches)
+        for stretch, reduced in in_order(pool, tasks):
+            for block, result in zip(stretch, reduced, strict=True):
+                results.append(result)
+                if store is not None:
+                    store.save(blocks, results)
+                if progress is not None:
+                    progress(block.stop - block.first)
     return results
 
 
+def _with_corrections(frames: FrameSeries, stretch: Sequence[Block]) -> list[tuple[FrameRun, CameraParameters, Array]]:
+    """Frames of every block with its camera parameters and corrections."""
+    return [
+        (FrameRun(frames.references[b.first : b.stop]), b.parameters, frames.correction_K[b.first : b.stop])
+        for b in stretch
+    ]
+
+
+def _reduce_stretch(
+    members: Sequence[tuple[FrameRun, CameraParameters, Array]], prepared: tuple[TableTracker, Samples]
+) -> list[_BlockResult]:
+    """Reduce the blocks of a stretch: the task of a thread or of a worker."""
+    return [_reduce_block(run, parameters, prepared, correction_K) for run, parameters, correction_K in members]
+
+
 def _reduce_block(
-    frames: Sequence[FrameReference],
+    frames: FrameRun,
     parameters: CameraParameters,
     prepared: tuple[TableTracker, Samples],
     correction_K: Array,

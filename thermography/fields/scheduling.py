@@ -1,16 +1,19 @@
-"""Computation of blocks by threads or by a dask cluster: results in order, and a limited number of blocks in memory."""
+"""Computation of function calls by threads or by a dask cluster: results in order, and a limited number of them in memory."""
 
 from __future__ import annotations
 
 import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from thermography.errors import ThermographyError
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 Task = TypeVar("Task")
 
@@ -34,11 +37,14 @@ class Pool:
         Sends an object that many calls need to the workers once; returns what to pass to `submit` in its place.
     in_flight : int
         Number of calls to keep waiting or running.
+    result : callable
+        Waits for a future and returns its result; raises what the call raised.
     """
 
     submit: Callable[..., Any]
     share: Callable[[Any], Any]
     in_flight: int
+    result: Callable[[Any], Any]
 
 
 @contextmanager
@@ -63,7 +69,7 @@ def open_pool(scheduler: str | None = None) -> Iterator[Pool]:
     if scheduler is None:
         threads = min(THREADS, os.cpu_count() or 1)
         with ThreadPoolExecutor(threads, "reduce") as executor:
-            yield Pool(executor.submit, lambda shared: shared, threads + 1)
+            yield Pool(executor.submit, lambda shared: shared, threads + 1, lambda future: future.result())
         return
     try:
         from distributed import Client
@@ -82,13 +88,48 @@ def open_pool(scheduler: str | None = None) -> Iterator[Pool]:
         if not workers:
             raise SchedulerError(f"scheduler {scheduler} has no worker; start one with: dask worker {scheduler}")
 
-        def submit(function: Callable[..., Any], *arguments: Any) -> Any:
-            # Not pure: hashing the references of a day of video costs more than the scheduler saves by it.
-            return client.submit(function, *arguments, pure=False)
-
-        yield Pool(submit, lambda shared: client.scatter(shared, broadcast=True, hash=False), 2 * len(workers) + 1)
+        yield _cluster_pool(client, scheduler, len(workers))
     finally:
         client.close()
+
+
+def _cluster_pool(client: Client, scheduler: str, workers: int) -> Pool:
+    """Return a pool of the workers of a connected scheduler; calls of a worker that dies are computed by another one."""
+    import dask
+    from distributed import KilledWorker
+
+    def submit(function: Callable[..., Any], *arguments: Any) -> Any:
+        # Not pure: hashing the places of a day of video costs more than the scheduler saves by it.
+        return client.submit(function, *arguments, pure=False)
+
+    def share(shared: Any) -> Any:
+        # Not scattered: what is scattered is lost with the workers that hold it, while the result of a call is computed again.
+        with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}):
+            return submit(_returned, shared)
+
+    def result(future: Any) -> Any:
+        try:
+            return future.result()
+        except FileNotFoundError as error:
+            raise SchedulerError(
+                f"{error.filename}: a worker of {scheduler} does not find this file; all workers need the files under the same path "
+                "(a shared folder), or leave the scheduler out"
+            ) from error
+        except KilledWorker as error:
+            raise SchedulerError(
+                f"scheduler {scheduler}: the same work ended {error.allowed_failures + 1} workers, most often for want of memory; "
+                "give each worker 1 GB or more, and look into its log"
+            ) from error
+        except CancelledError as error:
+            raise SchedulerError(
+                f"scheduler {scheduler}: the connection was lost; start the same command again with --resume"
+            ) from error
+
+    return Pool(submit, share, 2 * workers + 1, result)
+
+
+def _returned(shared: Task) -> Task:
+    return shared
 
 
 def in_order(pool: Pool, tasks: Iterable[tuple[Task, tuple[Any, ...]]]) -> Generator[tuple[Task, Any], None, None]:
@@ -112,10 +153,10 @@ def in_order(pool: Pool, tasks: Iterable[tuple[Task, tuple[Any, ...]]]) -> Gener
             waiting.append((task, pool.submit(*call)))
             if len(waiting) >= pool.in_flight:
                 first, future = waiting.popleft()
-                yield first, future.result()
+                yield first, pool.result(future)
         while waiting:
             first, future = waiting.popleft()
-            yield first, future.result()
+            yield first, pool.result(future)
     finally:
         for _, future in waiting:
             future.cancel()

@@ -1,6 +1,6 @@
 """Fields of a still table: one per cycle, and one per frame or short block of frames, on the table plan.
 
-Blocks of frames are reduced in parallel and gathered in order. Every frame is compared with its registration; after a lasting
+Stretches of frames are reduced in parallel and gathered in order. Every frame is compared with its registration; after a lasting
 displacement of camera or table (a knock) the plan is registered again, and the frames from there on are cut into blocks again.
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -19,12 +18,22 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from thermography._typing import Array
-from thermography.fields.blocks import Block, BlockResult, cut_blocks, reduce_block
+from thermography.fields.blocks import Block, cut_blocks
 from thermography.fields.checkpoint import Checkpoint, ParameterGroup, StoredCycle, describe_reduction
 from thermography.fields.cycle_fields import CyclePart, assemble_fields
 from thermography.fields.following import Displacements, Knock, Obstructions, Registrations
 from thermography.fields.inputs import NO_CYCLE, FrameSeries, Override, ReductionError, make_frame_series
 from thermography.fields.scheduling import Pool, in_order, open_pool
+from thermography.fields.tasks.stretches import (
+    Portion,
+    PortionResult,
+    add_sums,
+    choose_frames,
+    cut_stretches,
+    gather_frames,
+    reduce_portion,
+    reduce_stretch,
+)
 from thermography.io.frame import FrameReference
 from thermography.registration.displacement import RegistrationSpan, zoom_and_turn
 from thermography.registration.plan import PlanGrid
@@ -140,25 +149,25 @@ def _check_overlap(frames: FrameSeries) -> None:
 def _reduce_until_knock(
     reduction: StillReduction, pool: Pool, first: int, *, block_s: float, progress: Callable[[int], None] | None
 ) -> int:
-    """Reduce the frames from `first` on, block by block, up to the block in which a knock is found; the first frame not reduced."""
+    """Reduce the frames from `first` on, stretch by stretch, up to the block in which a knock is found; the first frame not reduced."""
     frames, registrations = reduction.frames, reduction.registrations
     blocks = cut_blocks(frames, registrations.spans, block_s=block_s, first=first)
     sensors = [pool.share(sensor) for sensor in registrations.sensors]
     keep_statistics = reduction.checkpoint is not None
     tasks = (
-        (b, (reduce_block, frames.references[b.first : b.stop], b.parameters, sensors[b.span], keep_statistics))
-        for b in blocks
-    )
+        (stretch, (reduce_stretch, [(gather_frames(frames, p.blocks), p.whole) for p in stretch], sensors[span], keep_statistics))
+        for stretch in cut_stretches(blocks, total=len(frames), begun=reduction.cycles.begun)
+        for span in [stretch[0].first.span]
+    )  # fmt: skip
     with closing(in_order(pool, tasks)) as results:
-        for block, result in results:
-            knock = reduction.displacement.find_knock(block, result.displacement_px)
-            if knock is not None:
-                reduction.register_again(knock)
-                return block.first
-            reduction.obstructions.examine(block, result)
-            reduction.gather(block, result)
-            if progress is not None:
-                progress(block.stop - block.first)
+        for stretch, reduced in results:
+            for portion, result in zip(stretch, reduced, strict=True):
+                knocked = reduction.gather(portion, result)
+                stop = portion.blocks[-1].stop if knocked is None else knocked.first
+                if progress is not None and stop > portion.first.first:
+                    progress(stop - portion.first.first)
+                if knocked is not None:
+                    return stop
     return len(frames)
 
 
@@ -205,24 +214,19 @@ class _Cycles:
         """The open cycle, if there is one."""
         return self.parts[-1] if self.parts and self.parts[-1].pixels is not None else None
 
-    def holds(self, block: Block) -> bool:
-        """Whether the last cycle is that of a block."""
-        return bool(self.parts) and (self.parts[-1].cycle, self.parts[-1].span) == (block.cycle, block.span)
+    @property
+    def begun(self) -> tuple[int, int] | None:
+        """Cycle and registration of the open cycle, if there is one."""
+        return None if self.open is None else (self.open.cycle, self.open.span)
 
-    def add(self, block: Block, result: BlockResult, times: Array, correction_K: float) -> None:
-        """Add a block to the open cycle, or open its cycle: times (frames,) of its frames, and their mean correction."""
-        if not self.holds(block):
-            self.parts.append(CyclePart(block.cycle, block.span))
-        self.parts[-1].add(replace(result.temperature, mean=result.temperature.mean + correction_K), times)
-        if result.statistics is not None:
-            self._add_sums(ParameterGroup(block.parameters, result.statistics, correction_K))
-
-    def _add_sums(self, new: ParameterGroup) -> None:
-        for number, group in enumerate(self.sums):
-            if group.parameters == new.parameters and group.correction_K == new.correction_K:
-                self.sums[number] = replace(group, statistics=group.statistics.merge(new.statistics))
-                return
-        self.sums.append(new)
+    def add(self, part: CyclePart, sums: Sequence[ParameterGroup]) -> None:
+        """Add a portion to the open cycle, or begin its cycle; one that is finished already has no other portion."""
+        if self.open is not None:
+            self.open.join(part)
+        else:
+            self.parts.append(part)
+        for group in sums:
+            add_sums(self.sums, group)
 
 
 class StillReduction:
@@ -310,32 +314,58 @@ class StillReduction:
         """Frames so far that are shaken or obstructed."""
         return self.displacement.shaken | self.obstructions.found
 
-    def gather(self, block: Block, result: BlockResult) -> None:
-        """Add a block to the stack and to its cycle; the first block of another cycle or registration closes the open cycle."""
-        kept = self.kept(block)
-        if not len(kept):
-            return
-        if len(kept) < block.stop - block.first:
-            chosen = [self.frames.references[i] for i in kept]
-            sensor = self.registrations.sensors[block.span]
-            result = reduce_block(chosen, block.parameters, sensor, self.checkpoint is not None)
-        if not self.cycles.holds(block):
+    def gather(self, portion: Portion, result: PortionResult) -> Block | None:
+        """Add a portion to the stack and to its cycle, up to the block of a knock, which is returned; the plan is then registered again.
+
+        The first portion of another cycle or registration closes the open cycle. Where frames are left out, the others are read again.
+        """
+        kept: list[tuple[Block, Array]] = []
+        complete, knocked = True, None
+        for block, view in zip(portion.blocks, result.views, strict=True):
+            knock = self.displacement.find_knock(block, view.displacement_px)
+            if knock is not None:
+                knocked = block
+                break
+            self.obstructions.examine(block, view)
+            chosen = self.kept(block)
+            complete = complete and len(chosen) == block.stop - block.first
+            if len(chosen):
+                kept.append((block, chosen))
+        if kept:
+            if knocked is not None or not complete:
+                members = [choose_frames(self.frames, block, chosen) for block, chosen in kept]
+                sensor, statistics = self.registrations.sensors[portion.first.span], self.checkpoint is not None
+                whole = portion.whole and knocked is None
+                result = reduce_portion(members, sensor, statistics, whole=whole)
+            self._add([block for block, _ in kept], result)
+        if knock is not None:
+            self.register_again(knock)
+        return knocked
+
+    def _add(self, blocks: Sequence[Block], result: PortionResult) -> None:
+        """Add blocks and their sums."""
+        first = blocks[0]
+        if self.cycles.begun not in (None, (first.cycle, first.span)):
             self.close()
-        correction = float(self.frames.correction_K[kept].mean())
-        self.stack.blocks.append(block)
-        self.stack.fields.append((result.cells + correction).astype(np.float32))
-        if block.cycle == NO_CYCLE:
+        self.stack.blocks.extend(blocks)
+        self.stack.fields.extend(view.cells for view in result.views)
+        if result.part is None:
             return
-        self.cycles.add(block, result, self.frames.times[kept], correction)
-        if self.checkpoint is not None and block.stop - self.stored_frames >= STORED_FRAMES:
+        self.cycles.add(result.part, result.sums)
+        if result.part.pixels is None:
+            self._store_finished()
+        elif self.checkpoint is not None and blocks[-1].stop - self.stored_frames >= STORED_FRAMES:
             self._store(self.checkpoint)
 
     def close(self) -> None:
         """Finish the open cycle, if there is one, and store it."""
         part = self.cycles.open
-        if part is None:
-            return
-        part.finish(self.registrations.sensors[part.span].weights)
+        if part is not None:
+            part.finish(self.registrations.sensors[part.span].weights)
+            self._store_finished()
+
+    def _store_finished(self) -> None:
+        """Store the last cycle, which is finished."""
         if self.checkpoint is not None:
             self._store(self.checkpoint)
             self.stored_blocks, self.finished_frames = len(self.stack.blocks), self.stored_frames

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -255,6 +255,29 @@ class PlainSamples:
 
     offset: int
     little_endian: bool
+
+
+class StoredPixels(Protocol):
+    """What reading pixels needs to know of a frame; `FrameReference` and `thermography.fields.tasks.frame_run.PlainFrame` tell it."""
+
+    @property
+    def path(self) -> Path:
+        """Path of the file."""
+
+    @property
+    def index(self) -> int:
+        """Index of the frame in the file, from 0."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of rows and columns."""
+
+    @property
+    def plain_samples(self) -> PlainSamples | None:
+        """Where the pixels stand as they are; None where they must be read as a whole."""
+
+    def read_counts(self) -> NDArray[np.uint16]:
+        """Read the pixels, (row, column) uint16."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from thermography.io.frame import FrameReference
+from thermography.io.frame import StoredPixels
 
 #: Offsets, lengths and buffers of direct disk reads must be multiples of this, bytes.
 _PAGE = mmap.PAGESIZE
@@ -48,12 +48,12 @@ class WindowReader:
         if self._file is not None:
             self._file.close()
 
-    def read(self, frames: Sequence[FrameReference], counts: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    def read(self, frames: Sequence[StoredPixels], counts: NDArray[np.uint16]) -> NDArray[np.uint16]:
         """Read the window of every frame into a buffer.
 
         Parameters
         ----------
-        frames : sequence of FrameReference
+        frames : sequence of StoredPixels
             n frames; consecutive frames of one file cost one open file.
         counts : (n or more, row, column) ndarray of uint16
             Buffer of the shape of the window; its first n elements are overwritten.

@@ -9,6 +9,7 @@ from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene, reco
 from thermography.fields import still
 from thermography.fields.checkpoint import CheckpointError, recalibrate
 from thermography.fields.still import reduce_frames
+from thermography.fields.tasks import stretches
 from thermography.radiometry.planck import override
 from thermography.registration.displacement import RegistrationSpan
 from thermography.registration.register import register
@@ -45,14 +46,14 @@ def test_a_broken_run_goes_on_and_ends_the_same(film, tmp_path, monkeypatch):
     again = reduce_frames(
         frames, registration, GRID, BOUNDS, block_s=2, checkpoint=tmp_path / "cp", progress=seen.append
     )
-    # Two cycles, and the part of the third before the knock, were finished.
-    assert seen[0] == 9
+    # Two cycles, and both parts of the third, before the knock and after it, were finished.
+    assert seen[0] == 11
     assert sum(seen) == len(frames)
     for name in whole.variables:
         assert whole[name].values.tobytes() == again[name].values.tobytes(), name
     assert whole.attrs == again.attrs
     # A third run finds everything done but the last cycle's end, and reads no block.
-    monkeypatch.setattr(still, "reduce_block", None)
+    monkeypatch.setattr(still, "reduce_stretch", None)
     third = reduce_frames(frames, registration, GRID, BOUNDS, block_s=2, checkpoint=tmp_path / "cp")
     assert whole["temperature"].values.tobytes() == third["temperature"].values.tobytes()
 
@@ -61,6 +62,7 @@ def test_a_long_cycle_goes_on_within_it(film, tmp_path, monkeypatch):
     """One cycle over all frames: what was done of it is kept whenever it has grown by some frames."""
     frames, registration = film
     monkeypatch.setattr(still, "STORED_FRAMES", 4)
+    monkeypatch.setattr(stretches, "STRETCH_FRAMES", 4)
     whole = reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], block_s=2)
     done, seen = [], []
 
@@ -73,7 +75,7 @@ def test_a_long_cycle_goes_on_within_it(film, tmp_path, monkeypatch):
     with pytest.raises(BrokenOffError):
         reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], progress=break_off, **options)
     again = reduce_frames(frames, registration, GRID, BOUNDS[[0, -1]], progress=seen.append, **options)
-    assert seen[0] == 4
+    assert seen[0] == 8
     for name in whole.variables:
         assert whole[name].values.tobytes() == again[name].values.tobytes(), name
     assert whole.attrs == again.attrs

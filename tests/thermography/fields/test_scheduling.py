@@ -1,30 +1,84 @@
 """The same reduction on a cluster, bit for bit, and the errors of one that is not there."""
 
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from tests.thermography.plan_scene import DISCS, GRID, START, Scene, record
 from thermography.fields.scheduling import SchedulerError, in_order, open_pool
 from thermography.fields.still import reduce_frames
+from thermography.fields.tasks import stretches
 from thermography.registration.register import register
 
-
 # The cluster's own event loop leaves sockets to the garbage collector after it has been closed.
-@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_cluster_of_two_workers_gives_the_same_fields_bit_for_bit(rng, tmp_path):
+ends_late = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+@pytest.fixture(scope="module")
+def cluster():
     distributed = pytest.importorskip("distributed")
-    image = Scene(disc_K=-4.0).render()
-    registration = register(image, DISCS, grid=GRID)
-    frames = record(tmp_path / "a.seq", (image + rng.normal(0, 0.05, image.shape) for _ in range(24)))
-    bounds = START + np.array([0, 9, 17, 24]) * np.timedelta64(1, "s")
-    alone = reduce_frames(frames, registration, GRID, bounds, block_s=4)
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
-    ) as cluster:
-        together = reduce_frames(frames, registration, GRID, bounds, block_s=4, scheduler=cluster.scheduler_address)
-    for name in alone.variables:
-        assert alone[name].values.tobytes() == together[name].values.tobytes(), name
-    assert alone.attrs == together.attrs
+    ) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory):
+    rng = np.random.default_rng(4)
+    image = Scene(disc_K=-4.0).render()
+    registration = register(image, DISCS, grid=GRID)
+    images = (image + rng.normal(0, 0.05, image.shape) for _ in range(24))
+    return record(tmp_path_factory.mktemp("film") / "a.seq", images), registration
+
+
+BOUNDS = START + np.array([0, 9, 17, 24]) * np.timedelta64(1, "s")
+
+
+def assert_equal_bits(one, other):
+    for name in one.variables:
+        assert one[name].values.tobytes() == other[name].values.tobytes(), name
+    assert one.attrs == other.attrs
+
+
+@ends_late
+def test_a_cluster_of_two_workers_gives_the_same_fields_bit_for_bit(cluster, film):
+    frames, registration = film
+    alone = reduce_frames(frames, registration, GRID, BOUNDS, block_s=4)
+    together = reduce_frames(frames, registration, GRID, BOUNDS, block_s=4, scheduler=cluster.scheduler_address)
+    assert_equal_bits(alone, together)
+
+
+@ends_late
+def test_a_worker_that_is_killed_in_the_middle_loses_nothing(cluster, film, monkeypatch, tmp_path):
+    frames, registration = film
+    monkeypatch.setattr(stretches, "STRETCH_FRAMES", 2)
+    alone = reduce_frames(frames, registration, GRID, BOUNDS, block_s=1)
+    killed = []
+
+    def kill_one(count):
+        if not killed:
+            killed.append(next(iter(cluster.workers.values())).pid)
+            os.kill(killed[0], signal.SIGKILL)
+
+    options = {"block_s": 1, "scheduler": cluster.scheduler_address, "checkpoint": tmp_path / "cp"}
+    together = reduce_frames(frames, registration, GRID, BOUNDS, progress=kill_one, **options)
+    assert killed
+    assert_equal_bits(alone, together)
+
+
+@ends_late
+def test_a_file_that_workers_do_not_see_is_named(cluster, film):
+    frames, registration = film
+    elsewhere = [replace(frame, path=Path("/elsewhere/a.seq")) for frame in frames]
+    with pytest.raises(
+        SchedulerError, match=r"/elsewhere/a\.seq: a worker of tcp://.* does not find this file; all workers need"
+    ):
+        reduce_frames(elsewhere, registration, GRID, BOUNDS, scheduler=cluster.scheduler_address)
 
 
 def test_a_scheduler_that_does_not_answer_is_named():
