@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from fusion.endings import ExitCode, answering
+from fusion.endings import ExitCode, answering, interrupt_ends_step
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -86,6 +86,21 @@ def run(
     no_plugins: Annotated[
         bool, typer.Option("--no-plugins", help="Leave out effects that other installed distributions add.")
     ] = False,
+    watch: Annotated[
+        bool,
+        typer.Option(
+            "--watch", help="First follow the test while its files grow, a line per cycle; Ctrl-C ends it, then run."
+        ),
+    ] = False,
+    until_idle: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS", min=0.0, help="With --watch: the test is over when nothing has come for so long."
+        ),
+    ] = None,
+    wanted: Annotated[
+        str, typer.Option(metavar="U", help="With --watch: wanted standard uncertainty of a position.")
+    ] = "0.1 um",
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but faults.")] = False,
 ) -> None:
     """Run the whole pipeline on a campaign.
@@ -94,6 +109,9 @@ def run(
     """
     if len(campaigns) > 2:
         errors.print("thermofuse: one campaign, or two of one machine, can be analysed at a time", highlight=False)
+        raise typer.Exit(ExitCode.BAD_INPUT)
+    if watch and len(campaigns) > 1:
+        errors.print("thermofuse: one campaign can be watched at a time", highlight=False)
         raise typer.Exit(ExitCode.BAD_INPUT)
 
     folders = _folders(campaigns, out)
@@ -110,6 +128,8 @@ def run(
             report("start", 1, 1)
         if no_plugins:
             leave_plugins_out()
+        if watch:
+            _watch(campaigns[0], until_idle_s=until_idle, wanted=wanted, quiet=quiet)
         records = len(folders) == 2 and of_one_kind(campaigns)
         for campaign, folder in folders:
             with _progress(quiet=quiet) as report:
@@ -122,6 +142,24 @@ def run(
             for name, text in join([folder for _, folder in folders], folders[0][1].parent):
                 if not quiet:
                     console.print(f"both campaigns, {name}: {text}", soft_wrap=True, highlight=False)
+
+
+def _watch(campaign: Path, *, until_idle_s: float | None, wanted: str, quiet: bool) -> None:
+    """Follow a test until it is over, a line per finished cycle."""
+    from fusion.campaign.config import CampaignError, load_campaign
+    from fusion.campaign.quantities import read_quantity
+    from fusion.pipeline.watch import follow, live_line
+
+    wanted_u_um = read_quantity(wanted, "um")
+    if not wanted_u_um > 0.0:
+        raise CampaignError(f'--wanted "{wanted}": the wanted uncertainty lies above 0; write for example "0.1 um"')
+    with interrupt_ends_step() as asked:
+        states = follow(load_campaign(campaign), until_idle_s=until_idle_s, wanted_u_um=wanted_u_um, stop=asked)
+        for state in states:
+            for warning in state.warnings:
+                errors.print(f"thermofuse: {warning}", highlight=False, markup=False)
+            if state.cycle is not None and not quiet:
+                console.print(live_line(state), soft_wrap=True, highlight=False, markup=False)
 
 
 @contextmanager

@@ -152,6 +152,28 @@ def _ends_in_time(last_words: Callable[[int], None]) -> Iterator[None]:
         watching.join()
 
 
+@contextmanager
+def interrupt_ends_step() -> Iterator[threading.Event]:
+    """Let the first SIGINT (Ctrl-C) end a step of a command that waits, and not the command.
+
+    Yields
+    ------
+    Event
+        Set by SIGINT. Outside the main thread, where no signal arrives, it is never set.
+    """
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked
+        return
+    before = signal.signal(signal.SIGINT, lambda number, frame: asked.set())
+    wakeup = signal.set_wakeup_fd(-1)
+    try:
+        yield asked
+    finally:
+        signal.set_wakeup_fd(wakeup)
+        signal.signal(signal.SIGINT, before)
+
+
 def _report_fault(error: BaseException, say: Callable[[str], None]) -> None:
     """Write the report of a fault of the program and name it."""
     stack = traceback.extract_tb(error.__traceback__)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -19,7 +19,8 @@ from interferometry.io.headings import CHINESE_WORDS
 from interferometry.io.numerals import Numerals
 from interferometry.io.workbook import is_workbook, read_sheets
 
-_DELIMITERS = ";\t,|"
+#: Marks that may stand between fields.
+DELIMITERS = ";\t,|"
 _LINE_ENDS = re.compile(r"\r\n|\n|\r")
 #: Longest part of a line of the file that a message repeats, characters.
 _SHOWN = 160
@@ -115,16 +116,35 @@ def read_grids(path: Path, *, sheet: str | None = None) -> list[Grid]:
         return [Grid(path, name, rows) for name, rows in sheets.items() if sheet in (None, name)]
     text = decode_text(path, content, chinese_words=CHINESE_WORDS)
     lines = ["" if line.startswith("#") else line for line in _LINE_ENDS.split(text)]
-    present = sorted(
-        (mark for mark in _DELIMITERS if any(mark in line for line in lines)), key=text.count, reverse=True
-    )
-    grids = [Grid(path, "", _split(path, lines, mark)) for mark in present or [","]]
+    present = sorted((mark for mark in DELIMITERS if any(mark in line for line in lines)), key=text.count, reverse=True)
+    grids = [Grid(path, "", split_lines(path, lines, mark)) for mark in present or [","]]
     if not grids[0].rows:
         raise LaserFormatError(f"{path}: the file is empty; expected a header line and the measured values below it")
     return grids
 
 
-def _split(path: Path, lines: list[str], delimiter: str) -> list[tuple[int, list[str]]]:
+def split_lines(path: Path, lines: Sequence[str], delimiter: str) -> list[tuple[int, list[str]]]:
+    """Split lines of text into fields.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        For the message.
+    lines : sequence of str
+        Without their ends.
+    delimiter : str
+        One character.
+
+    Returns
+    -------
+    list of (int, list of str)
+        Number of each line, from 1, and its fields; lines without any text are left out.
+
+    Raises
+    ------
+    LaserFormatError
+        A line is longer than a field may be, or holds what no table does.
+    """
     reader = csv.reader((f"{line}\n" for line in lines), delimiter=delimiter, skipinitialspace=True)
     try:
         rows = [(reader.line_num, [text.strip() for text in fields]) for fields in reader]

@@ -266,3 +266,26 @@ def test_a_thumbnail_is_written_where_it_is_asked_for(campaign_folder: Path, tmp
 def test_the_version_is_printed_alone() -> None:
     result = invoke("--version")
     assert (result.exit_code, result.output) == (0, f"thermofuse {metadata.version('thermofuse')}\n")
+
+
+def test_a_watched_test_prints_a_line_per_cycle_and_is_then_run(
+    results_folder: Path, campaign_folder: Path, tmp_path: Path
+) -> None:
+    out = shutil.copytree(results_folder, tmp_path / "results")
+    campaign = campaign_folder / "campaign.toml"
+    result = invoke("run", campaign, "--out", out, "--resume", "--watch", "--until-idle", "0", "--wanted", "0.2 um")
+    assert result.exit_code == 0, result.output
+    cycles = [int(found) for found in re.findall(r"^cycle (\d+): ", result.output, re.M)]
+    assert cycles == list(range(1, 25))
+    assert re.search(
+        r"^cycle 24: 1 frame, .* degC, rise .* K; drift .* µm; .*A .* µm \(cycles 20 to 24\); u ", result.output, re.M
+    )
+    assert result.output.rstrip().endswith(f"report: {out / 'report.html'}")
+
+
+def test_what_cannot_be_watched_is_refused(campaign_folder: Path, tmp_path: Path) -> None:
+    campaign = campaign_folder / "campaign.toml"
+    both = invoke("run", campaign, campaign, "--watch")
+    assert (both.exit_code, both.stderr) == (2, "thermofuse: one campaign can be watched at a time\n")
+    wish = invoke("run", campaign, "--out", tmp_path / "r", "--watch", "--wanted", "-1 um")
+    assert wish.exit_code == 2 and "the wanted uncertainty lies above 0" in wish.stderr

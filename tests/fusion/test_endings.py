@@ -15,7 +15,7 @@ import pytest
 import typer
 from rich.console import Console
 
-from fusion.endings import ExitCode, answering
+from fusion.endings import ExitCode, answering, interrupt_ends_step
 from fusion.errors import FusionError
 
 
@@ -89,3 +89,20 @@ def test_a_signal_ends_a_run_within_two_seconds(number: signal.Signals, busy: st
 
 def _indented(code: str) -> str:
     return "\n".join(f"    {line}" for line in code.splitlines())
+
+
+def test_an_interrupt_ends_a_step_and_the_next_one_the_command(tmp_path: Path) -> None:
+    """Ctrl-C while a test is watched ends the watch, and the command goes on beyond the time after which it would be ended."""
+    told = io.StringIO()
+    with answering(Console(file=told, soft_wrap=True)):
+        with interrupt_ends_step() as asked:
+            assert not asked.is_set()
+            signal.raise_signal(signal.SIGINT)
+            assert asked.wait(1.0)
+        time.sleep(1.2)
+    assert told.getvalue() == ""
+    with pytest.raises(typer.Exit) as exit, answering(Console(file=told, soft_wrap=True)):
+        with interrupt_ends_step():
+            pass
+        signal.raise_signal(signal.SIGINT)
+    assert exit.value.exit_code == ExitCode.INTERRUPTED

@@ -219,6 +219,61 @@ def index_frames(
     return kept, rejected + repeated
 
 
+def index_sequence(
+    path: str | os.PathLike[str], *, start: int = 0, index: int = 0, growing: bool = False
+) -> tuple[list[FrameReference], list[RejectedFrame], int]:
+    """List the frames of a sequence from a byte on, so that one that is still being recorded is not read from its beginning again.
+
+    Parameters
+    ----------
+    path : str or path-like
+        SEQ, CSQ or FFF file.
+    start : int
+        Byte to begin at: 0, or where the last call says to go on.
+    index : int
+        Index of the first frame from there on.
+    growing : bool
+        Whether the file is still being written: its last frame may lack its end and waits for the next call.
+
+    Returns
+    -------
+    frames : list of FrameReference
+        In the order of the file.
+    rejected : list of RejectedFrame
+        Damaged frames between them.
+    following : int
+        Byte at which the next call begins.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be opened.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder, "begun.seq")
+    ...     _ = path.write_bytes(b"FFF")
+    ...     index_sequence(path, growing=True)
+    ([], [], 0)
+    """
+    path = Path(path)
+    with path.open("rb", buffering=0) as file:
+        size = file.seek(0, os.SEEK_END)
+        first = _find_header(file, start, size)
+        found = list(_walk_sequence(file, path, first, size, index=index)) if first < size else []
+    whole = [at for at, one in enumerate(found) if isinstance(one, FlirFrameReference)]
+    if not whole:
+        return [], [] if growing else [one for one in found if isinstance(one, RejectedFrame)], start
+    last = found[whole[-1]]
+    assert isinstance(last, FlirFrameReference)
+    offset, length = last.segments[0]
+    kept = found[: whole[-1] if growing else len(found)]
+    frames: list[FrameReference] = [one for one in kept if isinstance(one, FlirFrameReference)]
+    return frames, [one for one in kept if isinstance(one, RejectedFrame)], offset if growing else offset + length
+
+
 def order_by_time(frames: Iterable[F]) -> tuple[list[F], list[RejectedFrame]]:
     """Sort frames by time, and take out those whose time occurs twice.
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.thermography.flir_mutations import CAMERA, HOUSEKEEPING, LIMITS, PARAMETERS, SETTINGS, TIME, jpeg, sequence
-from thermography.io.flir import index_frames, read_frame
+from thermography.io.flir import index_frames, index_sequence, read_frame
 from thermography.io.flir_writer import write_jpeg
 from thermography.io.frame import FlirFormatError
 
@@ -287,3 +287,27 @@ def test_a_missing_file_is_named_by_the_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError) as caught:
         read_frame(tmp_path / "a.jpg")
     assert Path(caught.value.filename) == tmp_path / "a.jpg"
+
+
+def test_a_sequence_is_read_on_from_where_it_was_read_before(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    sequence(path, frames=5)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: 3 * len(whole) // 5 + 100])
+    frames, rejected, following = index_sequence(path, growing=True)
+    assert (len(frames), rejected, following) == (2, [], 2 * len(whole) // 5)
+    path.write_bytes(whole)
+    rest, rejected, following = index_sequence(path, start=following, index=2)
+    assert ([frame.index for frame in rest], rejected, following) == ([2, 3, 4], [], len(whole))
+    every, _ = index_frames(path)
+    assert [frame.time for frame in [*frames, *rest]] == [frame.time for frame in every]
+
+
+def test_a_sequence_that_is_over_tells_what_its_end_lacks(tmp_path: Path) -> None:
+    path = tmp_path / "a.seq"
+    sequence(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) - 500])
+    frames, rejected, following = index_sequence(path)
+    assert (len(frames), len(rejected), following) == (2, 1, 2 * len(whole) // 3)
+    assert index_sequence(path, growing=True)[1] == []

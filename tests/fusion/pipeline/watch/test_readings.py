@@ -1,0 +1,143 @@
+"""Readings that arrive: each cycle once, whatever the kind of table; a line is read when it has its end."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import pytest
+import xarray as xr
+
+from fusion.pipeline.watch.readings import Arrived, ArrivingReadings
+from interferometry.io.readers import read_deviations
+
+HEADER = "cycle,direction,target,position_mm,time,deviation_um"
+
+
+def lines(cycles: range, *, first: int = 1, zero: float = 0.0) -> list[str]:
+    """Two targets in both directions, a minute a cycle; cycles numbered from `first`."""
+    rows = []
+    for cycle in cycles:
+        for at, (direction, target) in enumerate([("positive", 1), ("positive", 2), ("negative", 2), ("negative", 1)]):
+            second = 60 * cycle + 10 * at
+            time = f"2026-03-09T{6 + second // 3600:02d}:{second // 60 % 60:02d}:{second % 60:02d}Z"
+            rows.append(f"{cycle + first},{direction},{target},{100 * (target - 1)},{time},{zero + cycle + at}")
+    return rows
+
+
+def write(path: Path, rows: list[str], header: str = f"{HEADER}\n") -> None:
+    path.write_text(header + "\n".join(rows) + "\n")
+
+
+def given(arrived: list[Arrived]) -> list[int]:
+    """Numbers of the cycles that were finished: all but the open one of each look."""
+    return [int(n) for one in arrived if one.cycles is not None for n in one.cycles["cycle"].values[:-1]]
+
+
+def test_every_cycle_is_given_once_byte_by_byte(tmp_path: Path) -> None:
+    content = (f"{HEADER}\n" + "\n".join(lines(range(5))) + "\n").encode()
+    path = tmp_path / "laser.csv"
+    path.write_bytes(b"")
+    laser, arrived = ArrivingReadings(path), []
+    for byte in range(0, len(content), 7):
+        with path.open("ab") as file:
+            file.write(content[byte : byte + 7])
+        arrived.append(laser.poll())
+    assert given(arrived) == [1, 2, 3, 4]
+    last = laser.poll(final=True)
+    assert last.cycles is not None and last.cycles["cycle"].values.tolist() == [5]
+    assert sum(one.readings for one in [*arrived, last]) == 20
+    assert not [fault for one in arrived for fault in one.faults]
+
+
+def test_the_finished_cycles_hold_all_their_readings(tmp_path: Path) -> None:
+    path = tmp_path / "laser.csv"
+    laser = ArrivingReadings(path)
+    found = []
+    for stop in range(2, 12):
+        write(path, lines(range(stop)))
+        cycles = laser.poll().cycles
+        if cycles is not None:
+            found.append(cycles.isel(cycle=slice(0, -1)))
+    whole = read_deviations(path).isel(cycle=slice(0, -1))
+    for name in ("deviation", "time"):
+        xr.testing.assert_equal(xr.concat([cycles[name] for cycles in found], "cycle"), whole[name])
+
+
+def test_only_new_lines_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import fusion.pipeline.watch.readings as module
+
+    path, sizes = tmp_path / "laser.csv", []
+    read = module.read_long_table
+    monkeypatch.setattr(module, "read_long_table", lambda table: sizes.append(len(table.rows)) or read(table))
+    laser = ArrivingReadings(path)
+    for stop in range(1, 60):
+        write(path, lines(range(stop)))
+        laser.poll()
+    # Two cycles of context, the one that is finished, and the one that has just begun.
+    assert max(sizes) <= 16
+
+
+def test_cycles_numbered_from_zero_keep_their_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "laser.csv"
+    laser, arrived = ArrivingReadings(path), []
+    for stop in range(1, 9):
+        write(path, lines(range(stop), first=0))
+        arrived.append(laser.poll())
+    assert given(arrived) == [1, 2, 3, 4, 5, 6, 7]
+
+
+@pytest.mark.parametrize(
+    "header", ["# a comment\n\ncycle;direction;target;position_mm;time;deviation_um\n", f"\ufeff{HEADER}\r\n"]
+)
+def test_other_marks_and_lines_before_the_header(tmp_path: Path, header: str) -> None:
+    path = tmp_path / "laser.csv"
+    path.write_text(header)
+    laser = ArrivingReadings(path)
+    assert laser.poll() == Arrived() or laser.poll().faults == ()
+    mark = ";" if ";" in header else ","
+    end = "\r\n" if "\r\n" in header else "\n"
+    with path.open("a", newline="") as file:
+        file.write(end.join(row.replace(",", mark) for row in lines(range(3))) + end)
+    assert given([laser.poll()]) == [1, 2]
+
+
+def test_a_table_by_run_is_read_as_a_whole_but_seldom(tmp_path: Path) -> None:
+    path, seconds, calls = tmp_path / "laser.csv", [0.0], []
+
+    def read(file: Path) -> xr.Dataset:
+        calls.append(seconds[0])
+        seconds[0] += 2.0
+        return read_deviations(file)
+
+    laser, arrived = ArrivingReadings(path, read, lambda: seconds[0]), []
+    for runs in range(2, 12):
+        head = ",".join(f"{run}+ [um],{run}- [um]" for run in range(1, runs + 1))
+        rows = [f"{100 * target}," + ",".join(f"{run}.1,{run}.2" for run in range(1, runs + 1)) for target in range(3)]
+        path.write_text("\n".join([f"Position [mm],{head}", *rows]) + "\n")
+        seconds[0] += 10.0
+        arrived.append(laser.poll())
+    arrived.append(laser.poll(final=True))
+    assert given(arrived[:-1])[:1] == [1]
+    assert all(after - before >= 20.0 for before, after in itertools.pairwise(calls[:-1]))
+    assert arrived[-1].cycles is not None and int(arrived[-1].cycles["cycle"][-1]) == 11
+
+
+def test_a_file_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "laser.csv"
+    laser = ArrivingReadings(path)
+    first, second = laser.poll(), laser.poll()
+    assert "No such file" in first.faults[0] and second.faults == ()
+    write(path, lines(range(2)))
+    assert given([laser.poll()]) == [1]
+
+
+def test_a_line_that_cannot_be_used_is_told_once(tmp_path: Path) -> None:
+    path = tmp_path / "laser.csv"
+    rows = lines(range(4))
+    rows[5] = rows[5].replace(",2,", ",two,")
+    laser, faults = ArrivingReadings(path), []
+    for stop in (8, 12, 16):
+        write(path, rows[:stop])
+        faults += laser.poll().faults
+    assert len(faults) == 1 and faults[0].startswith("laser.csv, line 7:")
