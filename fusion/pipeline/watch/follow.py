@@ -109,7 +109,7 @@ class _RunningTest:
         self._series = CycleSeries(wanted_u_um)
         self._window = np.timedelta64(round(1e9 * _WINDOW_S), "ns")
         self._first_frame: np.datetime64 = self._newest
-        self._length: np.timedelta64 = np.timedelta64(0, "ns")
+        self._length = np.timedelta64(0, "s").astype("timedelta64[ns]")
         self._warnings: list[str] = []
         if thermography is not None:
             self._camera = ArrivingFrames(campaign.frame_paths, stack_options(campaign))
