@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 import xarray as xr
@@ -98,7 +99,11 @@ class _RunningTest:
     def __init__(self, campaign: Campaign, wanted_u_um: float, clock: Callable[[], float]) -> None:
         thermography, laser = campaign.thermography, campaign.interferometry
         self._campaign, self._clock = campaign, clock
-        self._offset = np.timedelta64(0, "ns")
+        offset_s = None if thermography is None else thermography.clock_offset_s
+        window_s = None if thermography is None else thermography.window_s
+        self._offset = _nanoseconds(offset_s or 0.0)
+        self._window = _nanoseconds(window_s or _WINDOW_S)
+        self._length = _nanoseconds(0.0)
         self._frames_seen = self._readings_seen = self._cycles = self._windows = self._left = 0
         self._waiting: deque[FrameReference] = deque()
         self._due: deque[tuple[int, np.datetime64, np.datetime64, xr.Dataset | None, float]] = deque()
@@ -107,27 +112,18 @@ class _RunningTest:
         self._camera: ArrivingFrames | None = None
         self._laser: ArrivingReadings | None = None
         self._series = CycleSeries(wanted_u_um)
-        self._window = np.timedelta64(round(1e9 * _WINDOW_S), "ns")
         self._first_frame: np.datetime64 = self._newest
-        self._length = np.timedelta64(0, "s").astype("timedelta64[ns]")
         self._warnings: list[str] = []
         if thermography is not None:
             self._camera = ArrivingFrames(campaign.frame_paths, stack_options(campaign))
             self._fields = FieldsOfCycles(campaign)
-            self._offset = np.timedelta64(round(1e9 * (thermography.clock_offset_s or 0.0)), "ns")
-            self._window = np.timedelta64(round(1e9 * (thermography.window_s or _WINDOW_S)), "ns")
-            if thermography.clock_offset_s is None and laser is not None:
+            if offset_s is None and laser is not None:
                 self._warnings.append("the clock offset is not given: 0 s is taken while the test runs")
         if laser is not None:
-            path, feed, dwell, sheet = (
-                campaign.resolve(laser.deviations),
-                laser.feed_mm_per_min,
-                laser.dwell_s,
-                laser.sheet,
+            read = partial(
+                read_deviations, feed_mm_per_min=laser.feed_mm_per_min, dwell_s=laser.dwell_s, sheet=laser.sheet
             )
-            self._laser = ArrivingReadings(
-                path, lambda file: read_deviations(file, feed_mm_per_min=feed, dwell_s=dwell, sheet=sheet), clock
-            )
+            self._laser = ArrivingReadings(campaign.resolve(laser.deviations), read, clock)
             if laser.compensation == "redo" or laser.dead_path_mm or laser.material_temperature == "camera":
                 self._warnings.append("readings are shown as they were written; the full run compensates them")
 
@@ -260,3 +256,7 @@ class _RunningTest:
 def _reason(rejected: RejectedFrame) -> str:
     """Return why a frame is left out, beginning with its file."""
     return rejected.reason if str(rejected.path) in rejected.reason else f"{rejected.path}: {rejected.reason}"
+
+
+def _nanoseconds(seconds: float) -> np.timedelta64:
+    return np.timedelta64(round(1e9 * seconds), "ns")
