@@ -11,6 +11,7 @@ from panel.theme.base import Design, Inherit
 from panel.viewable import Viewable
 
 from fusion.app.elements import paragraph
+from fusion.app.run.screen import run_screen
 from fusion.app.setup.screen import set_up
 from fusion.app.state import State, state_of
 
@@ -19,7 +20,7 @@ _TEMPLATES = Path(__file__).parent / "templates"
 #: A screen shows a state, and changes it.
 Screen = Callable[[State], Viewable]
 #: Screens in the order of the work.
-SCREENS: dict[str, Screen] = {"Set up": set_up}
+SCREENS: dict[str, Screen] = {"Set up": set_up, "Run": run_screen}
 
 
 class Look(Design):

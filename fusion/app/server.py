@@ -49,6 +49,8 @@ def serve(root: Path, *, port: int = 0, open_browser: bool = False, say: Callabl
     if not root.is_dir():
         raise PlaceError(f"{root}: no such folder; name the folder that holds the files of the measurement")
     server, address = build_server(root, port=port)
+    from fusion.app.run.process import RUNS
+
     server.start()
     say(address)
     if open_browser:
@@ -56,6 +58,7 @@ def serve(root: Path, *, port: int = 0, open_browser: bool = False, say: Callabl
     try:
         server.io_loop.start()
     finally:
+        RUNS.end()
         server.stop(wait=False)
 
 

@@ -262,6 +262,26 @@ def finished_stages(folder: Path) -> list[str]:
         return []
 
 
+def noted_messages(folder: Path) -> list[dict[str, Any]]:
+    """Return the notices of the finished stages of a run, also while it is under way.
+
+    Parameters
+    ----------
+    folder : Path
+        Results folder.
+
+    Returns
+    -------
+    list of dict
+        As in ``warnings`` of results.json, in the order in which the stages were finished.
+    """
+    try:
+        stamps = json.loads((folder / _STAMPS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return []
+    return [notice for stamp in stamps.values() for notice in (stamp.get("note") or {}).get("notices", [])]
+
+
 _CONVENTIONS = "CF-1.11"
 #: What `annotate` writes for the whole file.
 GLOBAL_ATTRIBUTES = ("Conventions", "title", "history", "provenance")

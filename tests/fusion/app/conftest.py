@@ -95,7 +95,7 @@ def new_page() -> Iterator[Callable[..., object]]:
         def open_page(address: str, *, width: int = 1280) -> Page:
             host = address.split("?")[0]
             page = browser.new_context(viewport={"width": width, "height": 900}).new_page()
-            page.set_default_timeout(15_000)
+            page.set_default_timeout(60_000)
             page.on("pageerror", lambda error: faults.append(f"page error: {error}"))
             page.on(
                 "console",

@@ -17,6 +17,7 @@ from fusion.products.store import (
     digest,
     finished_stages,
     name_in_words,
+    noted_messages,
     plain,
     read_dataset,
     write_atomically,
@@ -112,3 +113,11 @@ def test_the_digest_depends_on_content_alone() -> None:
 def test_a_variable_is_named_in_words() -> None:
     assert name_in_words("drift_profile_u") == "standard uncertainty of drift profile"
     assert name_in_words("mean_rise") == "mean rise"
+
+
+def test_notices_of_finished_stages_are_told_while_a_run_is_under_way(tmp_path: Path) -> None:
+    assert noted_messages(tmp_path) == []
+    stamps = StageStamps(tmp_path)
+    stamps.record("fields", "key", [], {"parts": {}, "notices": [{"code": "a", "message": "M.", "remedy": "R."}]})
+    stamps.record("model", "key", [], None)
+    assert noted_messages(tmp_path) == [{"code": "a", "message": "M.", "remedy": "R."}]

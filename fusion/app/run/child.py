@@ -1,0 +1,59 @@
+"""The process of a run: the pipeline, with its progress as one JSON object per line for the page that watches it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import typer
+from rich.console import Console
+
+from fusion.endings import answering
+
+
+def main(campaign: str, results: str, *more: str) -> int:
+    """Run a campaign as `thermofuse run` does.
+
+    Parameters
+    ----------
+    campaign : str
+        The campaign file.
+    results : str
+        Results folder.
+    *more : str
+        ``--resume`` continues the run that is in the folder.
+
+    Returns
+    -------
+    int
+        Exit code of the process, as that of the command.
+    """
+    try:
+        with answering(Console(stderr=True, soft_wrap=True)):
+            write_progress("start", 0, 1)
+            from fusion.pipeline.run import run_campaign
+
+            write_progress("start", 1, 1)
+            run_campaign(Path(campaign), Path(results), resume="--resume" in more, report=write_progress)
+    except typer.Exit as ended:
+        return ended.exit_code
+    return 0
+
+
+def write_progress(label: str, done: int, total: int) -> None:
+    """Write the progress of a step.
+
+    Parameters
+    ----------
+    label : str
+        Step of the work.
+    done, total : int
+        Finished parts and their number.
+    """
+    sys.stdout.write(json.dumps({"label": label, "done": done, "total": total}) + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))
