@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from fusion.endings import ExitCode, answering, interrupt_ends_step
+from fusion.endings import ExitCode, answering, failed_code, interrupt_ends_step
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -24,7 +24,7 @@ app = typer.Typer(
 )
 console = Console()
 errors = Console(stderr=True, soft_wrap=True)
-#: Characters of a line of the ISO 230-2 tables where the output is no terminal.
+#: Characters of a line of a wide table where the output is no terminal.
 _TABLE_WIDTH = 160
 
 
@@ -182,6 +182,57 @@ def _folders(campaigns: list[Path], out: Path | None) -> list[tuple[Path, Path]]
     unique = names if len(set(names)) == len(names) else [f"{name}_{k}" for k, name in enumerate(names, start=1)]
     base = out or Path("results")
     return [(path, base / name) for path, name in zip(campaigns, unique, strict=True)]
+
+
+@app.command()
+def fleet(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FOLDER|CAMPAIGN.toml...", help="Campaign files, or folders with a campaign.toml in each."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the summary and the results of every campaign.")] = Path(
+        "fleet"
+    ),
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Most campaigns at a time; left out: one per processor, as memory allows.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Keep campaigns that are finished and unchanged, continue the others.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but faults.")] = False,
+) -> None:
+    """Run many campaigns, one process for each.
+
+    Writes fleet.json, fleet.csv and fleet.html with a row for each. One that fails does not stop the others; exit code 100 and the number
+    that failed.
+    """
+    from fusion.fleet.members import find_members
+    from fusion.fleet.run import run_fleet
+    from fusion.fleet.summary import Row, count_line, read_rows, summary_table
+
+    def kept() -> str:
+        return f"{out}: {count_line([*read_rows(out).values()])}; start the same command with --resume to go on"
+
+    def say(row: Row) -> None:
+        what = row.message if row.state == "failed" else row.headline or row.state
+        (errors if row.state == "failed" else console).print(
+            f"{row.name}: {what}", soft_wrap=True, highlight=False, markup=False
+        )
+
+    with answering(errors, kept=kept):
+        members = find_members(paths)
+        with _progress(quiet=quiet) as report:
+            said = (lambda row: say(row) if row.state == "failed" else None) if quiet else say
+            rows = run_fleet(members, out, jobs=jobs, resume=resume, report=report, say=said)
+        if not quiet:
+            wide = console if console.is_terminal else Console(width=_TABLE_WIDTH)
+            wide.print(summary_table(rows, count_line(rows)))
+            console.print(f"summary: {(out / 'fleet.html').resolve()}", soft_wrap=True, highlight=False)
+        failed = sum(row.state == "failed" for row in rows)
+        if failed:
+            raise typer.Exit(failed_code(failed))
 
 
 @app.command()

@@ -32,6 +32,8 @@ from thermography.errors import ThermographyError
 _GRACE_S = 1.0
 _SIGNAL_BASE = 128
 _STOPPING = (signal.SIGINT, signal.SIGTERM)
+#: Codes from here on count failed campaigns, up to the last that means nothing to a shell.
+_FAILED_BASE, _MOST_FAILED = 100, 25
 
 
 class ExitCode(IntEnum):
@@ -47,6 +49,17 @@ class ExitCode(IntEnum):
     FAULT = 70
     INTERRUPTED = _SIGNAL_BASE + signal.SIGINT
     TERMINATED = _SIGNAL_BASE + signal.SIGTERM
+
+
+def failed_code(count: int) -> int:
+    """Return the exit code of a command of which `count` parts failed: 0 for none, 101 for one, 125 for 25 or more.
+
+    Parameters
+    ----------
+    count : int
+        Failed campaigns of a fleet.
+    """
+    return _FAILED_BASE + min(count, _MOST_FAILED) if count else ExitCode.DONE
 
 
 class Stopped(KeyboardInterrupt):

@@ -6,19 +6,25 @@ Reproduces the rows of docs/measured.md, "Speed and memory", on file to fields.
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
+from tests.thermography.fields.tasks.test_stretches import simulated
 from tests.thermography.plan_scene import DISCS, GRID, SC660, START, Scene
+from thermography.fields.blocks import cut_blocks
 from thermography.fields.checkpoint import recalibrate
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
+from thermography.fields.tasks.stretches import cut_stretches, gather_frames
 from thermography.io.flir import index_frames
 from thermography.io.flir_writer import write_sequence
 from thermography.io.frame import CameraIdentity, Frame
@@ -206,21 +212,71 @@ def test_peak_memory_does_not_grow_with_the_frames(film: Path, tmp_path: Path) -
     assert max(peak) < 600
 
 
+def played_again(references, times: int):
+    """The frames of a film over and over, each time later: a long recording of which few frames are on disk."""
+    length = len(references) * np.timedelta64(INTERVAL_MS, "ms")
+    return [
+        replace(reference, time=reference.time + turn * length) for turn in range(times) for reference in references
+    ]
+
+
 @pytest.mark.filterwarnings("ignore")
-def test_overhead_of_a_cluster(film: Path, registration) -> None:
+def test_two_workers_against_two_threads(film: Path, registration) -> None:
+    """20,000 frames in 10 cycles; processor time is that of this process and of the workers together."""
     distributed = pytest.importorskip("distributed")
     references, _ = index_frames([film])
-    bounds = bounds_of(FRAMES, 2)
+    references = played_again(references, 40)
+    frames = len(references)
+    bounds = bounds_of(frames, 10)
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
     ) as cluster:
         address = cluster.scheduler_address
-        clustered, alone = take_turns(
-            lambda: reduce_frames(references, registration, GRID, bounds, scheduler=address),
-            lambda: reduce_frames(references, registration, GRID, bounds),
-            rounds=5,
-        ).T
+        workers = [psutil.Process(worker.pid) for worker in cluster.workers.values()]
+        works = {
+            "threads": lambda: reduce_frames(references, registration, GRID, bounds),
+            "workers": lambda: reduce_frames(references, registration, GRID, bounds, scheduler=address),
+        }
+        wall: dict[str, list[float]] = {name: [] for name in works}
+        processor: dict[str, list[float]] = {name: [] for name in works}
+        fields = {}
+        for _ in range(4):
+            for name, work in works.items():
+                began, begun = time.perf_counter(), processor_s(workers)
+                fields[name] = work()
+                wall[name].append(time.perf_counter() - began)
+                processor[name].append(processor_s(workers) - begun)
+    # The first turn of each compiles and fills the page cache.
+    ratios = {
+        what: np.array(values["threads"][1:]) / values["workers"][1:]
+        for what, values in {"wall": wall, "processor": processor}.items()
+    }
     print(
-        f"\ncluster of two workers: {median_of(clustered)} s, threads {median_of(alone)} s: "
-        f"{median_of((clustered - alone) / FRAMES * 1000)} s per 1000 frames more"
+        f"\n{frames} frames, two workers: {median_of(frames / np.array(wall['workers'][1:]))} frames/s; of the speed of two threads "
+        f"{median_of(ratios['wall'])} by wall time, {median_of(ratios['processor'])} by processor time "
+        f"({median_of(np.array(processor['workers'][1:]))} s)"
     )
+    for name in fields["threads"].variables:
+        assert fields["threads"][name].values.tobytes() == fields["workers"][name].values.tobytes(), name
+
+
+def processor_s(workers) -> float:
+    """Processor time of this process and of others so far, s."""
+    return time.process_time() + sum(sum(worker.cpu_times()[:2]) for worker in workers)
+
+
+def test_planning_a_day_of_video() -> None:
+    """What the client does before the first and for every task, for 756,000 frames (464 GB) of which nothing is on disk."""
+    began = time.process_time()
+    series = simulated(756_000, cycles=100)
+    simulate_s, began = time.process_time() - began, time.process_time()
+    blocks = cut_blocks(series, [RegistrationSpan(0, None)], block_s=10)
+    stretches = cut_stretches(blocks, total=len(series))
+    plan_s, began = time.process_time() - began, time.process_time()
+    sent = sum(len(pickle.dumps([gather_frames(series, p.blocks) for p in stretch])) for stretch in stretches)
+    send_s = time.process_time() - began
+    print(
+        f"\n756,000 frames: {len(stretches)} tasks planned in {plan_s:.2f} s of processor, described in {send_s:.1f} s and "
+        f"{sent / 1e6:.0f} MB (inputs made and checked in {simulate_s:.1f} s)"
+    )
+    assert len(stretches) < 1000

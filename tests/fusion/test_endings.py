@@ -15,7 +15,7 @@ import pytest
 import typer
 from rich.console import Console
 
-from fusion.endings import ExitCode, answering, interrupt_ends_step
+from fusion.endings import ExitCode, answering, failed_code, interrupt_ends_step
 from fusion.errors import FusionError
 
 
@@ -31,6 +31,10 @@ def test_faults_of_input_end_with_their_message() -> None:
     assert ending(FusionError("laser.csv, line 3: x")) == (ExitCode.BAD_INPUT, "thermofuse: laser.csv, line 3: x\n")
     missing = FileNotFoundError(errno.ENOENT, "No such file or directory", "IR_0007.jpg")
     assert ending(missing) == (ExitCode.BAD_INPUT, "thermofuse: IR_0007.jpg: No such file or directory\n")
+
+
+def test_failed_parts_are_counted_in_the_exit_code() -> None:
+    assert [failed_code(count) for count in (0, 1, 3, 25, 200)] == [0, 101, 103, 125, 125]
 
 
 def test_a_fault_of_the_program_is_reported_without_data_of_the_user(

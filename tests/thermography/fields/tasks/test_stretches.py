@@ -19,6 +19,7 @@ from thermography.fields.tasks.stretches import (
     reduce_portion,
     reduce_stretch,
 )
+from thermography.io.frame import PlainSamples
 from thermography.radiometry.planck import calibrate
 from thermography.registration.displacement import RegistrationSpan, monitor_fiducials
 from thermography.registration.register import register
@@ -35,6 +36,10 @@ class SimulatedFrame:
     time: np.datetime64
     parameters: object = SC660
     shape: tuple[int, int] = (480, 640)
+
+    @property
+    def plain_samples(self) -> PlainSamples:
+        return PlainSamples(1000 + 620_000 * self.index, True)
 
 
 def simulated(frames, *, cycles, interval_ms=33, files=24):
