@@ -40,6 +40,7 @@ from fusion.products.results import Notice
 from interferometry.contract import DEVIATIONS
 from interferometry.io.readers import read_deviations, read_environment
 from thermography.io.frame import FrameReference
+from thermography.io.frame_index.frame_list import FrameList, frame_times
 from thermography.io.frame_readers import index_recordings
 from thermography.registration.lens import read_lens
 from thermography.registration.plan import PlanGrid, read_fiducials
@@ -214,19 +215,18 @@ def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
     }
     if cycles is None:
         _raise_if_no_rise(campaign, frames, rejected)
-        times = np.array([frame.time for frame in frames], dtype="datetime64[ns]")
-        times = camera_on_laser_clock(times, thermography.clock_offset_s or 0.0)
+        times = camera_on_laser_clock(frame_times(frames), thermography.clock_offset_s or 0.0)
         camera["cycles"] = cycles_of_frames(times, thermography.window_s or usual_window_s(times))
     return camera
 
 
-def _read_frames(campaign: Campaign) -> tuple[list[FrameReference], list[dict[str, Any]]]:
+def _read_frames(campaign: Campaign) -> tuple[FrameList, list[dict[str, Any]]]:
     """Return the usable frames sorted by time, and file, index and reason of the others."""
     frames, rejected = index_recordings(campaign.frame_paths(), stack_options(campaign))
-    timed = [frame for frame in frames if not np.isnat(frame.time)]
-    timed, odd = _of_one_size(timed)
+    has_time = ~np.isnat(frames.times)
+    timed, odd = _of_one_size(frames.choose(has_time))
     left_out = [(frame, frame.reason.replace(f"{campaign.folder}/", "")) for frame in rejected]
-    left_out += [(frame, "the frame has no time") for frame in frames if np.isnat(frame.time)]  # type: ignore[misc]
+    left_out += [(frame, "the frame has no time") for frame in frames.choose(~has_time)]  # type: ignore[misc]
     left_out += odd  # type: ignore[arg-type]
     return timed, [
         {"file": relative_name(frame.path, campaign.folder), "index": frame.index, "reason": reason}
@@ -234,15 +234,20 @@ def _read_frames(campaign: Campaign) -> tuple[list[FrameReference], list[dict[st
     ]
 
 
-def _of_one_size(frames: list[FrameReference]) -> tuple[list[FrameReference], list[tuple[FrameReference, str]]]:
+def _of_one_size(frames: FrameList) -> tuple[FrameList, list[tuple[FrameReference, str]]]:
     """Keep the frames of the size that most of them have; the others with the reason."""
     if not frames:
-        return [], []
-    counted_shapes = Counter(frame.shape for frame in frames)
-    shape = counted_shapes.most_common(1)[0][0]
-    kept = [frame for frame in frames if frame.shape == shape]
+        return frames, []
+    shapes = frames.shapes()
+    sizes, counted = np.unique(shapes, axis=0, return_counts=True)
+    # Of two sizes as frequent as each other, that of the earlier frame.
+    most = sizes[counted == counted.max()]
+    first = min(range(len(most)), key=lambda i: int(np.argmax((shapes == most[i]).all(axis=1))))
+    fits = (shapes == most[first]).all(axis=1)
     reason = "{1} x {0} pixels among frames of {3} x {2}"
-    return kept, [(frame, reason.format(*frame.shape, *shape)) for frame in frames if frame.shape != shape]
+    return frames.choose(fits), [
+        (frame, reason.format(*frame.shape, *most[first].tolist())) for frame in frames.choose(~fits)
+    ]
 
 
 def compensate_by_camera(source: Source, fields: xr.Dataset) -> tuple[Source, list[Notice]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,7 +17,8 @@ from fusion.campaign.config import Campaign, InterferometryTable, PlanTable, The
 from fusion.campaign.iso_budget import StatedBudget
 from fusion.campaign.sensors import ContactSensors
 from fusion.products.results import Notice
-from thermography.io.flir import FrameReference
+from thermography.io.frame import FrameReference
+from thermography.io.frame_index.frame_list import frame_times
 from thermography.registration.lens import Lens
 from thermography.registration.plan import Fiducial, PlanGrid
 
@@ -174,7 +176,7 @@ class CameraInputs(Inputs):
     grid: PlanGrid
     fiducials: list[Fiducial]
     fiducials_file: str
-    frames: list[FrameReference]
+    frames: Sequence[FrameReference]
     frames_rejected: list[dict[str, Any]]
     cycles: Cycles
     regions: list[Region] = field(default_factory=list)
@@ -183,7 +185,7 @@ class CameraInputs(Inputs):
     @property
     def frame_times(self) -> np.ndarray:
         """Times of the usable frames on the camera's clock, (n,) datetime64[ns]."""
-        return np.array([frame.time for frame in self.frames], dtype="datetime64[ns]")
+        return frame_times(self.frames)
 
     @property
     def direction(self) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from thermography._typing import Array
 from thermography.errors import ThermographyError
 from thermography.io.frame import CameraParameters, FrameReference
+from thermography.io.frame_index.frame_list import frame_times
 from thermography.radiometry.planck import calibrate
 
 Override = Callable[[FrameReference], CameraParameters]
@@ -135,7 +136,7 @@ def _check_frames(references: Sequence[FrameReference], shape: tuple[int, int]) 
     """Times of the frames, (frames,) datetime64[ns]."""
     if not references:
         raise ReductionError("there is no frame to reduce")
-    times = np.array([frame.time for frame in references], "datetime64[ns]")
+    times = frame_times(references)
     for i, frame in enumerate(references):
         where = f"{frame.path}: frame {frame.index}"
         if tuple(frame.shape) != tuple(shape):

@@ -11,7 +11,7 @@ ExifTool (P. Harvey, "FLIR Tags").
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -42,11 +42,21 @@ CAMERA_RECORD = 0x20
 RAW_RECORD = 0x01
 RAW_HEADER_SIZE = 0x20
 #: The largest directory in these files has 33 slots.
-_MAX_SLOTS = 1024
+MAX_SLOTS = 1024
 #: Up to and including Planck R2 and the raw range; the shortest record in these files has 1148 bytes.
 _MINIMUM_CAMERA_INFO = 0x314
 #: The longest record in these files has 2476 bytes; a wrong length must not cost memory.
-_MAXIMUM_CAMERA_INFO = 0x4000
+MAXIMUM_CAMERA_INFO = 0x4000
+#: Bytes of the camera information, from and to: those that `parse_parameters` and `parse_settings` take one after the other, those of
+#: camera and lens, of the calibrated range, and of seconds, milliseconds and minutes west of Greenwich.
+PARAMETER_BYTES = ((0x20, 0x40), (0x58, 0x64), (0x70, 0x84), (0x308, 0x310))
+SETTING_BYTES = ((0x98, 0xB0), (0x338, 0x340), (0x45C, 0x466))
+IDENTITY_BYTES = (0xD4, 0x1B8)
+LIMIT_BYTES = ((0x90, 0x98), (0x310, 0x314))
+TIME_BYTES = (0x384, 0x38E)
+#: Temperatures without a name, and the table of those with one: its first entry, the length of an entry, and the name in it.
+UNNAMED_BYTES = (0x394, 0x3A4)
+FIRST_SENSOR, SENSOR_SIZE, SENSOR_NAME = 0x47C, 28, (4, 20)
 #: Limits between which a number in the housekeeping table is a temperature inside a camera.
 _LOWEST_K, _HIGHEST_K = 150.0, 450.0
 #: The largest FLIR detectors have 3 million pixels; a file that claims more is damaged or hostile.
@@ -160,7 +170,7 @@ def is_fff_header(data: bytes) -> bool:
     if order is None:
         return False
     offset, slots = struct.unpack_from(order + "2I", data, 0x18)
-    return offset >= HEADER_SIZE and 0 < slots <= _MAX_SLOTS
+    return offset >= HEADER_SIZE and 0 < slots <= MAX_SLOTS
 
 
 def read_directory(source: FffSource) -> Directory:
@@ -191,8 +201,8 @@ def read_directory(source: FffSource) -> Directory:
     if order is None:
         raise source.error(0x14, "a version of 100 to 199 in either byte order", head[0x14:0x18].hex(" "))
     offset, slots = struct.unpack_from(order + "2I", head, 0x18)
-    if not 0 < slots <= _MAX_SLOTS:
-        raise source.error(0x1C, f"1 to {_MAX_SLOTS} directory slots", str(slots))
+    if not 0 < slots <= MAX_SLOTS:
+        raise source.error(0x1C, f"1 to {MAX_SLOTS} directory slots", str(slots))
     if offset < HEADER_SIZE:
         raise source.error(0x18, f"a directory after the header (offset >= {HEADER_SIZE})", str(offset))
     end = offset + slots * ENTRY_SIZE
@@ -290,7 +300,7 @@ def find_camera_info(source: FffSource, directory: Directory) -> tuple[int, int]
     offset, length = _find_record(source, directory, CAMERA_RECORD, "camera information")
     if length < _MINIMUM_CAMERA_INFO:
         raise source.error(offset, f"camera information of at least {_MINIMUM_CAMERA_INFO} bytes", f"{length} bytes")
-    return offset, min(length, _MAXIMUM_CAMERA_INFO)
+    return offset, min(length, MAXIMUM_CAMERA_INFO)
 
 
 def read_header(source: FffSource, place: tuple[int, int]) -> FrameHeader:
@@ -318,12 +328,11 @@ def read_header(source: FffSource, place: tuple[int, int]) -> FrameHeader:
     order = "<" if info[:2] == b"\x02\x00" else ">" if info[:2] == b"\x00\x02" else None
     if order is None:
         raise source.error(offset, "the byte-order mark 2 of the camera information", info[:2].hex(" "))
-    parameters, notes = _parameters(order, info[0x20:0x40] + info[0x58:0x64] + info[0x70:0x84] + info[0x308:0x310])
+    parameters, notes = parse_parameters(order, _join(info, PARAMETER_BYTES))
     time, utc_offset = _time(order, info)
-    limits = _limits(order, info[0x90:0x98] + info[0x310:0x314])
-    whole = info.ljust(0x47C, b"\0")
-    settings = _settings(order, whole[0x98:0xB0] + whole[0x338:0x340] + whole[0x45C:0x466])
-    camera = _identity(order, info[0xD4:0x1B8])
+    limits = _limits(order, _join(info, LIMIT_BYTES))
+    settings = parse_settings(order, _join(info.ljust(FIRST_SENSOR, b"\0"), SETTING_BYTES))
+    camera = _identity(order, info[slice(*IDENTITY_BYTES)])
     housekeeping = _housekeeping(order, info)
     return FrameHeader(
         parameters=parameters,
@@ -337,9 +346,21 @@ def read_header(source: FffSource, place: tuple[int, int]) -> FrameHeader:
     )
 
 
+def _join(info: bytes, places: tuple[tuple[int, int], ...]) -> bytes:
+    return b"".join([info[start:stop] for start, stop in places])
+
+
 @lru_cache(maxsize=256)
-def _parameters(order: str, data: bytes) -> tuple[CameraParameters, tuple[str, ...]]:
-    """Return the parameters and notes from their bytes; cached because the frames of a sequence share them."""
+def parse_parameters(order: str, data: bytes) -> tuple[CameraParameters, tuple[str, ...]]:
+    """Return the parameters, and notes on them; cached because the frames of a sequence share them.
+
+    Parameters
+    ----------
+    order : {"<", ">"}
+        Byte order of the camera information.
+    data : bytes
+        The bytes `PARAMETER_BYTES` of the camera information.
+    """
     *ambient, r1, b, f, alpha1, alpha2, beta1, beta2, x, o, r2 = struct.unpack(order + "16fif", data)
     notes: tuple[str, ...] = ()
     if ambient[7] > 2:
@@ -356,14 +377,23 @@ def _limits(order: str, data: bytes) -> CalibratedRange:
 
 
 @lru_cache(maxsize=256)
-def _settings(order: str, data: bytes) -> CameraSettings:
+def parse_settings(order: str, data: bytes) -> CameraSettings:
+    """Return the settings of the camera.
+
+    Parameters
+    ----------
+    order : {"<", ">"}
+        Byte order of the camera information.
+    data : bytes
+        The bytes `SETTING_BYTES` of the camera information.
+    """
     *temperatures, raw_median, raw_range, focus, frame_rate = struct.unpack(order + "6f2If4xH", data)
     return CameraSettings(*[focus, frame_rate, *temperatures, raw_median, raw_range])
 
 
 @lru_cache(maxsize=256)
 def _identity(order: str, data: bytes) -> CameraIdentity:
-    """Return camera and lens from bytes 0xD4 to 0x1B8 of the camera information."""
+    """Return camera and lens from the bytes `IDENTITY_BYTES` of the camera information."""
 
     def text(offset: int, width: int) -> str:
         return data[offset - 0xD4 : offset - 0xD4 + width].split(b"\0")[0].decode("latin-1").strip()
@@ -382,28 +412,56 @@ def _identity(order: str, data: bytes) -> CameraIdentity:
 
 def _time(order: str, info: bytes) -> tuple[np.datetime64, int]:
     """Return UTC with milliseconds, and local time minus UTC in minutes; the file stores minutes west of Greenwich."""
-    if len(info) < 0x38E:
+    if len(info) < TIME_BYTES[1]:
         return np.datetime64("NaT", "ms"), 0
-    seconds, milliseconds, west = struct.unpack_from(order + "2Ih", info, 0x384)
+    seconds, milliseconds, west = struct.unpack_from(order + "2Ih", info, TIME_BYTES[0])
     if seconds == 0:
         return np.datetime64("NaT", "ms"), -west
     return np.datetime64(seconds * 1000 + milliseconds % 1000, "ms"), -west
 
 
 def _housekeeping(order: str, info: bytes) -> dict[str, float]:
-    """Return the temperatures inside the camera, K; the table also holds raw readings and times, which are left out."""
-    readings: dict[str, float] = {}
-    for entry in range(0x47C, len(info) - 27, 28):
-        name = info[entry + 4 : entry + 20].split(b"\0")[0]
+    """Return the temperatures inside the camera, K."""
+    names = sensor_names(info)
+    values = [struct.unpack_from(order + "f", info, FIRST_SENSOR + SENSOR_SIZE * i)[0] for i in range(len(names))]
+    unnamed = struct.unpack_from(order + "4f", info, UNNAMED_BYTES[0]) if len(info) >= UNNAMED_BYTES[1] else ()
+    return select_temperatures(names, values, unnamed)
+
+
+def sensor_names(info: bytes) -> list[str]:
+    """Return the names in the housekeeping table of the camera information, up to the first entry without one."""
+    names = []
+    for entry in range(FIRST_SENSOR, len(info) - SENSOR_SIZE + 1, SENSOR_SIZE):
+        name = info[entry + SENSOR_NAME[0] : entry + SENSOR_NAME[1]].split(b"\0")[0]
         if not name or not name.isascii():
             break
-        (value,) = struct.unpack_from(order + "f", info, entry)
-        if _LOWEST_K < value < _HIGHEST_K and name != b"ITimeUs":
-            readings[name.decode()] = value
-    if not readings and len(info) >= 0x3A4:
-        unnamed = struct.unpack_from(order + "4f", info, 0x394)
-        readings = {f"sensor {i}": value for i, value in enumerate(unnamed, 1) if _LOWEST_K < value < _HIGHEST_K}
-    return readings
+        names.append(name.decode())
+    return names
+
+
+def select_temperatures(names: Sequence[str], values: Sequence[float], unnamed: Sequence[float]) -> dict[str, float]:
+    """Return the temperatures among the housekeeping values; the table also holds raw readings and times, which are left out.
+
+    Parameters
+    ----------
+    names : sequence of str
+        From `sensor_names`.
+    values : sequence of float
+        One per name.
+    unnamed : sequence of float
+        Values that stand without names, used where no named one is a temperature.
+
+    Returns
+    -------
+    dict of str to float
+        Temperatures inside the camera, K.
+    """
+    readings = {
+        name: value
+        for name, value in zip(names, values, strict=True)
+        if _LOWEST_K < value < _HIGHEST_K and name != "ITimeUs"
+    }
+    return readings or {f"sensor {i}": value for i, value in enumerate(unnamed, 1) if _LOWEST_K < value < _HIGHEST_K}
 
 
 def locate_samples(source: FffSource, directory: Directory) -> SampleLocation:

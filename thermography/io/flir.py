@@ -9,92 +9,25 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO, TypeVar
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import BinaryIO
 
 from thermography.io.fff_record import (
     HEADER_SIZE,
     MAGIC,
     Directory,
     FffSource,
-    damaged_records,
     find_camera_info,
     is_fff_header,
     locate_samples,
-    read_counts,
     read_directory,
     read_header,
 )
-from thermography.io.frame import (
-    FlirFormatError,
-    Frame,
-    FrameHeader,
-    FrameReference,
-    PlainSamples,
-    RejectedFrame,
-    SampleLocation,
-    Segments,
-)
-
-F = TypeVar("F", bound=FrameReference)
-
-
-@dataclass(frozen=True, kw_only=True)
-class FlirFrameReference(FrameReference):
-    """A frame in a FLIR file; further attributes are those of `FrameReference`.
-
-    Attributes
-    ----------
-    segments : tuple of (offset, length)
-        Segments of the FFF record in the file, bytes.
-    camera_info_place : (offset, length)
-        Place of the camera information in the record, bytes.
-    samples : SampleLocation
-        Place and packing of the pixels in the record.
-    """
-
-    segments: Segments
-    camera_info_place: tuple[int, int]
-    samples: SampleLocation
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Number of rows and columns."""
-        return self.samples.shape
-
-    @property
-    def plain_samples(self) -> PlainSamples | None:
-        """Place of the pixels; None where they are packed, or parted into the segments of a JPEG."""
-        if self.samples.encoding != "raw" or len(self.segments) != 1:
-            return None
-        return PlainSamples(self.segments[0][0] + self.samples.offset, self.samples.little_endian)
-
-    def read(self) -> Frame:
-        """Read the frame with its pixels and camera information; raise FlirFormatError where they are damaged."""
-        with self.path.open("rb", buffering=0) as file:
-            return self._read_from(file)
-
-    def _read_from(self, file: BinaryIO) -> Frame:
-        source = FffSource(file, self.path, self.segments)
-        info = source.take(*self.camera_info_place, "camera information")
-        counts = read_counts(source, self.samples)
-        header = {each.name: getattr(self, each.name) for each in fields(FrameHeader)}
-        return Frame(**header, counts=counts, source=str(self.path), index=self.index, camera_info=info)
-
-    def damaged_records(self) -> list[int]:
-        """Return the types of all records that differ from their checksums; reading compares that of the pixels only."""
-        with self.path.open("rb", buffering=0) as file:
-            source = FffSource(file, self.path, self.segments)
-            return damaged_records(source, read_directory(source))
-
-    def read_counts(self) -> NDArray[np.uint16]:
-        """Read the pixels only, (row, column) uint16; raise FlirFormatError where they are damaged."""
-        with self.path.open("rb", buffering=0) as file:
-            return read_counts(FffSource(file, self.path, self.segments), self.samples)
+from thermography.io.frame import FlirFormatError, Frame, FrameReference, RejectedFrame, Segments
+from thermography.io.frame_index.flir_frame import FlirFrameReference
+from thermography.io.frame_index.frame_list import FrameList, FrameRun, order_by_time
+from thermography.io.frame_index.header_scan import scan_run
 
 
 class FlirReader:
@@ -113,8 +46,8 @@ class FlirReader:
         """
         return start[:2] == b"\xff\xd8" or start[:4] == MAGIC
 
-    def index(self, path: Path, options: object) -> Iterator[FrameReference | RejectedFrame]:
-        """Yield the frames of a file in its order; damaged ones as `RejectedFrame`.
+    def index(self, path: Path, options: object) -> Iterator[FrameReference | FrameRun | RejectedFrame]:
+        """Yield the frames of a file in its order; damaged ones as `RejectedFrame`, those of a long sequence together.
 
         Parameters
         ----------
@@ -175,12 +108,13 @@ def read_frame(path: str | os.PathLike[str]) -> Frame:
         first = next(_walk(file, path))
         if isinstance(first, RejectedFrame):
             raise FlirFormatError(first.reason)
-        return first._read_from(file)
+        assert isinstance(first, FlirFrameReference)
+        return first.read_from(file)
 
 
 def index_frames(
     paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
-) -> tuple[list[FrameReference], list[RejectedFrame]]:
+) -> tuple[FrameList, list[RejectedFrame]]:
     """List all frames of many radiometric FLIR files by reading their headers only.
 
     Parameters
@@ -190,15 +124,17 @@ def index_frames(
 
     Returns
     -------
-    frames : list of FrameReference
-        Sorted by time (UTC), frames without a time last; no time occurs twice.
+    frames : FrameList
+        Sequence of `FrameReference`, sorted by time (UTC), frames without a time last; no time occurs twice.
     rejected : list of RejectedFrame
         Everything that is not in `frames`: unreadable files, damaged or truncated frames, a second frame with the same time.
 
     Notes
     -----
     A file or frame that cannot be used is returned in `rejected`, never raised, so that one damaged file does not stop a series.
-    The frames of a sequence are found from the ends of their records, because the magic of a header also occurs among pixels.
+    The frames of a sequence are found from the ends of their records, because the magic of a header also occurs among pixels. The
+    headers of every frame are read and checked, those of a long sequence compiled (`thermography.io.frame_index.header_scan`); pixels
+    and their checksums are checked when they are read.
 
     Examples
     --------
@@ -206,7 +142,7 @@ def index_frames(
     >>> frames, rejected[0].reason
     ([], "[Errno 2] No such file or directory: 'does_not_exist.seq'")
     """
-    frames: list[FrameReference] = []
+    frames: list[FrameReference | FrameRun] = []
     rejected: list[RejectedFrame] = []
     for path in map(Path, [paths] if isinstance(paths, str | os.PathLike) else paths):
         try:
@@ -262,7 +198,8 @@ def index_sequence(
     with path.open("rb", buffering=0) as file:
         size = file.seek(0, os.SEEK_END)
         first = _find_header(file, start, size)
-        found = list(_walk_sequence(file, path, first, size, index=index)) if first < size else []
+        walked = _walk_sequence(file, path, first, size, index=index) if first < size else iter(())
+        found = [one for some in walked for one in (some if isinstance(some, FrameRun) else [some])]
     whole = [at for at, one in enumerate(found) if isinstance(one, FlirFrameReference)]
     if not whole:
         return [], [] if growing else [one for one in found if isinstance(one, RejectedFrame)], start
@@ -274,33 +211,8 @@ def index_sequence(
     return frames, [one for one in kept if isinstance(one, RejectedFrame)], offset if growing else offset + length
 
 
-def order_by_time(frames: Iterable[F]) -> tuple[list[F], list[RejectedFrame]]:
-    """Sort frames by time, and take out those whose time occurs twice.
-
-    Parameters
-    ----------
-    frames : iterable of FrameReference
-
-    Returns
-    -------
-    kept : list of FrameReference
-        By time (UTC), frames without a time last.
-    repeated : list of RejectedFrame
-        Every second frame of one time.
-    """
-    kept: list[F] = []
-    repeated: list[RejectedFrame] = []
-    for frame in sorted(frames, key=lambda frame: (np.isnat(frame.time), frame.time, str(frame.path), frame.index)):
-        if kept and frame.time == kept[-1].time:
-            reason = f"{frame.path}: frame {frame.index} has the same time {frame.time} as frame {kept[-1].index} of {kept[-1].path}"
-            repeated.append(RejectedFrame(frame.path, frame.index, reason))
-        else:
-            kept.append(frame)
-    return kept, repeated
-
-
-def _walk(file: BinaryIO, path: Path) -> Iterator[FlirFrameReference | RejectedFrame]:
-    """Yield the frames of one file in file order; damaged ones as `RejectedFrame`."""
+def _walk(file: BinaryIO, path: Path) -> Iterator[FlirFrameReference | FrameRun | RejectedFrame]:
+    """Yield the frames of one file in file order; damaged ones as `RejectedFrame`, those of a long sequence together."""
     start = file.read(4)
     if start[:2] == b"\xff\xd8":
         source = FffSource(file, path, _jpeg_segments(file, path))
@@ -343,22 +255,27 @@ def _reference(source: FffSource, directory: Directory, index: int) -> FlirFrame
 
 def _walk_sequence(
     file: BinaryIO, path: Path, start: int, size: int, *, index: int
-) -> Iterator[FlirFrameReference | RejectedFrame]:
+) -> Iterator[FlirFrameReference | FrameRun | RejectedFrame]:
     """Yield the frames of consecutive FFF records from `start` on; padding and damaged frames are skipped and reported."""
     notes: tuple[str, ...] = ()
     while start < size:
         source = FffSource(file, path, ((start, size - start),))
+        run = None
         try:
             directory = read_directory(source)
             end, following = _next_frame(file, start, size, directory)
             source = FffSource(file, path, ((start, end - start),))
             reference = _reference(source, directory, index)
             yield replace(reference, notes=notes + reference.notes) if notes else reference
+            run = scan_run(file, reference, size) if end == following < size else None
         except FlirFormatError as error:
             yield RejectedFrame(path, index, str(error))
             end = following = _find_header(file, start + HEADER_SIZE, size)
         notes = ()
-        if end < following and _holds_data(file, end, following - end):
+        if run is not None:
+            yield run
+            index, end, following = index + len(run), run.end, run.end
+        elif end < following and _holds_data(file, end, following - end):
             index += 1
             text = f"{path}: at 0x{end:X}: expected a frame or padding, found {following - end} bytes that are neither"
             yield RejectedFrame(path, index, text)

@@ -20,8 +20,9 @@ from typing import Protocol, runtime_checkable
 
 from thermography.errors import ThermographyError
 from thermography.io.array_frames import NetcdfReader, NumpyReader, TiffReader
-from thermography.io.flir import FlirReader, order_by_time
+from thermography.io.flir import FlirReader
 from thermography.io.frame import FrameReference, RejectedFrame
+from thermography.io.frame_index.frame_list import FrameList, FrameRun, order_by_time
 from thermography.io.temperature_frames import StackError, StackOptions
 from thermography.io.text_frames import TextReader
 
@@ -46,8 +47,10 @@ class FrameReader(Protocol):
         """Return whether a file is of this kind, by its content; `start` holds its first 512 bytes, none of a folder."""
         ...
 
-    def index(self, path: Path, options: StackOptions) -> Iterator[FrameReference | RejectedFrame]:
+    def index(self, path: Path, options: StackOptions) -> Iterator[FrameReference | FrameRun | RejectedFrame]:
         """Yield the frames of a file in its order without reading pixels, damaged ones as `RejectedFrame`.
+
+        Frames of a long file may be yielded together as a `FrameRun`, which makes their references on access.
 
         Raise a ThermographyError or OSError where nothing in the file can be used.
         """
@@ -105,7 +108,7 @@ def find_reader(path: Path) -> FrameReader | None:
 
 def index_recordings(
     paths: Iterable[str | os.PathLike[str]], options: StackOptions | None = None
-) -> tuple[list[FrameReference], list[RejectedFrame]]:
+) -> tuple[FrameList, list[RejectedFrame]]:
     """List all frames of many thermal files of one camera without reading a pixel.
 
     Parameters
@@ -117,8 +120,8 @@ def index_recordings(
 
     Returns
     -------
-    frames : list of FrameReference
-        Sorted by time (UTC), frames without a time last; no time occurs twice.
+    frames : FrameList
+        Sequence of `FrameReference`, sorted by time (UTC), frames without a time last; no time occurs twice.
     rejected : list of RejectedFrame
         Everything that is not in `frames`, with the reason.
 
@@ -141,7 +144,7 @@ def index_recordings(
     "[Errno 2] No such file or directory: 'does_not_exist.tif'"
     """
     options = options or StackOptions()
-    frames: list[FrameReference] = []
+    frames: list[FrameReference | FrameRun] = []
     rejected: list[RejectedFrame] = []
     for path in map(Path, paths):
         try:

@@ -10,7 +10,7 @@ import json
 import os
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from xarray.core import indexing
 from thermography.io.flir import FlirFrameReference, index_frames
 from thermography.io.flir_annotations import read_measurement_regions, read_visible_picture
 from thermography.io.frame import CameraParameters, FlirFormatError, FrameReference, RejectedFrame
+from thermography.io.frame_index.frame_list import FrameList, frame_times
 from thermography.radiometry.planck import ZERO_CELSIUS_K, RadiometryError, calibrate, override
 
 #: Camera parameter -> (name in a Dataset, units, units_metadata).
@@ -239,34 +240,32 @@ def _open_frames(paths: Iterable[str | os.PathLike[str]], changes: dict[str, flo
     if not frames:
         reason = rejected[0].reason if rejected else "no files were given"
         raise FlirFormatError(f"no FLIR frame can be read: {reason}")
-    for frame in frames:
-        if frame.shape != frames[0].shape:
-            raise FlirFormatError(
-                f"{frame.path}: frame {frame.index} has (rows, columns) {frame.shape}, {frames[0].path} has "
-                f"{frames[0].shape}; open the files of each camera separately"
-            )
+    _check_shapes(frames)
     if rejected:
         text = f"{len(rejected)} files or frames could not be used, the first: {rejected[0].reason}"
         warnings.warn(text, UserWarning, stacklevel=3)
-    regions = read_measurement_regions(frames[0]) if isinstance(frames[0], FlirFrameReference) else []
+    first = frames[0]
+    regions = read_measurement_regions(first) if isinstance(first, FlirFrameReference) else []
+    sets, which = frames.parameter_sets()
+    readings = frames.temperatures()
     if changes:
-        frames = [replace(frame, parameters=override(frame.parameters, **changes)) for frame in frames]
+        sets = [override(parameters, **changes) for parameters in sets]
     chunks = {"preferred_chunks": {"time": 1}}
     counts, temperature = (
         xr.Variable(("time", "row", "column"), indexing.LazilyIndexedArray(stack), attrs, chunks)
         for stack, attrs in (
-            (_FrameStack(frames, np.uint16, _counts), {"long_name": "counts of the detector", "units": "1"}),
-            (_FrameStack(frames, np.float32, _temperature), _TEMPERATURE),
+            (_FrameStack(frames, np.uint16, _Counts()), {"long_name": "counts of the detector", "units": "1"}),
+            (_FrameStack(frames, np.float32, _Temperatures(sets, which)), _TEMPERATURE),
         )
     )
     dataset = xr.Dataset(
         {
             "counts": counts,
             "temperature": temperature,
-            **_parameter_variables(frames),
-            "camera_temperature": _camera_temperatures(frames),
+            **_parameter_variables(sets, which),
+            "camera_temperature": _camera_temperatures(readings, len(frames)),
         },
-        coords=_coordinates(frames),
+        coords={**_coordinates(frames), "sensor": ("sensor", np.array(list(readings), dtype=object))},
         attrs={
             **_attributes(frames, rejected),
             "measurement_regions": json.dumps([asdict(region) for region in regions]),
@@ -276,11 +275,24 @@ def _open_frames(paths: Iterable[str | os.PathLike[str]], changes: dict[str, flo
     return dataset
 
 
+def _check_shapes(frames: FrameList) -> None:
+    """Raise an error where frames differ in size."""
+    shapes = frames.shapes()
+    others = np.flatnonzero((shapes != shapes[0]).any(axis=1))
+    if not others.size:
+        return
+    first, other = frames[0], frames[int(others[0])]
+    raise FlirFormatError(
+        f"{other.path}: frame {other.index} has (rows, columns) {other.shape}, {first.path} has "
+        f"{first.shape}; open the files of each camera separately"
+    )
+
+
 class _FrameStack(BackendArray):
     """Frames as one array (time, row, column); it holds only paths and offsets, so it can be pickled and keeps no file open."""
 
     def __init__(
-        self, frames: list[FrameReference], kind: type[np.generic], read: Callable[[FrameReference], np.ndarray]
+        self, frames: FrameList, kind: type[np.generic], read: Callable[[FrameReference, int], np.ndarray]
     ) -> None:
         self.frames, self.read = frames, read
         self.shape = (len(frames), *frames[0].shape)
@@ -292,66 +304,72 @@ class _FrameStack(BackendArray):
     def _read(self, key: tuple[Any, ...]) -> np.ndarray:
         time, row, column = key
         if isinstance(time, (int, np.integer)):
-            return self.read(self.frames[time])[row][..., column]
+            return self.read(self.frames[int(time)], int(time))[row][..., column]
         chosen = range(len(self.frames))[time] if isinstance(time, slice) else time
         first = np.empty(self.shape[1:], self.dtype)[row][..., column]
         stack = np.empty((len(chosen), *first.shape), self.dtype)
         for place, index in enumerate(chosen):
-            stack[place] = self.read(self.frames[index])[row][..., column]
+            stack[place] = self.read(self.frames[int(index)], int(index))[row][..., column]
         return stack
 
 
-def _counts(frame: FrameReference) -> np.ndarray:
-    return frame.read_counts()
+class _Counts:
+    """Reads the counts of a frame."""
+
+    def __call__(self, frame: FrameReference, index: int) -> np.ndarray:
+        """Return (row, column) uint16."""
+        return frame.read_counts()
 
 
-def _temperature(frame: FrameReference) -> np.ndarray:
-    return calibrate(frame.read_counts(), frame.parameters)
+@dataclass(frozen=True)
+class _Temperatures:
+    """Reads and calibrates a frame with one of several sets of parameters."""
+
+    sets: Sequence[CameraParameters]
+    which: np.ndarray
+
+    def __call__(self, frame: FrameReference, index: int) -> np.ndarray:
+        """Return (row, column) float32, degC."""
+        return calibrate(frame.read_counts(), self.sets[self.which[index]])
 
 
-def _parameter_variables(frames: list[FrameReference]) -> dict[str, xr.Variable]:
+def _parameter_variables(sets: Sequence[CameraParameters], which: np.ndarray) -> dict[str, xr.Variable]:
     """Return one variable per camera parameter: a scalar, or along time where it varies."""
     variables = {}
     for field, (name, units, metadata) in _PARAMETERS.items():
-        values = np.array([getattr(frame.parameters, field) for frame in frames])
+        values = np.array([getattr(parameters, field) for parameters in sets])
         attrs = {"units": units, **({"units_metadata": metadata} if metadata else {})}
         constant = (values == values[0]).all()
-        variables[name] = xr.Variable((), values[0], attrs) if constant else xr.Variable("time", values, attrs)
+        variables[name] = xr.Variable((), values[0], attrs) if constant else xr.Variable("time", values[which], attrs)
     return variables
 
 
-def _camera_temperatures(frames: list[FrameReference]) -> xr.Variable:
+def _camera_temperatures(readings: dict[str, np.ndarray], frames: int) -> xr.Variable:
     """Return the temperatures inside the camera (time, sensor), K; NaN where a frame does not store one."""
-    names = _sensors(frames)
-    values = np.array([[frame.housekeeping.get(name, np.nan) for name in names] for frame in frames])
+    values = list(readings.values())
     attrs = {
         "long_name": "temperatures inside the camera",
         "units": "K",
         "units_metadata": "temperature: on_scale",
     }
-    return xr.Variable(("time", "sensor"), values.reshape(len(frames), len(names)), attrs)
+    table = np.stack(values, axis=-1) if values else np.empty((frames, 0))
+    return xr.Variable(("time", "sensor"), table, attrs)
 
 
-def _sensors(frames: list[FrameReference]) -> list[str]:
-    return list(dict.fromkeys(name for frame in frames for name in frame.housekeeping))
-
-
-def _coordinates(frames: list[FrameReference]) -> dict[str, Any]:
+def _coordinates(frames: FrameList) -> dict[str, Any]:
     rows, columns = frames[0].shape
-    times = np.array([frame.time for frame in frames]).astype("datetime64[ns]")
     return {
-        "time": ("time", times, {"standard_name": "time", "units_metadata": "leap_seconds: utc"}),
+        "time": ("time", frame_times(frames), {"standard_name": "time", "units_metadata": "leap_seconds: utc"}),
         "row": ("row", np.arange(rows), {"long_name": "sensor row", "units": "1"}),
         "column": ("column", np.arange(columns), {"long_name": "sensor column", "units": "1"}),
-        "sensor": ("sensor", np.array(_sensors(frames), dtype=object)),
-        "source": ("time", np.array([str(frame.path) for frame in frames], dtype=object)),
-        "frame": ("time", np.array([frame.index for frame in frames]), {"long_name": "index in the file, from 0"}),
+        "source": ("time", frames.files()),
+        "frame": ("time", frames.numbers(), {"long_name": "index in the file, from 0"}),
     }
 
 
-def _attributes(frames: list[FrameReference], rejected: list[RejectedFrame]) -> dict[str, str]:
+def _attributes(frames: FrameList, rejected: list[RejectedFrame]) -> dict[str, str]:
     notes = list(
-        dict.fromkeys(f"{frame.path}: frame {frame.index}: {note}" for frame in frames for note in frame.notes)
+        dict.fromkeys(f"{frame.path}: frame {frame.index}: {note}" for frame in frames.noted() for note in frame.notes)
     )
     unused = [{"path": str(each.path), "index": each.index, "reason": each.reason} for each in rejected]
     return {

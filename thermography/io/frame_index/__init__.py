@@ -1,0 +1,1 @@
+"""Frames of many files without their pixels: one object per frame, or columns for the frames of a long sequence."""
