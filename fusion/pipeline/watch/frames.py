@@ -11,8 +11,9 @@ import numpy as np
 
 from thermography.errors import ThermographyError
 from thermography.io.fff_record import MAGIC
-from thermography.io.flir import index_sequence, order_by_time
+from thermography.io.flir import index_sequence
 from thermography.io.frame import FrameReference, RejectedFrame
+from thermography.io.frame_index.frame_list import order_by_time
 from thermography.io.frame_readers import index_recordings
 from thermography.io.temperature_frames import StackOptions
 
@@ -66,7 +67,7 @@ class ArrivingFrames:
             if np.isnat(one.time)
         ]
         kept, repeated = order_by_time(timed)
-        return kept, rejected + repeated
+        return list(kept), rejected + repeated
 
     def _poll_file(self, path: Path) -> tuple[list[FrameReference], list[RejectedFrame]]:
         sequence = self._sequences.get(path)
@@ -81,7 +82,8 @@ class ArrivingFrames:
                 sequence = self._sequences[path] = _Sequence()
                 del self._sizes[path]
                 return self._go_on(path, sequence, size), []
-            frames, rejected = index_recordings([path], self._options)
+            found, rejected = index_recordings([path], self._options)
+            frames = list(found)
         except (OSError, ThermographyError) as error:
             frames, rejected = [], [RejectedFrame(path, 0, str(error))]
         self._sizes.pop(path, None)
