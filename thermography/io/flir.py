@@ -91,6 +91,7 @@ def read_frame(path: str | os.PathLike[str]) -> Frame:
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
     >>> from thermography.io.flir_writer import write_jpeg
     >>> from thermography.io.frame import CameraParameters
     >>> sc660 = CameraParameters(
