@@ -528,6 +528,45 @@ def report(
 
 
 @app.command()
+def compare(
+    results: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RESULTS RESULTS...", help="Results folders of one machine; the first is the reference."
+        ),
+    ],
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
+) -> None:
+    """Compare campaigns of one machine: what changed by more than the uncertainties.
+
+    Profile, scatter, drift per kelvin, ISO 230-2 values and positions that stand out, each campaign against the first.
+    """
+    from fusion.comparison.campaigns import compare_campaigns
+    from fusion.report.comparison_section import (
+        campaign_names,
+        changes_table,
+        comparison_json,
+        conclude_comparison,
+        side_by_side,
+    )
+    from fusion.report.tables import print_table
+
+    with _answering():
+        pairs = compare_campaigns(results)
+        if as_json:
+            sys.stdout.write(json.dumps(comparison_json(pairs), indent=1, ensure_ascii=False) + "\n")
+            return
+        wide = console if console.is_terminal else Console(width=_TABLE_WIDTH)
+        wide.print(print_table(side_by_side(pairs), "Side by side"))
+        names = campaign_names(pairs)
+        for name, pair in zip(names[1:], pairs, strict=True):
+            if pair.changes:
+                wide.print(print_table(changes_table(pair), f"{names[0]} -> {name}"))
+            for line in (*conclude_comparison(pair), *(f"Not compared: {lack}" for lack in pair.not_compared)):
+                console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
+@app.command()
 def plan(
     source: Annotated[
         list[str], typer.Option(metavar="NAME=TIME", help="A heat source that can be switched, with its time constant.")
