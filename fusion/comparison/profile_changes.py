@@ -110,10 +110,13 @@ class _Difference:
     freedom: float
 
     def fit(self, shapes: Sequence[_Shape]) -> tuple[Array, Array]:
-        """Return the sizes of shapes and their covariance (um2), by generalised least squares."""
+        """Return the sizes of shapes and their covariance (um2), by generalised least squares, widened by Birge's ratio."""
         design = np.linalg.solve(self.root, np.column_stack([shape.column for shape in shapes]))
+        value = np.linalg.solve(self.root, self.value)
         covariance = np.linalg.pinv(design.T @ design)
-        return covariance @ design.T @ np.linalg.solve(self.root, self.value), covariance
+        sizes = covariance @ design.T @ value
+        left = value - design @ sizes
+        return sizes, covariance * max(1.0, float(left @ left) / max(value.size - len(shapes), 1))
 
     def separate(self, shape: _Shape, others: Sequence[_Shape]) -> bool:
         """Tell whether a shape can be told from others."""
@@ -153,7 +156,9 @@ def compare_profiles(before: xr.Dataset, after: xr.Dataset, *, level: float, tes
     -----
     With d the difference of the profiles, C the sum of their covariances and L the shapes that are not judged, a further shape e has the
     size and the uncertainty of generalised least squares on [L, e]. The largest ratio of both is tested with Student's t and Bonferroni's
-    bound for the family; a shape beyond the level joins L, and the search goes on. At most half of the positions can stand out.
+    bound for the family; a shape beyond the level joins L, and the search goes on. At most half of the positions can stand out. Where
+    [L, e] leaves more than the covariances allow, as the shapes of a thermal state are not exact, all uncertainties are widened by the
+    root of chi-squared over its degrees of freedom (Birge 1932, Phys. Rev. 40, 207).
     """
     difference, left_out = _difference(before, after)
     positions = np.unique(difference.position_mm)
