@@ -9,14 +9,17 @@ compensated again, with the logged air and with any temperature of the axis.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
 import ref_index
-import xarray as xr
 
 from interferometry._typing import Array
 from interferometry.contract import check_dataset
 from interferometry.errors import InterferometryError
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 #: Vacuum wavelength of the stabilised HeNe laser in nm, as genuine files imply it (632.990616 .. 632.990634).
 VACUUM_WAVELENGTH_NM = 632.990625

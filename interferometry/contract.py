@@ -5,9 +5,12 @@ A contract maps the name of a variable to ``(dims, units, kind)``, kind being a 
 
 from __future__ import annotations
 
-import xarray as xr
+from typing import TYPE_CHECKING
 
 from interferometry.errors import InterferometryError
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 Contract = dict[str, tuple[tuple[str, ...], str, str]]
 
@@ -63,6 +66,8 @@ def check_dataset(dataset: xr.Dataset, argument: str) -> None:
     """
     contract, source = _ARGUMENTS[argument]
     remedy = f"give what {source} returns"
+    import xarray as xr
+
     if not isinstance(dataset, xr.Dataset):
         raise InterferometryError(f"{argument} is of type {type(dataset).__name__}, not a Dataset; {remedy}")
     for name, (dims, *_) in contract.items():

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from fusion._typing import Array
-from fusion.alignment.first_order_lag import respond
 from fusion.errors import FusionError
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 #: Names of the air and material quantities that the environment unit of a laser logs.
 ENVIRONMENT = ("air_temperature", "air_pressure", "relative_humidity", "material_temperature")
@@ -75,6 +77,8 @@ class Series:
             return Series(self.seconds, np.concatenate(responses), self.units, self.first)
         values = self.values if self.values.ndim == 2 else self.values[:, None]
         start = None if at_rest is None else np.full(values.shape[1], at_rest)
+        from fusion.alignment.first_order_lag import respond  # compiled: a campaign file is checked without it
+
         response = respond(values, self.seconds, time_constant_s=time_constant_s, start=start)
         return Series(self.seconds, response.reshape(self.values.shape), self.units)
 
@@ -241,7 +245,7 @@ def sample_noise(samples: Array) -> float:
     The second difference of white noise has six times its variance, and a slow series cancels in it. Its scatter is the normalised
     median absolute deviation (Rousseeuw and Croux 1993, J. Am. Stat. Assoc. 88, 1273), which outliers do not enlarge.
     """
-    return float(stats.median_abs_deviation(np.diff(samples, 2), scale="normal") / np.sqrt(6.0))
+    return float(scipy.stats.median_abs_deviation(np.diff(samples, 2), scale="normal") / np.sqrt(6.0))
 
 
 def read_fused(fused: xr.Dataset) -> Readings:

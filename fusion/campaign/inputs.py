@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ from fusion.campaign.sources import (
 from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones
 from fusion.errors import FusionError
 from fusion.products.contracts import check
+from fusion.products.notices import counted, left_out_notices, listed
 from fusion.products.results import Notice
 from interferometry.contract import DEVIATIONS
 from interferometry.io.readers import read_deviations, read_environment
@@ -46,8 +47,6 @@ from thermography.registration.lens import read_lens
 from thermography.registration.plan import PlanGrid, read_fiducials
 from thermography.registration.polygon import Polygon, PolygonError
 
-#: Maximum number of omitted items listed in a message; the products hold all of them.
-_NAMED = 5
 #: Smallest test that has a scatter and a drift, and smallest recording that has a rise.
 _LEAST_CYCLES, _LEAST_TARGETS, _LEAST_FRAMES = 2, 2, 2
 
@@ -467,56 +466,6 @@ def _reason(item: Mapping[str, Any]) -> str:
     """Return why a frame was left out without the absolute path that the reader's message starts with."""
     text = str(item["reason"])
     return text.split(f"{Path(item['file']).name}: ", 1)[-1]
-
-
-def left_out_notices(dataset: xr.Dataset, code: str) -> list[Notice]:
-    """Return one notice for each file that counts its rejected lines and lists the first of them.
-
-    Parameters
-    ----------
-    dataset : Dataset
-        Table whose attribute ``left_out`` lists the rejected lines as JSON.
-    code : str
-        Code of the notice.
-    """
-    lines = json.loads(dataset.attrs.get("left_out", "[]"))
-    notices = []
-    for path in dict.fromkeys(item["path"] for item in lines):
-        named = [f"line {item['line']} ({item['value']!r} {item['reason']})" for item in lines if item["path"] == path]
-        notices.append(
-            Notice(
-                code,
-                f"{counted(len(named), 'line')} of {path} left out: {listed(named)}.",
-                f"Correct these lines in {path} and run again; the estimates allow for the gaps.",
-            )
-        )
-    return notices
-
-
-def counted(number: int, noun: str) -> str:
-    """Return a number with its noun, plural unless the number is 1.
-
-    Parameters
-    ----------
-    number : int
-        How many.
-    noun : str
-        In the singular.
-    """
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
-def listed(names: Iterable[str]) -> str:
-    """Return the first names, and how many more there are.
-
-    Parameters
-    ----------
-    names : iterable of str
-        All of them; the first five are listed.
-    """
-    names = list(names)
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return "; ".join(names[:_NAMED]) + more
 
 
 #: A shift by whole quarter hours counts as a wrong time zone where less than this share of the readings lies within the frames.

@@ -13,8 +13,9 @@ import xarray as xr
 from fusion._typing import Array
 from fusion.alignment.align import camera_on_laser_clock
 from fusion.campaign.config import relative_name
-from fusion.campaign.inputs import SourceError, counted, frames_notices, listed
+from fusion.campaign.inputs import SourceError, frames_notices
 from fusion.campaign.sources import CameraInputs
+from fusion.products.notices import counted, listed
 from fusion.products.progress import Report
 from fusion.products.results import Notice
 from thermography.errors import ThermographyError

@@ -12,7 +12,6 @@ import xarray as xr
 
 from fusion.alignment.align import align
 from fusion.alignment.readings import Readings, read_fused
-from fusion.campaign.inputs import counted
 from fusion.campaign.sources import Inputs, LaserInputs, Source
 from fusion.consistency.axis_line import compare_lines
 from fusion.diagnosis.residual_tests import ResidualTests, examine_residual
@@ -28,6 +27,7 @@ from fusion.pipeline.positions import judge_positions, sites_of
 from fusion.pipeline.rise_scale import axis_scale_u, plan_scale_u, scale_coefficients, scale_evidence
 from fusion.products import store
 from fusion.products.grouped import joined
+from fusion.products.notices import counted
 from fusion.products.progress import Report
 from fusion.products.results import Notice, Outcome
 

@@ -9,13 +9,13 @@ import xarray as xr
 
 from fusion.alignment.align import AxisGeometry, align, align_logs
 from fusion.alignment.sensor_line import add_sensor_line
-from fusion.campaign.inputs import counted, listed
 from fusion.campaign.iso_budget import material_by_cycle
 from fusion.campaign.sources import LaserInputs, Source
 from fusion.consistency.place import find_gaps, gap_words, in_gaps
 from fusion.consistency.readings import find_gross_readings
 from fusion.pipeline.iso230.evaluation import evaluate_standard
 from fusion.products.grouped import group, joined
+from fusion.products.notices import counted, listed
 from fusion.products.results import Notice, Outcome
 from fusion.report.wording import moment
 from interferometry import neighbours

@@ -10,8 +10,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from fusion.campaign.config import SurfaceTable, ThermographyTable
-from fusion.campaign.inputs import counted
 from fusion.campaign.sources import CameraInputs
+from fusion.products.notices import counted
 from fusion.products.results import Notice, Outcome
 from thermography.fields.cycle_fields import reference_cycle
 from thermography.fields.surfaces import (

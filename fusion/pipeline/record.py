@@ -9,9 +9,9 @@ import numpy as np
 import xarray as xr
 
 from fusion.campaign.config import Campaign
-from fusion.campaign.inputs import counted, left_out_notices, listed
 from fusion.campaign.record_runs import read_record
 from fusion.effects.thermal import QUASI_STATIC
+from fusion.products.notices import counted, left_out_notices, listed
 from fusion.products.progress import Report
 from fusion.products.results import Notice, Outcome
 from fusion.record.blocks import Record, reduce_record

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from fusion.campaign.inputs import counted
+from fusion.products.notices import counted
 from fusion.products.results import Notice
 
 #: Smallest test whose drift can be modelled and attributed: below, no cycle can be held out and no course be told from chance.

@@ -13,11 +13,11 @@ import numpy as np
 import xarray as xr
 
 from fusion.alignment.align import camera_on_laser_clock
-from fusion.campaign.inputs import counted, listed
 from fusion.campaign.sources import CameraInputs, Source
 from fusion.pipeline.camera import CameraState, clear_frames, examine_camera, survey_campaign
 from fusion.pipeline.radiometry import complete_fields, overridden_parameters
 from fusion.products.contracts import check
+from fusion.products.notices import counted, listed
 from fusion.products.progress import Report
 from fusion.products.results import Notice, Outcome
 from fusion.products.store import write_atomically

@@ -1,4 +1,7 @@
-"""Products on disk: written whole or not at all, described by the CF conventions, and stamped so that a finished stage is kept."""
+"""Products on disk: written whole or not at all, described by the CF conventions, and stamped so that a finished stage is kept.
+
+xarray, which takes a third of a second to load, is loaded with the first NetCDF file: a finished run is recognised without it.
+"""
 
 from __future__ import annotations
 
@@ -7,18 +10,21 @@ import json
 import math
 import shutil
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
-import xarray as xr
 
 from fusion.errors import FusionError
 from thermography.io import atomic
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 _STAMPS = ".stages/stamps.json"
 #: A product is one Dataset, or a tree of them whose nodes become the groups of one NetCDF file.
-Product = TypeVar("Product", xr.Dataset, xr.DataTree)
+Product = TypeVar("Product", "xr.Dataset", "xr.DataTree")
 
 
 class OutputError(FusionError):
@@ -99,6 +105,8 @@ def write_dataset(path: Path, product: xr.Dataset | xr.DataTree) -> Path:
     OutputError
         If the folder cannot be written to, or its disk has not the room that the product may take.
     """
+    import xarray as xr
+
     tree = xr.DataTree(product) if isinstance(product, xr.Dataset) else product
     _require_room(path, sum(node.to_dataset().nbytes for node in tree.subtree))
 
@@ -152,6 +160,8 @@ def read_dataset(path: Path) -> xr.Dataset:
     path : Path
         Product.
     """
+    import xarray as xr
+
     with xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as dataset:
         return dataset.load()
 
@@ -164,6 +174,8 @@ def read_tree(path: Path) -> xr.DataTree:
     path : Path
         Product.
     """
+    import xarray as xr
+
     with xr.open_datatree(path, engine="h5netcdf", decode_timedelta=False) as tree:
         return tree.load()
 
@@ -224,7 +236,8 @@ class StageStamps:
         self._folder = folder
         self._path = folder / _STAMPS
         self._stamps: dict[str, dict[str, Any]] = {}
-        if self._path.exists():
+        # Without stamps, or with damaged ones, nothing is known to be done.
+        with suppress(FileNotFoundError, ValueError):
             self._stamps = json.loads(self._path.read_text(encoding="utf-8"))
 
     def done(self, stage: str, key: str) -> bool:
@@ -240,6 +253,11 @@ class StageStamps:
     def note(self, stage: str) -> Any:
         """Return what was noted when `stage` was recorded."""
         return self._stamps[stage]["note"]
+
+    def forget(self, stage: str) -> None:
+        """Remove the stamp of `stage`, where there is one, before its files are written anew."""
+        if self._stamps.pop(stage, None) is not None:
+            write_json(self._path, self._stamps)
 
     def record(self, stage: str, key: str, files: Iterable[Path], note: object) -> None:
         """Stamp that `stage` is done from input `key` and wrote `files`; `note` is its share of results.json."""
@@ -300,6 +318,8 @@ def annotate(product: Product, *, title: str, history: str, provenance: Mapping[
     provenance : mapping
         Stored as one JSON text, since NetCDF attributes hold neither mappings nor None.
     """
+    import xarray as xr
+
     described = product.copy()
     for node in described.subtree if isinstance(described, xr.DataTree) else (described,):
         for name, variable in node.variables.items():

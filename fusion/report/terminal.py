@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import rich.table
 from rich.markup import escape
 
-from fusion.attribution.duty_plan import DutyPlanError, Machine, plan_duty, switchings
 from fusion.campaign.quantities import read_quantity
 from fusion.products.results import Results
 from fusion.products.results_axis import RegistrationPart
@@ -146,6 +145,12 @@ def duty_lines(
         If a quantity has no unit, a source no time constant, or no schedule is possible.
     """
     named = [_source(text) for text in sources]
+    from fusion.attribution.duty_plan import (
+        Machine,
+        plan_duty,
+        switchings,
+    )  # no other summary needs them
+
     machine = Machine(
         sources=tuple(name for name, _ in named),
         time_constants_s=tuple(seconds for _, seconds in named),
@@ -167,6 +172,8 @@ def duty_lines(
 
 def _source(text: str) -> tuple[str, float]:
     """Return name and time constant (s) of a heat source such as ``"spindle=40 min"``."""
+    from fusion.attribution.duty_plan import DutyPlanError
+
     name, equals, time_constant = text.partition("=")
     if not equals or not name.strip():
         raise DutyPlanError(

@@ -11,13 +11,14 @@ import numpy as np
 
 from fusion.alignment.align import camera_on_laser_clock
 from fusion.campaign.config import Campaign, load_campaign
-from fusion.campaign.inputs import counted, read_source
+from fusion.campaign.inputs import read_source
 from fusion.campaign.logged_tables import read_drivers
 from fusion.campaign.sources import CameraInputs, Inputs, LaserInputs
 from fusion.consistency.checks import Check, ContradictionError, open_doubts, refuse_contradictions
 from fusion.errors import FusionError
 from fusion.pipeline import record as record_stage
 from fusion.pipeline.consistency import check_source
+from fusion.products.notices import counted
 from fusion.products.results import Notice
 from fusion.starting.time_bars import Recording, time_bars
 from interferometry.errors import InterferometryError

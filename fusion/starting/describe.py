@@ -5,14 +5,11 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 
-from fusion.attribution.thermal_modes import read_regions
-from fusion.campaign.config import Campaign, load_campaign
-from fusion.campaign.inputs import counted, left_out_notices
-from fusion.campaign.logged_tables import read_drivers
+from fusion.products.notices import counted, left_out_notices
 from fusion.report.wording import join, moment, print_unit
 from fusion.starting.kinds import Kind, Recognised, is_displacement, is_temperature, is_time
 from interferometry.inspection import describe_test
@@ -21,6 +18,11 @@ from interferometry.io.readers import read_deviations, read_environment
 from thermography.inspection import describe_stack, inspect_file
 from thermography.registration.lens import read_lens
 from thermography.registration.plan import read_fiducials
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from fusion.campaign.config import Campaign
 
 
 def describe_file(found: Recognised) -> list[str]:
@@ -51,12 +53,16 @@ def describe_file(found: Recognised) -> list[str]:
     if found.kind is Kind.ENVIRONMENT:
         return _describe_log(path, "environment", read_environment(path))
     if found.kind is Kind.DRIVERS:
+        from fusion.campaign.logged_tables import read_drivers
+
         return _describe_log(path, "drivers", read_drivers(path))
     if found.kind is Kind.RECORD:
         return _describe_record(path, found.headings)
     if found.kind is Kind.FIDUCIALS:
         return _describe_fiducials(path)
     if found.kind is Kind.REGIONS:
+        from fusion.attribution.thermal_modes import read_regions
+
         regions = read_regions(path)
         return [f"{path}: {counted(len(regions), 'region')} of the plan: {join([region.name for region in regions])}"]
     if found.kind is Kind.LENS:
@@ -64,6 +70,8 @@ def describe_file(found: Recognised) -> list[str]:
         column, row = lens.principal_point_px
         return [f"{path}: lens, focal length {lens.focal_length_px:.1f} px, centre {column:.1f}, {row:.1f} px"]
     if found.kind is Kind.CAMPAIGN:
+        from fusion.campaign.config import load_campaign
+
         return _describe_campaign(load_campaign(path))
     content = tomllib.loads(path.read_text(encoding="utf-8"))
     title = content.get("campaign", {}).get("title", "")

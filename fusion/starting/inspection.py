@@ -9,13 +9,11 @@ from typing import Any
 
 from fusion.errors import FusionError
 from fusion.products.store import write_atomically
-from fusion.starting.describe import describe_file
 from fusion.starting.folder import input_files
 from fusion.starting.kinds import Kind, recognise
-from fusion.starting.series import describe_series
 from interferometry.errors import InterferometryError
 from thermography.errors import ThermographyError
-from thermography.inspection import is_flir_file, thumbnail
+from thermography.inspection import inspect_file, is_flir_file, thumbnail
 
 #: Thermal files of one folder and ending that are described one by one; more are a series.
 _ONE_BY_ONE = 3
@@ -147,6 +145,10 @@ def _inspect(path: Path, *, named: bool) -> Inspected:
         kind = found.kind
         if kind is Kind.UNKNOWN:
             return Inspected(str(path), kind, fault=found.reason, named=named)
+        if kind is Kind.FRAMES:
+            return Inspected(str(path), kind, tuple(inspect_file(path).lines()), named=named)
+        from fusion.starting.describe import describe_file  # reads everything else: frames are described without it
+
         return Inspected(str(path), kind, tuple(describe_file(found)), named=named)
     except (FusionError, ThermographyError, InterferometryError) as error:
         fault = str(error).removeprefix(str(path)).lstrip(":, ")
@@ -157,6 +159,8 @@ def _inspect(path: Path, *, named: bool) -> Inspected:
 
 def _inspect_series(paths: Sequence[Path], *, label: str) -> Inspected:
     """Sum up a series of thermal files."""
+    from fusion.starting.series import describe_series
+
     try:
         return Inspected(label, Kind.FRAMES, tuple(describe_series(paths, label=label)))
     except ThermographyError as error:

@@ -12,15 +12,9 @@ from pathlib import Path
 
 from fusion.campaign.quantities import unit_name
 from interferometry.errors import InterferometryError
-from interferometry.io.delimited import read_grids
-from interferometry.io.ecmc import is_ecmc_log
 from interferometry.io.encodings import decode_text
 from interferometry.io.faults import LaserFormatError
 from interferometry.io.headings import CHINESE_WORDS
-from interferometry.io.long_table import find_long_table
-from interferometry.io.readers import is_environment_log, read_deviations
-from interferometry.io.wide_table import find_wide_table
-from interferometry.io.workbook import is_workbook, read_sheets
 from thermography.inspection import is_flir_file
 from thermography.io.flir import index_frames
 from thermography.io.frame_readers import find_reader
@@ -101,6 +95,9 @@ def recognise(path: Path) -> Recognised:
     text = _text_start(path)
     if text is not None and ("camera_matrix" in text or "cameraMatrix" in text):
         return Recognised(path, Kind.LENS)
+    # The readers of tables load what frames do not need.
+    from interferometry.io.readers import is_environment_log, read_deviations
+
     try:
         headings = _headings(text) if text is not None else _sheet_headings(path)
         kind = _by_headings(headings)
@@ -163,6 +160,11 @@ def is_time(heading: str) -> bool:
 
 def _holds_deviations(path: Path) -> bool:
     """Whether a file has the columns of deviations, whatever is in them; where not, its reader says what is missing."""
+    from interferometry.io.delimited import read_grids
+    from interferometry.io.ecmc import is_ecmc_log
+    from interferometry.io.long_table import find_long_table
+    from interferometry.io.wide_table import find_wide_table
+
     with path.open("rb") as stream:
         start = stream.read(4096)
     if b"HEADER::" in start or is_ecmc_log(start):
@@ -237,6 +239,8 @@ def _is_record(headings: tuple[str, ...]) -> bool:
 
 def _sheet_headings(path: Path) -> tuple[str, ...]:
     """Return the headings of the first sheet of a spreadsheet; none where the file is neither that nor text."""
+    from interferometry.io.workbook import is_workbook, read_sheets
+
     content = path.read_bytes()
     if not is_workbook(content):
         return ()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fusion.campaign.inputs import counted, listed
+from fusion.products.notices import counted, listed
 from fusion.report.wording import duration, join, moment
 from fusion.starting.time_bars import Recording
 from thermography.errors import ThermographyError

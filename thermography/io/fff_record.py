@@ -33,9 +33,9 @@ from thermography.io.frame import (
     SampleLocation,
     Segments,
 )
-from thermography.io.png16 import SIGNATURE, PngError, decode_png
 
 MAGIC = b"FFF\0"
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 HEADER_SIZE = 0x40
 ENTRY_SIZE = 32
 CAMERA_RECORD = 0x20
@@ -500,7 +500,7 @@ def locate_samples(source: FffSource, directory: Directory) -> SampleLocation:
     if not 0 < rows * columns <= _MAX_PIXELS:
         raise source.error(offset + 2, f"1 to {_MAX_PIXELS} pixels", f"{columns} x {rows}")
     encoding: Encoding = "raw"
-    if head[RAW_HEADER_SIZE:] == SIGNATURE:
+    if head[RAW_HEADER_SIZE:] == PNG_SIGNATURE:
         encoding = "png"
     elif head[RAW_HEADER_SIZE : RAW_HEADER_SIZE + 4] == b"\xff\xd8\xff\xf7":
         encoding = "jpegls"
@@ -576,6 +576,8 @@ def _decode(source: FffSource, samples: SampleLocation, data: memoryview) -> NDA
     packed = bytes(data)
     if samples.encoding == "jpegls":
         return _decode_jpegls(source, samples, packed)
+    from thermography.io.png16 import PngError, decode_png  # compiled: loaded with the first PNG
+
     try:
         counts = decode_png(packed, samples.shape)
     except PngError as error:

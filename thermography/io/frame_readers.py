@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from thermography.errors import ThermographyError
-from thermography.io.array_frames import NetcdfReader, NumpyReader, TiffReader
 from thermography.io.flir import FlirReader
 from thermography.io.frame import FrameReference, RejectedFrame
 from thermography.io.frame_index.frame_list import FrameList, FrameRun, order_by_time
@@ -70,6 +69,8 @@ def readers() -> tuple[FrameReader, ...]:
     FrameReaderError
         A plug-in cannot be imported or does not keep the protocol.
     """
+    from thermography.io.array_frames import NetcdfReader, NumpyReader, TiffReader  # FLIR files are read without them
+
     found: list[FrameReader] = []
     for entry in entry_points(group=ENTRY_POINT_GROUP):
         try:

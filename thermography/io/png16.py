@@ -14,8 +14,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from thermography.errors import ThermographyError
+from thermography.io.fff_record import PNG_SIGNATURE
 
-SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _GREY_16_BIT = (16, 0, 0, 0, 0)
 _BYTES_PER_PIXEL = 2
 
@@ -66,8 +66,8 @@ def decode_png(data: bytes, shape: tuple[int, int]) -> NDArray[np.uint16]:
 
 def _image_data(data: bytes, shape: tuple[int, int]) -> list[bytes]:
     """Return the contents of the IDAT chunks after checking every chunk's length and CRC."""
-    pieces, start = [], len(SIGNATURE)
-    if not data.startswith(SIGNATURE):
+    pieces, start = [], len(PNG_SIGNATURE)
+    if not data.startswith(PNG_SIGNATURE):
         raise PngError("the signature of a PNG", data[:8].hex(" "))
     while True:
         if start + 12 > len(data):
@@ -78,7 +78,7 @@ def _image_data(data: bytes, shape: tuple[int, int]) -> list[bytes]:
             raise PngError(f"{length} bytes in PNG chunk {kind!r}", f"{max(len(data) - start - 12, 0)} before the end")
         if zlib.crc32(data[start + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
             raise PngError(f"PNG chunk {kind!r} with its CRC", "another one: the samples are damaged")
-        if start == len(SIGNATURE):
+        if start == len(PNG_SIGNATURE):
             header = struct.unpack_from(">2I5B", data, start + 8) if kind == b"IHDR" and length == 13 else None
             expected = (shape[1], shape[0], *_GREY_16_BIT)
             if header != expected:

@@ -11,11 +11,12 @@ import numpy as np
 import xarray as xr
 
 from fusion.campaign.config import Campaign, CampaignError, load_campaign
-from fusion.campaign.inputs import left_out_notices, read_laser
+from fusion.campaign.inputs import read_laser
 from fusion.campaign.iso_budget import Origin, StatedBudget, material_by_cycle
 from fusion.pipeline.iso230.evaluation import evaluate_standard
 from fusion.pipeline.iso230.sheet import complete_sheet
 from fusion.products.grouped import joined
+from fusion.products.notices import left_out_notices
 from fusion.products.results import read_results
 from fusion.products.results_axis import Iso230Part
 from fusion.products.store import plain, read_dataset

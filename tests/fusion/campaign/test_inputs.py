@@ -10,7 +10,7 @@ import pytest
 
 from fusion.alignment.align import AlignmentError
 from fusion.campaign.config import load_campaign
-from fusion.campaign.inputs import SourceError, counted, listed, read_source
+from fusion.campaign.inputs import SourceError, read_source
 from fusion.pipeline.interferometry import evaluate_interferometry
 from tests.fusion.campaign_parts import without
 
@@ -119,9 +119,3 @@ def test_a_region_that_cannot_be_used_is_refused_before_the_long_work(copied: Pa
     path.write_text(path.read_text() + f'\n[[thermography.region]]\nname = "chuck"\n{lines}\n')
     with pytest.raises(SourceError, match=message):
         read_source(load_campaign(path))
-
-
-def test_numbers_and_lists_are_words() -> None:
-    assert (counted(1, "frame"), counted(0, "frame")) == ("1 frame", "0 frames")
-    assert listed("abc") == "a; b; c"
-    assert listed(str(k) for k in range(7)) == "0; 1; 2; 3; 4 and 2 more"

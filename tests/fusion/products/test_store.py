@@ -100,6 +100,9 @@ def test_a_stage_is_done_only_for_the_same_input_and_untouched_files(tmp_path: P
     assert stamps.note("fields") == {"rms_mm": 0.1}
     assert not stamps.done("fields", "other key")
     assert not stamps.done("loop", "key")
+    stamps.forget("fields")
+    assert not StageStamps(tmp_path).done("fields", "key")
+    stamps.record("fields", "key", [product], {})
     product.write_bytes(b"touched")
     assert not stamps.done("fields", "key")
     assert (finished_stages(tmp_path), finished_stages(tmp_path / "absent")) == (["fields"], [])

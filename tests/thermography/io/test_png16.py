@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermography.io.png16 import SIGNATURE, PngError, decode_png
+from thermography.io.fff_record import PNG_SIGNATURE
+from thermography.io.png16 import PngError, decode_png
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:
@@ -23,7 +24,7 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
 def _png(shape: tuple[int, int], lines: bytes, *, kind: tuple[int, ...] = (16, 0, 0, 0, 0)) -> bytes:
     """A PNG with a sound structure around lines of any content."""
     header = struct.pack(">2I5B", shape[1], shape[0], *kind)
-    return SIGNATURE + _chunk(b"IHDR", header) + _chunk(b"IDAT", zlib.compress(lines)) + _chunk(b"IEND", b"")
+    return PNG_SIGNATURE + _chunk(b"IHDR", header) + _chunk(b"IDAT", zlib.compress(lines)) + _chunk(b"IEND", b"")
 
 
 @settings(max_examples=200, deadline=None)
@@ -48,7 +49,7 @@ def test_data_in_several_chunks_and_bytes_after_the_end_are_fine() -> None:
     packed = zlib.compress(b"".join(b"\0" + line.tobytes() for line in counts))
     header = _chunk(b"IHDR", struct.pack(">2I5B", 4, 3, 16, 0, 0, 0, 0))
     parts = [_chunk(b"IDAT", packed[:5]), _chunk(b"tEXt", b"a\0b"), _chunk(b"IDAT", packed[5:]), _chunk(b"IEND", b"")]
-    data = SIGNATURE + header + b"".join(parts) + b"padding"
+    data = PNG_SIGNATURE + header + b"".join(parts) + b"padding"
     np.testing.assert_array_equal(decode_png(data, (3, 4)), counts)
 
 
@@ -60,7 +61,7 @@ def test_data_in_several_chunks_and_bytes_after_the_end_are_fine() -> None:
         (_png((2, 3), bytes(14))[:-12], "a PNG that ends with IEND", "bytes without it"),
         (_png((60000, 60000), b""), r"a PNG header .* \(3, 2, 16, 0, 0, 0, 0\)", r"\(60000, 60000, 16, 0, 0, 0, 0\)"),
         (_png((2, 3), bytes(14), kind=(8, 2, 0, 0, 0)), "a PNG header", "\\(3, 2, 8, 2, 0, 0, 0\\)"),
-        (SIGNATURE + _chunk(b"IDAT", b""), "a PNG header", "None"),
+        (PNG_SIGNATURE + _chunk(b"IDAT", b""), "a PNG header", "None"),
         (_png((2, 3), bytes(13)), "PNG data that inflate to 14 bytes", "13"),
         (_png((2, 3), bytes(10_000_000)), "PNG data that inflate to 14 bytes", ""),
         (_png((2, 3), bytes((9, *bytes(13)))), "PNG lines with filters 0 to 4", "another filter"),
