@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
 from fusion.endings import ExitCode, answering, failed_code, interrupt_ends_step
+
+if TYPE_CHECKING:
+    from fusion.products.progress import Report
+    from fusion.products.results import Results
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -120,9 +124,6 @@ def run(
         with _progress(quiet=quiet) as report:
             report("start", 0, 1)
             from fusion.effects.plugins import leave_plugins_out
-            from fusion.pipeline.run import run_campaign
-            from fusion.pipeline.two_campaigns import join_campaigns
-            from fusion.pipeline.two_records import join_records, of_one_kind
             from fusion.report.terminal import summary_table
 
             report("start", 1, 1)
@@ -130,15 +131,14 @@ def run(
             leave_plugins_out()
         if watch:
             _watch(campaigns[0], until_idle_s=until_idle, wanted=wanted, quiet=quiet)
-        records = len(folders) == 2 and of_one_kind(campaigns)
+        join = _joining(campaigns) if len(folders) == 2 else None
         for campaign, folder in folders:
             with _progress(quiet=quiet) as report:
-                results = run_campaign(campaign, folder, resume=resume, scheduler=scheduler, report=report)
+                results = _run_or_keep(campaign, folder, resume=resume, scheduler=scheduler, report=report)
             if not quiet:
                 console.print(summary_table(results))
                 console.print(f"report: {(folder / 'report.html').resolve()}", soft_wrap=True, highlight=False)
-        if len(folders) == 2:
-            join = join_records if records else join_campaigns
+        if join is not None:
             for name, text in join([folder for _, folder in folders], folders[0][1].parent):
                 if not quiet:
                     console.print(f"both campaigns, {name}: {text}", soft_wrap=True, highlight=False)
@@ -160,6 +160,29 @@ def _watch(campaign: Path, *, until_idle_s: float | None, wanted: str, quiet: bo
                 errors.print(f"thermofuse: {warning}", highlight=False, markup=False)
             if state.cycle is not None and not quiet:
                 console.print(live_line(state), soft_wrap=True, highlight=False, markup=False)
+
+
+def _run_or_keep(campaign: Path, folder: Path, *, resume: bool, scheduler: str | None, report: Report) -> Results:
+    """Run a campaign, or read the results of a run that is whole, for which the libraries of the analysis are not loaded."""
+    if resume:
+        from fusion.campaign.config import load_campaign
+        from fusion.pipeline.provenance import kept_results
+
+        kept = kept_results(load_campaign(campaign), folder)
+        if kept is not None:
+            report("run (kept)", 1, 1)
+            return kept
+    from fusion.pipeline.run import run_campaign
+
+    return run_campaign(campaign, folder, resume=resume, scheduler=scheduler, report=report)
+
+
+def _joining(campaigns: list[Path]) -> Callable[[Sequence[Path], Path], Iterable[tuple[str, str]]]:
+    """Return what joins the results of two campaigns, or of two records."""
+    from fusion.pipeline.two_campaigns import join_campaigns
+    from fusion.pipeline.two_records import join_records, of_one_kind
+
+    return join_records if of_one_kind(campaigns) else join_campaigns
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Provenance of a run: versions, inputs with their SHA-256, parameters, times, and the command."""
+"""Provenance of a run: versions, inputs with their SHA-256, parameters, times, and the command; and whether a run is there already."""
 
 from __future__ import annotations
 
@@ -6,16 +6,22 @@ import os
 import platform
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from fusion.campaign.config import Campaign
+from fusion.effects.plugins import plugins
 from fusion.products.progress import Report, silent
-from fusion.products.results import Notice
-from fusion.products.store import file_sha256
+from fusion.products.results import Notice, Results, read_results
+from fusion.products.store import StageStamps, digest, file_sha256
+
+#: Number of the products' layout: stages that were kept in another one are computed again.
+PRODUCT_LAYOUT = 5
+#: The stamp of a whole run, which its last stage gets.
+_REPORT = "report"
 
 #: Packages whose version can change a number in the results.
 _PACKAGES = (
@@ -56,6 +62,70 @@ def hash_inputs(files: Mapping[str, Path], *, report: Report = silent) -> dict[s
         hashed[name] = {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
     report("input files", len(files), len(files))
     return hashed
+
+
+def dependencies() -> tuple[int, dict[str, str], list[dict[str, Any]]]:
+    """Return what every product depends on beside campaign and files: its layout, the versions, and the effects of plug-ins."""
+    return PRODUCT_LAYOUT, versions(), [asdict(plugin) for plugin in plugins()]
+
+
+def stamp_run(
+    stamps: StageStamps, campaign: Campaign, inputs: Mapping[str, Mapping[str, Any]], products: Sequence[Path]
+) -> None:
+    """Stamp that a run is whole, so that `kept_results` knows it again.
+
+    Parameters
+    ----------
+    stamps : StageStamps
+        Of the results folder.
+    campaign : Campaign
+        What was run.
+    inputs : mapping
+        Result of `hash_inputs`, from before the run.
+    products : sequence of Path
+        Everything that the run wrote or kept.
+    """
+    stamps.record(_REPORT, _run_key(campaign), products, {"inputs": inputs})
+
+
+def kept_results(campaign: Campaign, folder: Path) -> Results | None:
+    """Return the results of a whole run of the same campaign from the same input, or None where anything has to be done.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        What is to be run.
+    folder : Path
+        Results folder.
+
+    Notes
+    -----
+    The campaign file's content, the files that its patterns find and their SHA-256, the versions and every product's SHA-256 must be those
+    of the stamp. What is cheap to compare is compared first; a product or an input that was touched but holds the same is the same.
+    """
+    stamps = StageStamps(folder)
+    if not stamps.done(_REPORT, _run_key(campaign)):
+        return None
+    noted, files = stamps.note(_REPORT)["inputs"], campaign.input_files()
+    sizes = {name: path.stat().st_size for name, path in files.items() if path.is_file()}
+    if sizes != {name: known["bytes"] for name, known in noted.items()} or hash_inputs(files) != noted:
+        return None
+    return read_results(folder)
+
+
+def forget_run(stamps: StageStamps) -> None:
+    """Take the stamp of a whole run away, before its products are written anew.
+
+    Parameters
+    ----------
+    stamps : StageStamps
+        Of the results folder.
+    """
+    stamps.forget(_REPORT)
+
+
+def _run_key(campaign: Campaign) -> str:
+    return digest(_REPORT, dependencies(), campaign.model_dump(mode="json", exclude={"path"}))
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,18 @@ from fusion.pipeline import record as record_stage
 from fusion.pipeline.camera import camera_corrected
 from fusion.pipeline.consistency import check_fields, check_fields_alone, check_loop, check_plan, check_source
 from fusion.pipeline.iso230.sheet import complete_sheet
-from fusion.pipeline.provenance import FileState, describe_run, hash_inputs, input_states, note_changes, versions
+from fusion.pipeline.provenance import (
+    FileState,
+    dependencies,
+    describe_run,
+    forget_run,
+    hash_inputs,
+    input_states,
+    kept_results,
+    note_changes,
+    stamp_run,
+    versions,
+)
 from fusion.pipeline.sizes import choose_targets, lacks_for_correlation, lacks_for_model
 from fusion.products.folder import claim, open_folder
 from fusion.products.progress import Report, silent
@@ -50,9 +61,6 @@ FILES = {
 #: What a run writes last.
 PAGES = ("results.json", "provenance.json", "report.html")
 
-#: Number of the products' layout: stages that were kept in another one are computed again.
-PRODUCT_LAYOUT = 5
-
 
 @dataclass
 class Run:
@@ -78,6 +86,8 @@ class Run:
         Parts of results.json and notices of the stages so far.
     seconds, keys : dict
         Wall time (s) and input digest by stage.
+    products : list of Path
+        What the run wrote or kept.
     """
 
     campaign: Campaign
@@ -91,6 +101,7 @@ class Run:
     notices: list[Notice] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     keys: dict[str, str] = field(default_factory=dict)
+    products: list[Path] = field(default_factory=list)
 
     def stage(
         self,
@@ -130,6 +141,7 @@ class Run:
                 name, key, [path], {"parts": outcome.parts, "notices": [vars(item) for item in outcome.notices]}
             )
         self.keys[name] = key
+        self.products.append(path)
         self.parts.update(outcome.parts)
         self.notices.extend(outcome.notices)
         self.seconds[name] = time.monotonic() - begun
@@ -140,10 +152,7 @@ class Run:
         asked = self.campaign.model_dump(mode="json", include=set(tables))
         files = {file: self.inputs[file] for table in tables for file in self.campaign.files_of(table)}
         zone = self.campaign.campaign.time_zone
-        added = [asdict(plugin) for plugin in plugins()]
-        return digest(
-            name, PRODUCT_LAYOUT, versions(), added, zone, asked, files, [self.keys[earlier] for earlier in after]
-        )
+        return digest(name, *dependencies(), zone, asked, files, [self.keys[earlier] for earlier in after])
 
     def checkpoint(self, key: str) -> Path:
         """Return the folder that keeps the finished cycles of a long recording; folders of other inputs are removed."""
@@ -172,7 +181,7 @@ def run_campaign(
     out : str or Path
         Results folder; must be empty or absent unless `resume`.
     resume : bool
-        Keep the stages that were finished from the same input and compute the others.
+        Keep the stages that were finished from the same input and compute the others; a run that is whole is read and nothing written.
     scheduler : str, optional
         Address of a dask scheduler for the per-frame work.
     report : callable
@@ -200,6 +209,9 @@ def run_campaign(
     """
     campaign = load_campaign(path)
     folder = Path(out)
+    if resume and (kept := kept_results(campaign, folder)) is not None:
+        report("run (kept)", 1, 1)
+        return kept
     seen = input_states(campaign)
     report("reading and checking", 0, 1)
     if campaign.record is not None:
@@ -222,7 +234,9 @@ def _start_run(campaign: Campaign, folder: Path, seen: Mapping[str, FileState], 
     claim(folder, *products, *PAGES)
     started = datetime.now(UTC)
     inputs = hash_inputs(campaign.input_files(), report=report)
-    return Run(campaign, folder, report, StageStamps(folder), inputs, seen, started)
+    stamps = StageStamps(folder)
+    forget_run(stamps)
+    return Run(campaign, folder, report, stamps, inputs, seen, started)
 
 
 def _run_instruments(
@@ -349,7 +363,9 @@ def _model(
 
 def _write_maps(run: Run, fields: xr.Dataset) -> None:
     """Write the maps of every cycle as OpenEXR."""
-    claim(run.folder, *(f"maps/{thermal.map_name(cycle)}" for cycle in fields["cycle"].values))
+    names = [f"maps/{thermal.map_name(cycle)}" for cycle in fields["cycle"].values]
+    claim(run.folder, *names)
+    run.products.extend(run.folder / name for name in names)
     thermal.write_exr(run.folder / "maps", fields, report=run.report)
 
 
@@ -358,7 +374,7 @@ def _write_fusion(
 ) -> xr.DataTree:
     """Write fusion.nc: the readings on one clock, with what was found beside them."""
     fusion = run.described(drift_model.join_fusion(fused, modelled, maps, model))
-    write_dataset(run.folder / "fusion.nc", fusion)
+    run.products.append(write_dataset(run.folder / "fusion.nc", fusion))
     return fusion
 
 
@@ -382,5 +398,6 @@ def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
     write_json(run.folder / "results.json", results.as_json())
     write_json(run.folder / "provenance.json", provenance)
     write_text(run.folder / "report.html", render_report(results, provenance, datasets))
+    stamp_run(run.stamps, run.campaign, run.inputs, [*run.products, *(run.folder / name for name in PAGES)])
     run.report("report", 1, 1)
     return results

@@ -33,6 +33,7 @@ def _consoles_follow_the_runner(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_run_ends_with_a_summary_and_the_report(results_folder: Path, campaign_folder: Path, tmp_path: Path) -> None:
     out = shutil.copytree(results_folder, tmp_path / "results")
+    (out / "report.html").unlink()
     result = invoke("run", campaign_folder / "campaign.toml", "--out", out, "--resume")
     assert result.exit_code == 0, result.output
     loop = json.loads((out / "results.json").read_text())["loop"]
@@ -62,6 +63,33 @@ def test_a_run_shows_a_sign_of_life_before_it_loads_the_libraries(campaign_folde
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout == "start ... set()\n", done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "unneeded"),
+    [
+        (["--help"], {"numpy", "xarray"}),
+        (["inspect", "FRAME"], {"xarray", "pandas", "scipy", "numba"}),
+        (["run", "CAMPAIGN", "--out", "RESULTS", "--resume"], {"xarray", "pandas", "scipy.stats", "numba", "bokeh"}),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_a_short_answer_loads_no_library_that_it_does_not_need(
+    arguments: list[str], unneeded: set[str], campaign_folder: Path, results_folder: Path
+) -> None:
+    """Help, one frame, and a run that is whole: loading the libraries of the analysis would take most of the time."""
+    places = {
+        "FRAME": sorted((campaign_folder / "thermal").iterdir())[0],
+        "CAMPAIGN": campaign_folder / "campaign.toml",
+        "RESULTS": results_folder,
+    }
+    code = (
+        "import sys, fusion.cli as cli\n"
+        f"cli.app({[str(places.get(word, word)) for word in arguments]!r}, standalone_mode=False)\n"
+        f"print('loaded', sorted({unneeded!r} & set(sys.modules)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.endswith("loaded []\n"), done.stdout[-300:] + done.stderr
 
 
 def test_bad_input_is_one_paragraph_without_a_traceback(
@@ -99,7 +127,10 @@ def test_stopping_tells_what_is_kept_and_how_to_go_on(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("fusion.pipeline.run.run_campaign", stopped)
-    for out, kept in ((results_folder, "fields, deviations, correlation, model"), (tmp_path, "no finished stage")):
+    for out, kept in (
+        (results_folder, "fields, deviations, correlation, model, report"),
+        (tmp_path, "no finished stage"),
+    ):
         result = invoke("run", tmp_path / "campaign.toml", "--out", out)
         assert result.exit_code == 130
         assert (

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 import sys
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
 from fusion.campaign.config import load_campaign
-from fusion.pipeline.provenance import FileState, describe_run, hash_inputs, input_states, note_changes, versions
+from fusion.pipeline.provenance import (
+    FileState,
+    describe_run,
+    hash_inputs,
+    input_states,
+    kept_results,
+    note_changes,
+    versions,
+)
 
 
 def test_inputs_are_hashed_by_name(tmp_path: Path) -> None:
@@ -75,3 +85,75 @@ def test_the_state_of_inputs_is_seen_without_reading_them(copied: Path) -> None:
     removed.unlink()
     (notice,) = note_changes(before, input_states(campaign))
     assert f"1 changed (laser.csv); 1 removed (thermal/{removed.name})" in notice.message
+
+
+def _other_input(campaign: Path, out: Path) -> None:
+    """One digit of a reading: the size of the file stays."""
+    text = (campaign / "laser.csv").read_text()
+    (campaign / "laser.csv").write_text(text[:-3] + ("1" if text[-3] != "1" else "2") + text[-2:])
+
+
+def _another_frame(campaign: Path, out: Path) -> None:
+    frame = sorted((campaign / "thermal").iterdir())[0]
+    shutil.copy(frame, frame.with_name("IR_9999.jpg"))
+
+
+def _a_frame_less(campaign: Path, out: Path) -> None:
+    sorted((campaign / "thermal").iterdir())[0].unlink()
+
+
+def _other_title(campaign: Path, out: Path) -> None:
+    path = campaign / "campaign.toml"
+    path.write_text(path.read_text().replace("Small campaign", "Another title"))
+
+
+def _missing_page(campaign: Path, out: Path) -> None:
+    (out / "report.html").unlink()
+
+
+def _damaged_map(campaign: Path, out: Path) -> None:
+    path = out / "maps" / "cycle_0003.exr"
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+
+
+def _missing_stage(campaign: Path, out: Path) -> None:
+    (out / ".stages" / "model.nc").unlink()
+
+
+def _damaged_stamps(campaign: Path, out: Path) -> None:
+    (out / ".stages" / "stamps.json").write_text('{"report": ')
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        _other_input,
+        _another_frame,
+        _a_frame_less,
+        _other_title,
+        _missing_page,
+        _damaged_map,
+        _missing_stage,
+        _damaged_stamps,
+    ],
+)
+def test_a_run_is_whole_only_as_long_as_nothing_changed(
+    change: Callable[[Path, Path], None], results_folder: Path, copied: Path, tmp_path: Path
+) -> None:
+    out = shutil.copytree(results_folder, tmp_path / "results")
+    assert kept_results(load_campaign(copied / "campaign.toml"), out) is not None
+    change(copied, out)
+    assert kept_results(load_campaign(copied / "campaign.toml"), out) is None
+
+
+def test_a_run_of_another_version_is_not_whole(
+    results_folder: Path, campaign_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign = load_campaign(campaign_folder / "campaign.toml")
+    assert kept_results(campaign, results_folder) is not None
+    monkeypatch.setattr("fusion.pipeline.provenance.versions", lambda: {"thermofuse": "0.0.1"})
+    assert kept_results(campaign, results_folder) is None
+
+
+def test_a_folder_without_a_run_keeps_nothing(campaign_folder: Path, tmp_path: Path) -> None:
+    assert kept_results(load_campaign(campaign_folder / "campaign.toml"), tmp_path / "absent") is None

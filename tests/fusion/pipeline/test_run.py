@@ -89,7 +89,9 @@ def test_provenance_names_inputs_versions_and_no_machine(results_folder: Path, c
 def test_a_resumed_run_redoes_only_what_changed(results_folder: Path, copied: Path, tmp_path: Path) -> None:
     out = shutil.copytree(results_folder, tmp_path / "results")
     done: list[str] = []
+    (out / "report.html").unlink()
     run_campaign(copied / "campaign.toml", out, resume=True, report=lambda label, part, total: done.append(label))
+    assert (out / "report.html").is_file()
     assert "frames" not in done and "correlation" not in done and "closed loop" not in done
     assert "thermal fields (kept)" in done
 
@@ -101,6 +103,18 @@ def test_a_resumed_run_redoes_only_what_changed(results_folder: Path, copied: Pa
     )
     assert "frames" not in done and "correlation" not in done and "closed loop" in done
     assert results.loop is not None and results.loop.declared == ("axis_expansion",)
+
+
+def test_a_whole_run_is_read_and_nothing_written(results_folder: Path, copied: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(results_folder, tmp_path / "results")
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    told: list[str] = []
+    results = run_campaign(
+        copied / "campaign.toml", out, resume=True, report=lambda label, part, total: told.append(label)
+    )
+    assert told == ["run (kept)"]
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
+    assert results.as_json() == json.loads((out / "results.json").read_text())
 
 
 def test_an_older_result_is_not_overwritten(results_folder: Path, campaign_folder: Path) -> None:
