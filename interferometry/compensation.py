@@ -310,6 +310,7 @@ def compensate(
     An instrument that used an index of air of 1.00027 throughout, on a reading at 1 m:
 
     >>> import numpy as np
+    >>> import xarray as xr
     >>> from interferometry.deviations import build_deviations
     >>> time = np.array([[["2026-03-09T06:30"], ["2026-03-09T06:31"]]], "datetime64[ns]")
     >>> test = build_deviations([1], [1], np.array([1000.0]), np.zeros((1, 2, 1)), time)
