@@ -28,6 +28,7 @@ from thermography.io.fff_record import (
     MAX_SLOTS,
     MAXIMUM_CAMERA_INFO,
     PARAMETER_BYTES,
+    PNG_SIGNATURE,
     RAW_HEADER_SIZE,
     RAW_RECORD,
     SENSOR_NAME,
@@ -44,7 +45,6 @@ from thermography.io.fff_record import (
 from thermography.io.frame import CameraParameters
 from thermography.io.frame_index.flir_frame import FlirFrameReference
 from thermography.io.frame_index.frame_list import FrameRun
-from thermography.io.png16 import SIGNATURE
 
 #: A run is looked for where the file has room for this number of frames: fewer are read one by one before the compiled code is loaded.
 FEWEST_FRAMES = 256
@@ -53,9 +53,9 @@ _FIRST_BATCH, _LARGEST_BATCH = 8, 256
 #: Headers this close together are read as one piece, bytes.
 _PIECE = 1 << 14
 #: Start of the raw-image record that is read: its header, and by what packed samples are recognised.
-_RAW_HEAD = RAW_HEADER_SIZE + len(SIGNATURE)
+_RAW_HEAD = RAW_HEADER_SIZE + len(PNG_SIGNATURE)
 #: Rows as `_raw_fits` compares them: the samples of PNG and JPEG-LS begin so.
-_PNG_START = np.frombuffer(bytes(RAW_HEADER_SIZE) + SIGNATURE, np.uint8)
+_PNG_START = np.frombuffer(bytes(RAW_HEADER_SIZE) + PNG_SIGNATURE, np.uint8)
 _JPEGLS_START = np.frombuffer(bytes(RAW_HEADER_SIZE) + b"\xff\xd8\xff\xf7", np.uint8)
 _NO_TIME = np.iinfo(np.int64).min
 
