@@ -27,7 +27,6 @@ from thermography.io.fff_record import (
 from thermography.io.frame import FlirFormatError, Frame, FrameReference, RejectedFrame, Segments
 from thermography.io.frame_index.flir_frame import FlirFrameReference
 from thermography.io.frame_index.frame_list import FrameList, FrameRun, order_by_time
-from thermography.io.frame_index.header_scan import scan_run
 
 
 class FlirReader:
@@ -268,7 +267,7 @@ def _walk_sequence(
             source = FffSource(file, path, ((start, end - start),))
             reference = _reference(source, directory, index)
             yield replace(reference, notes=notes + reference.notes) if notes else reference
-            run = scan_run(file, reference, size) if end == following < size else None
+            run = _scan(file, reference, size) if end == following < size else None
         except FlirFormatError as error:
             yield RejectedFrame(path, index, str(error))
             end = following = _find_header(file, start + HEADER_SIZE, size)
@@ -283,6 +282,13 @@ def _walk_sequence(
         elif end < following:
             notes = (f"{following - end} bytes of padding before the frame were skipped",)
         start, index = following, index + 1
+
+
+def _scan(file: BinaryIO, reference: FlirFrameReference, size: int) -> FrameRun | None:
+    """Return the run of frames that follow one and are laid out as it is; a file of one frame is read without the compiled scan."""
+    from thermography.io.frame_index.header_scan import scan_run
+
+    return scan_run(file, reference, size)
 
 
 def _holds_data(file: BinaryIO, offset: int, length: int) -> bool:
