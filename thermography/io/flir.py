@@ -11,7 +11,7 @@ import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 from thermography.io.fff_record import (
     HEADER_SIZE,
@@ -27,6 +27,9 @@ from thermography.io.fff_record import (
 from thermography.io.frame import FlirFormatError, Frame, FrameReference, RejectedFrame, Segments
 from thermography.io.frame_index.flir_frame import FlirFrameReference
 from thermography.io.frame_index.frame_list import FrameList, FrameRun, order_by_time
+
+if TYPE_CHECKING:
+    from thermography.io.frame_index.header_scan import FlirRun
 
 
 class FlirReader:
@@ -284,7 +287,7 @@ def _walk_sequence(
         start, index = following, index + 1
 
 
-def _scan(file: BinaryIO, reference: FlirFrameReference, size: int) -> FrameRun | None:
+def _scan(file: BinaryIO, reference: FlirFrameReference, size: int) -> FlirRun | None:
     """Return the run of frames that follow one and are laid out as it is; a file of one frame is read without the compiled scan."""
     from thermography.io.frame_index.header_scan import scan_run
 
