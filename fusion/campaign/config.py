@@ -36,6 +36,7 @@ from fusion.campaign.value_types import (
     PartsPerMillion,
     PartsPerMillionU,
     PixelPatch,
+    Pixels,
     PositiveMillimetres,
     PositiveSeconds,
     Seconds,
@@ -350,17 +351,24 @@ class AxisTable(_Table):
 
 
 class PlanTable(_Table):
-    """``[plan]``: the table plan in millimetres and its fiducials."""
+    """``[plan]``: the table plan in millimetres and its fiducials; or, by ``registration = "pixels"``, the picture itself."""
 
-    size_mm: tuple[PositiveMillimetres, PositiveMillimetres] = Field(alias="size")
+    registration: Literal["fiducials", "pixels"] = "fiducials"
+    size_mm: tuple[PositiveMillimetres, PositiveMillimetres] | None = Field(default=None, alias="size")
     cell_size_mm: PositiveMillimetres | None = Field(default=None, alias="cell_size")
+    cell_px: Pixels | None = None
     fiducials: ExistingFile | None = None
     regions: ExistingFile | None = None
     axis: AxisTable | None = None
 
+    @property
+    def in_pixels(self) -> bool:
+        """Whether the picture itself is the plan, whose lengths are then in px."""
+        return self.registration == "pixels"
+
     @model_validator(mode="after")
     def _cells_fit(self) -> PlanTable:
-        if self.cell_size_mm is None:
+        if self.cell_size_mm is None or self.size_mm is None:
             return self
         along = [length / self.cell_size_mm for length in self.size_mm]
         cells = along[0] * along[1]

@@ -40,10 +40,12 @@ from fusion.products.notices import counted, left_out_notices, listed
 from fusion.products.results import Notice
 from interferometry.contract import DEVIATIONS
 from interferometry.io.readers import read_deviations, read_environment
+from thermography.errors import ThermographyError
 from thermography.io.frame import FrameReference
 from thermography.io.frame_index.frame_list import FrameList, frame_times
 from thermography.io.frame_readers import index_recordings
 from thermography.registration.lens import read_lens
+from thermography.registration.picture import picture_grid
 from thermography.registration.plan import PlanGrid, read_fiducials
 from thermography.registration.polygon import Polygon, PolygonError
 
@@ -196,16 +198,14 @@ def _refuse_mixed_zones(campaign: Campaign, read: Mapping[str, Any]) -> None:
 def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
     """Read what `CameraInputs` holds; without cycles of a laser, windows of the camera's time stand for them."""
     thermography, plan = campaign.thermography, campaign.plan
-    assert (
-        thermography is not None and plan is not None and plan.fiducials is not None and plan.cell_size_mm is not None
-    )
+    assert thermography is not None and plan is not None
     frames, rejected = _read_frames(campaign)
     camera: dict[str, Any] = {
         "thermography": thermography,
         "plan": plan,
-        "grid": PlanGrid(*plan.size_mm, plan.cell_size_mm),
-        "fiducials": read_fiducials(campaign.resolve(plan.fiducials)),
-        "fiducials_file": plan.fiducials,
+        "grid": _grid(campaign, frames, rejected),
+        "fiducials": [] if plan.fiducials is None else read_fiducials(campaign.resolve(plan.fiducials)),
+        "fiducials_file": plan.fiducials or "",
         "frames": frames,
         "frames_rejected": rejected,
         "cycles": cycles,
@@ -217,6 +217,20 @@ def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:
         times = camera_on_laser_clock(frame_times(frames), thermography.clock_offset_s or 0.0)
         camera["cycles"] = cycles_of_frames(times, thermography.window_s or usual_window_s(times))
     return camera
+
+
+def _grid(campaign: Campaign, frames: Sequence[FrameReference], rejected: Sequence[Mapping[str, Any]]) -> PlanGrid:
+    """The cells of the plan: as the campaign states them in mm, or in pixels of the frames."""
+    plan = campaign.plan
+    assert plan is not None
+    if plan.in_pixels:
+        _raise_if_no_rise(campaign, frames, rejected)
+        try:
+            return picture_grid(frames[0].shape, plan.cell_px)
+        except ThermographyError as error:
+            raise SourceError(f"{campaign.path}: plan.{error}") from None
+    assert plan.size_mm is not None and plan.cell_size_mm is not None
+    return PlanGrid(*plan.size_mm, plan.cell_size_mm)
 
 
 def _read_frames(campaign: Campaign) -> tuple[FrameList, list[dict[str, Any]]]:
@@ -376,9 +390,10 @@ def _raise_if_no_rise(
     """Raise if too few frames are left to show a rise."""
     if len(frames) < _LEAST_FRAMES:
         reasons = listed(_reason(item) for item in rejected) if rejected else "none rejected"
+        single = f", or look at it with thermofuse inspect {campaign.frame_paths()[0]}" if frames else ""
         raise SourceError(
-            f"{campaign.path}: {counted(len(frames), 'usable frame')}, at least {_LEAST_FRAMES} are needed "
-            f"({reasons}); check thermography.frames"
+            f"{campaign.path}: {counted(len(frames), 'usable frame')}, at least {_LEAST_FRAMES} are needed, as a rise is the change since "
+            f"the first ({reasons}); check thermography.frames{single}"
         )
 
 

@@ -9,6 +9,14 @@ from fusion.campaign.messages import Place
 
 #: Keys of ``[plan]`` without which frames cannot be brought to it.
 _NEEDED_BY_FRAMES = ("cell_size", "fiducials")
+#: Keys of ``[plan]`` in millimetres, which a plan of pixels does not have, and why not.
+_IN_MILLIMETRES = {
+    "size": "the plan is the whole picture",
+    "cell_size": 'cells are in pixels: write cell_px = "4 px"',
+    "fiducials": "fiducials bring a plan to millimetres",
+    "regions": "its corners are in millimetres",
+    "axis": "the measured line is in millimetres",
+}
 
 
 def check_tables(content: Mapping[str, Any], place: Place) -> list[str]:
@@ -55,7 +63,13 @@ def _check_plan(content: Mapping[str, Any], place: Place) -> list[str]:
     plan = content.get("plan")
     if not isinstance(plan, dict):
         return []
-    needed = list(_NEEDED_BY_FRAMES) if "thermography" in content else []
+    if plan.get("registration") == "pixels":
+        return _check_plan_of_pixels(content, plan, place)
+    needed = ["size", *(_NEEDED_BY_FRAMES if "thermography" in content else ())]
+    if "cell_px" in plan:
+        return [
+            f'{place(("plan", "cell_px"))}: cell_px belongs to a plan of pixels; write registration = "pixels", or cell_size in mm'
+        ]
     frames = content.get("thermography")
     moving = isinstance(frames, dict) and frames.get("table") == "moving"
     if moving or ("interferometry" in content and ("thermography" in content or "sensors" in content)):
@@ -65,6 +79,47 @@ def _check_plan(content: Mapping[str, Any], place: Place) -> list[str]:
         for name in needed
         if name not in plan
     ]
+
+
+def _check_plan_of_pixels(content: Mapping[str, Any], plan: Mapping[str, Any], place: Place) -> list[str]:
+    """Return the faults of a plan that is the picture itself: what is in millimetres has no place on it."""
+    faults = [
+        f'{place(("plan", name))}: plan.{name} beside plan.registration = "pixels": {why}; remove one of them'
+        for name, why in _IN_MILLIMETRES.items()
+        if name in plan
+    ]
+    frames = content.get("thermography")
+    if not isinstance(frames, dict):
+        return [
+            *faults,
+            f'{place(("plan", "registration"))}: registration = "pixels" makes the picture of a camera the plan, and there is no '
+            "[thermography]; write size and axis in mm instead",
+        ]
+    remedy = 'write registration = "fiducials" with at least four places on the table that are known in mm'
+    needing = {
+        "interferometry": "[interferometry] needs the measured line on the plan, in mm",
+        "sensors": "[sensors] needs the places of the sensors on the plan, in mm",
+    }
+    faults += [
+        f'{place((name,))}: plan.registration = "pixels", but {why}; {remedy}'
+        for name, why in needing.items()
+        if name in content
+    ]
+    in_millimetres = {
+        "lens": "the calibration of a lens serves to bring a picture to millimetres",
+        "region": "the corners of a region are in mm",
+    }
+    faults += [
+        f'{place(("thermography", name))}: plan.registration = "pixels", but {why}; {remedy}, or remove the key'
+        for name, why in in_millimetres.items()
+        if name in frames
+    ]
+    if frames.get("table") == "moving":
+        faults.append(
+            f'{place(("thermography", "table"))}: plan.registration = "pixels" holds for a table at rest, but table = "moving"; '
+            f"{remedy}, or frames of the table at rest"
+        )
+    return faults
 
 
 def _check_window(content: Mapping[str, Any], place: Place) -> list[str]:

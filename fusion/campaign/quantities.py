@@ -19,11 +19,12 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     "ppm": {"ppb": (1e-3, 0.0), "ppm": (1.0, 0.0), "um/m": (1.0, 0.0), "%": (1e4, 0.0)},
     "ppm/K": {"ppm/K": (1.0, 0.0), "um/m/K": (1.0, 0.0), "1/K": (1e6, 0.0)},
     "mm/min": {"mm/min": (1.0, 0.0), "m/min": (1e3, 0.0), "mm/s": (60.0, 0.0)},
+    "px": {"px": (1.0, 0.0)},
 }  # fmt: skip
 _SPELLINGS = {
     "µm": "um", "μm": "um", "°C": "degC", "℃": "degC", "C": "degC", "°F": "degF", "F": "degF", "sec": "s",
     "µm/m": "um/m", "μm/m": "um/m", "ppm/degC": "ppm/K", "ppm/°C": "ppm/K", "um/(m K)": "um/m/K", "µm/m/K": "um/m/K",
-    "K^-1": "1/K",
+    "K^-1": "1/K", "pixel": "px", "pixels": "px",
 }  # fmt: skip
 #: Units written out, in any case.
 _WORDS = {
@@ -34,11 +35,12 @@ _WORDS = {
 }  # fmt: skip
 _EXAMPLES = {
     "mm": "5 mm", "um": "5 um", "degC": "22 degC", "K": "1 K", "s": "37 s",
-    "ppm": "0.25 ppm", "ppm/K": "11.7 ppm/K", "mm/min": "300 mm/min",
+    "ppm": "0.25 ppm", "ppm/K": "11.7 ppm/K", "mm/min": "300 mm/min", "px": "4 px",
 }  # fmt: skip
 _KINDS = {
     "mm": "a length", "um": "a displacement", "degC": "a temperature", "K": "a temperature difference", "s": "a time",
     "ppm": "a share of a length", "ppm/K": "an expansion coefficient", "mm/min": "a feed rate",
+    "px": "a number of pixels",
 }  # fmt: skip
 #: Between a value and its standard uncertainty.
 _PLUS_MINUS = re.compile(r"\s*(?:\+/?-|±)\s*")
@@ -69,7 +71,7 @@ def conversion(unit: str, target: str) -> tuple[float, float]:
     unit : str
         Unit as it was written.
     target : str
-        Canonical unit: mm, um, degC, K (a difference), s, ppm, ppm/K or mm/min.
+        Canonical unit: mm, um, degC, K (a difference), s, ppm, ppm/K, mm/min or px.
 
     Returns
     -------

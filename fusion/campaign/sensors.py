@@ -63,7 +63,7 @@ def read_sensors(campaign: Campaign) -> ContactSensors | None:
         If a file is no table, a column is no temperature, or names and places do not belong to each other.
     """
     table, plan = campaign.sensors, campaign.plan
-    if table is None or plan is None:
+    if table is None or plan is None or plan.size_mm is None:
         return None
     path = campaign.resolve(table.file)
     logged = bring_to_utc(read_drivers(path), campaign.zone_of("sensors"), file=table.file)

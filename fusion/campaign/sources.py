@@ -24,6 +24,8 @@ from thermography.registration.plan import Fiducial, PlanGrid
 
 #: Lengths of the windows that stand for cycles where no laser gives them, s: what a clock shows, from 10 s to a day.
 _WINDOWS_S = (10.0, 30.0, *(60.0 * m for m in (1, 2, 5, 10, 15, 30)), *(3600.0 * h for h in (1, 2, 4, 8, 24)))
+#: Lengths for a recording that is shorter than that, s.
+_SHORT_WINDOWS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 #: So many windows a recording is divided into at most: as many maps as a reader pages through.
 _MOST_WINDOWS = 60
 
@@ -89,11 +91,15 @@ def usual_window_s(times: NDArray[np.datetime64]) -> float:
     Returns
     -------
     float
-        The shortest of some usual lengths that holds a frame and divides the recording into at most 60 windows.
+        The shortest of some usual lengths that holds a frame and divides the recording into at most 60 windows; of a recording that lasts
+        less than 10 s, shorter, so that it has at least two.
     """
     length_s = float((times[-1] - times[0]) / np.timedelta64(1, "s"))
     between_s = float(np.median(np.diff(times) / np.timedelta64(1, "s"))) if times.size > 1 else 0.0
     least_s = max(between_s, length_s / _MOST_WINDOWS)
+    if 0.0 < length_s < _WINDOWS_S[0]:
+        short = [window for window in _SHORT_WINDOWS_S if window <= length_s] or [length_s]
+        return next((window for window in short if window >= least_s), short[-1])
     return next((window for window in _WINDOWS_S if window >= least_s), _WINDOWS_S[-1])
 
 
@@ -196,7 +202,7 @@ class CameraInputs(Inputs):
     @property
     def travel_mm(self) -> float:
         """Largest distance of the table from where the plan holds, mm: without a laser, up to the length of the plan."""
-        return max(self.plan.size_mm)
+        return max(self.grid.width_mm, self.grid.height_mm)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from fusion.consistency.checks import Check
+from thermography.io.frame import FrameReference
+from thermography.radiometry.planck import calibrate
+from thermography.registration.displacement import image_displacement
+from thermography.registration.picture import picture_grid, register_picture
 
 #: Least share of the listed fiducials that must agree: of a list of this table, most are in view.
 _LEAST_FOUND = 0.5
@@ -19,6 +23,10 @@ _LARGEST_AREA_RATIO = 1.05
 #: Least share of the plan that the fiducials span; beyond them the registration is extrapolated. Discs around a measured line span two
 #: thirds of its table; a plan twice as long and wide as the table leaves a quarter of that.
 _LEAST_SPAN = 0.25
+#: Largest shift of a picture that is its own plan, px: a part that warms shifts the best match of two pictures by up to one.
+_LARGEST_SHIFT_PX = 2.0
+#: Number of frames, spread over the series, that are compared.
+_COMPARED = 8
 _FIGURES = (
     "the place of every temperature on the plan, rises along the measured line, and every cause that follows the field"
 )
@@ -116,6 +124,43 @@ def _span(span: float, file: str) -> Check:
         else f"Check size under [plan], and that {file} belongs to this table; else paint discs over the whole plan.",
         _FIGURES,
     )
+
+
+def check_picture(frames: Sequence[FrameReference]) -> list[Check]:
+    """Check that the picture stays where it is, where the picture itself is the plan.
+
+    Parameters
+    ----------
+    frames : sequence of FrameReference
+        Usable frames, at least one, sorted by time.
+
+    Returns
+    -------
+    list of Check
+        ``camera_place``: the largest shift of the picture against the first frame, in some frames over the series.
+    """
+    chosen = np.unique(np.linspace(0, len(frames) - 1, _COMPARED).round().astype(int))
+    first, *later = (calibrate(frames[k].read_counts(), frames[k].parameters) for k in chosen)
+    registration, grid = register_picture(first.shape), picture_grid(first.shape)
+    shifts_px = [float(np.linalg.norm(image_displacement(first, frame, registration, grid))) for frame in later]
+    measured = [shift for shift in shifts_px if np.isfinite(shift)]
+    largest, blind = max(measured, default=0.0), len(shifts_px) - len(measured)
+    passed = not blind and largest <= _LARGEST_SHIFT_PX
+    compared = f"{len(later)} of {len(frames) - 1} later frames were compared with the first"
+    unlike = f"; in {blind} of them too little is as in the first to tell" if blind else ""
+    return [
+        Check(
+            "camera_place",
+            largest,
+            _LARGEST_SHIFT_PX,
+            passed,
+            f"The picture shifts by up to {largest:.1f} px ({compared}{unlike}).",
+            ""
+            if passed
+            else "Fasten camera and table: without fiducials a cell is a place in the picture, and shows something else when that moves.",
+            _FIGURES,
+        )
+    ]
 
 
 def _diameters(area_ratio: float | None, file: str) -> Check:

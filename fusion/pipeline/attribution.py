@@ -20,6 +20,7 @@ from fusion.campaign.sources import Source
 from fusion.pipeline.rise_scale import place_scale_u, scaled
 from fusion.products.progress import Report
 from fusion.products.results import Outcome
+from thermography.fields.cycle_fields import plan_unit
 from thermography.fields.hotspots import Hotspot, detect_hotspots
 
 _CORRELATION_CELL_MM = 10.0
@@ -100,15 +101,26 @@ def describe_hotspots(fields: xr.Dataset) -> list[dict[str, Any]]:
 def _peak_part(name: str, spot: Hotspot, fields: xr.Dataset) -> dict[str, Any]:
     """Place, area and rise of a hotspot."""
     u = fields["temperature_rise_u"].isel(cycle=-1).sel(x=spot.x_mm, y=spot.y_mm, method="nearest")
+    rise = {"name": name, "peak_rise_K": spot.peak_rise_K, "peak_rise_u_K": float(u)}
+    if plan_unit(fields) == "px":
+        low_x, high_x, low_y, high_y = spot.extent_mm
+        return {
+            **rise,
+            "x_mm": None,
+            "y_mm": None,
+            "x_px": spot.x_mm,
+            "y_px": spot.y_mm,
+            "centroid_x_px": spot.centroid_x_mm,
+            "centroid_y_px": spot.centroid_y_mm,
+            "area_px": {"x_low_px": low_x, "x_high_px": high_x, "y_low_px": low_y, "y_high_px": high_y},
+        }
     return {
-        "name": name,
+        **rise,
         "x_mm": spot.x_mm,
         "y_mm": spot.y_mm,
         "centroid_x_mm": spot.centroid_x_mm,
         "centroid_y_mm": spot.centroid_y_mm,
         "area": area_json(Area(*spot.extent_mm)),
-        "peak_rise_K": spot.peak_rise_K,
-        "peak_rise_u_K": float(u),
     }
 
 

@@ -22,7 +22,7 @@ from fusion.consistency.logs import check_contact_sensors, check_log
 from fusion.consistency.place import check_gaps, check_place
 from fusion.consistency.plan_sensors import check_sensors, compare_sensors
 from fusion.consistency.readings import check_readings
-from fusion.consistency.registration import check_registration
+from fusion.consistency.registration import check_picture, check_registration
 from fusion.consistency.signs import check_signs
 from fusion.consistency.temperature import check_material
 from fusion.pipeline.radiometry import overridden_parameters
@@ -114,7 +114,7 @@ def _compare_sensors(source: CameraInputs, fields: xr.Dataset) -> list[Check]:
 def _extent_along_axis(campaign: Campaign) -> float | None:
     """Extent of the plan along the axis, mm; None where the campaign does not place the axis on a plan."""
     plan = campaign.plan
-    if plan is None or plan.axis is None:
+    if plan is None or plan.axis is None or plan.size_mm is None:
         return None
     x, y = plan.axis.direction
     width_mm, height_mm = plan.size_mm
@@ -193,6 +193,8 @@ def check_plan(source: CameraInputs, registration: Mapping[str, Any]) -> list[Ch
     registration : mapping
         Part ``registration`` of results.json.
     """
+    if source.plan.in_pixels:
+        return check_picture(source.frames)
     return check_registration(registration, file=source.fiducials_file)
 
 

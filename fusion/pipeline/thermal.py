@@ -22,6 +22,7 @@ from fusion.products.progress import Report
 from fusion.products.results import Notice, Outcome
 from fusion.products.store import write_atomically
 from thermography.contract import FIELDS
+from thermography.fields.cycle_fields import in_pixels
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
 from thermography.io.openexr import write_maps
@@ -30,6 +31,7 @@ from thermography.radiometry.overrides import Overrides
 from thermography.radiometry.planck import calibrate
 from thermography.registration.clock_offset import ClockOffset, estimate_clock_offset
 from thermography.registration.evidence import RegistrationError
+from thermography.registration.picture import register_picture
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration, register
 
@@ -94,6 +96,8 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
         ),
     )
     fields = fields.assign_coords(cycle=source.cycles.number)
+    if registration.is_picture:
+        fields = in_pixels(fields)
     completed = complete_fields(source, fields, override)
     fields = check(completed.dataset, FIELDS, name="the fields")
     notices += [*clock_notices, *_registration_notices(registration), *_frame_notices(fields), *completed.notices]
@@ -111,6 +115,8 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
 
 def _register(source: CameraInputs, reference: np.ndarray) -> Registration:
     """Register the plan on the mean of the first frames; a refusal names the file of the fiducials."""
+    if source.plan.in_pixels:
+        return register_picture(reference.shape)
     moving = source.thermography.table == "moving"
     if moving and any(fiducial.is_point for fiducial in source.fiducials):
         raise RegistrationError(
@@ -259,6 +265,10 @@ def pixel_notices(counts: np.ndarray) -> list[Notice]:
 
 def _registration_variables(registration: Registration, reference: np.ndarray) -> xr.Dataset:
     """Return the registration as variables: the fiducials with their errors, the homography, and the frame it was made on."""
+    degrees = {"units": "degC", "units_metadata": "temperature: on_scale"}
+    picture = (("row", "column"), reference.astype("f4"), degrees)
+    if registration.is_picture:
+        return xr.Dataset({"reference_frame": picture})
     names = list(registration.located)
     places = [registration.located[name] for name in names]
     fiducials = [registration.fiducials[name] for name in names]
@@ -272,14 +282,20 @@ def _registration_variables(registration: Registration, reference: np.ndarray) -
     }
     variables: dict[str, Any] = {name: ("fiducial", values, {"units": unit}) for name, (values, unit) in along.items()}
     variables["homography"] = (("plan_axis", "sensor_axis"), registration.homography, {"units": "1"})
-    degrees = {"units": "degC", "units_metadata": "temperature: on_scale"}
-    variables["reference_frame"] = (("row", "column"), reference.astype("f4"), degrees)
+    variables["reference_frame"] = picture
     variables["fiducial_name"] = ("fiducial", names)
     return xr.Dataset(variables)
 
 
 def _registration_part(registration: Registration, source: CameraInputs) -> dict[str, Any]:
     """Return the part ``registration`` of results.json."""
+    if registration.is_picture:
+        return {
+            "rms_mm": None,
+            "model": registration.model,
+            "leave_one_out_mm": {},
+            "frames_rejected": source.frames_rejected,
+        }
     return {
         "rms_mm": registration.rms_mm,
         "position_u_mm": float(np.sqrt(np.mean(registration.position_u(source.grid.centres_mm) ** 2))),

@@ -62,6 +62,19 @@ class AreaPart(ResultPart):
     """Largest y, mm."""
 
 
+class PixelAreaPart(ResultPart):
+    """A place on a plan that is the picture itself, as the rectangle around its cells, from the upper left corner of the picture."""
+
+    x_low_px: float
+    """Smallest x, px."""
+    x_high_px: float
+    """Largest x, px."""
+    y_low_px: float
+    """Smallest y, px."""
+    y_high_px: float
+    """Largest y, px."""
+
+
 class TimePart(ResultPart):
     """When the readings were taken."""
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from fusion.diagnosis.causes import CAUSES
 from fusion.products.results_attribution import CorrelationPart
-from fusion.products.results_axis import AnomalyPart, DriftPart, Iso230Part, Iso230Window
+from fusion.products.results_axis import AnomalyPart, DriftPart, HotspotPart, Iso230Part, Iso230Window
 from fusion.products.results_inputs import Figures
 from fusion.products.results_loop import Loop, RecordLoop, StepPart
 from fusion.products.results_part import AreaPart
@@ -178,6 +180,42 @@ def span_words(area: AreaPart | None) -> str:
     if area is None:
         return "–"
     return f"x {area.x_low_mm:.0f} to {area.x_high_mm:.0f} mm, y {area.y_low_mm:.0f} to {area.y_high_mm:.0f} mm"
+
+
+class SpotPlaces(NamedTuple):
+    """Places of a hotspot in words: on the plan in mm, or in the picture in px.
+
+    Attributes
+    ----------
+    area, peak, middle : str
+        Edges of its area, its peak, and the middle of its area.
+    """
+
+    area: str
+    peak: str
+    middle: str
+
+
+def spot_places(spot: HotspotPart) -> SpotPlaces:
+    """Return the places of a hotspot in words.
+
+    Parameters
+    ----------
+    spot : HotspotPart
+        An entry of ``hotspots`` in the results.
+    """
+    if spot.x_px is None:
+        return SpotPlaces(
+            span_words(spot.area), place(spot.x_mm, spot.y_mm), place(spot.centroid_x_mm, spot.centroid_y_mm)
+        )
+    area = spot.area_px
+    edges = (
+        "–"
+        if area is None
+        else f"x {area.x_low_px:.0f} to {area.x_high_px:.0f} px, y {area.y_low_px:.0f} to {area.y_high_px:.0f} px"
+    )
+    peak, middle = place(spot.x_px, spot.y_px, "px"), place(spot.centroid_x_px, spot.centroid_y_px, "px")
+    return SpotPlaces(edges, peak, middle)
 
 
 def randomised_causes(correlation: CorrelationPart) -> list[str]:

@@ -133,7 +133,9 @@ def _draw_charts(results: Results, datasets: Mapping[str, Any]) -> dict[str, Cha
     charts: dict[str, Chart] = {}
     fields, deviations, fused = (datasets.get(name) for name in ("fields", "deviations", "fusion"))
     if fields is not None:
-        charts |= {"registration": plan.plot_registration(fields), "rise_history": plan.plot_rise_history(fields)}
+        charts["rise_history"] = plan.plot_rise_history(fields)
+        if "fiducial" in fields.sizes:
+            charts["registration"] = plan.plot_registration(fields)
     if deviations is not None:
         charts |= _reading_charts(deviations)
         charts |= _drift_charts(results, deviations) if has(deviations, "drift") else {}

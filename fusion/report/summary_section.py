@@ -28,7 +28,7 @@ from fusion.report.findings import (
     drift_u_note,
     quoted_values,
     quoted_window,
-    span_words,
+    spot_places,
 )
 from fusion.report.iso230_section import contained_sentence, describe_iso230
 from fusion.report.model_section import (
@@ -52,12 +52,12 @@ from fusion.report.wording import (
     moment,
     number,
     p_cell,
-    place,
     premise,
     quantity,
     untouched,
 )
 from interferometry.figures import time_span
+from thermography.fields.cycle_fields import plan_unit
 
 _GLOSSARY = (
     ("Positioning deviation", "Measured minus target position of one reading, in µm."),
@@ -170,7 +170,7 @@ def describe_campaign(
             ("provenance", "Provenance"),
         ],
         "data": _data_rows(results, provenance, deviations, fields),
-        "fiducials": None if fields is None else _fiducials_table(fields),
+        "fiducials": _fiducials_table(fields) if fields is not None and "fiducial" in fields.sizes else None,
         "field_uncertainty": "" if results.radiometry is None else _field_uncertainty(results.radiometry),
         "budget": None if results.radiometry is None else _budget_table(results.radiometry),
         "surfaces": _surfaces_table(results.radiometry)
@@ -298,11 +298,12 @@ def _data_rows(
         clock = ", on the laser's clock" if results.alignment is not None else ""
         rows.append(("Frames", f"{fields.sizes['time']}, {_span(first, last, results)}{clock}"))
         cell = float(np.median(np.diff(fields["x"])))
-        rows.append(("Plan", f"{fields.sizes['x']} × {fields.sizes['y']} cells of {cell:g} mm"))
+        unit = plan_unit(fields)
+        of = ", the whole picture: nothing is known in mm" if unit == "px" else ""
+        rows.append(("Plan", f"{fields.sizes['x']} × {fields.sizes['y']} cells of {cell:g} {unit}{of}"))
         visible = float(np.isfinite(fields["temperature_rise"].isel(cycle=-1)).mean())
-        rows.append(
-            ("Visible", f"{visible:.0%} of the plan; the rest is masked (fiducials, edges) or outside the frame")
-        )
+        rest = "pixels without a value" if unit == "px" else "masked (fiducials, edges) or outside the frame"
+        rows.append(("Visible", f"{visible:.0%} of the plan" + (f"; the rest is {rest}" if visible < 1.0 else "")))
     if results.alignment is not None:
         rows.append(("Clock offset", _clock_offset(results.alignment.clock_offset_s)))
     rows.append(("Input files", f"{len(provenance['inputs'])}, listed with their SHA-256 under Provenance"))
@@ -425,9 +426,7 @@ def _hotspots_table(results: Results) -> Table:
     rows = [
         [
             spot.name,
-            span_words(spot.area),
-            place(spot.x_mm, spot.y_mm),
-            place(spot.centroid_x_mm, spot.centroid_y_mm),
+            *spot_places(spot),
             measured(spot.peak_rise_K, spot.peak_rise_u_K),
             *(
                 (

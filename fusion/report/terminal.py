@@ -75,7 +75,9 @@ def summary_rows(results: Results) -> list[tuple[str, str]]:
 
 
 def _registration(part: RegistrationPart) -> str:
-    """Return the scatter of the fiducials; of four, which determine the plan exactly, the uncertainty alone."""
+    """Return the scatter of the fiducials; of four, which determine the plan exactly, the uncertainty; of a picture, that it is one."""
+    if part.is_picture:
+        return "none: the picture is the plan, lengths in px"
     if part.rms_mm is None or not math.isfinite(part.rms_mm):
         count = len(part.leave_one_out_mm)
         return f"standard uncertainty {number(part.position_u_mm, 2)} mm, not checked: {count} fiducials determine the plan exactly"

@@ -250,16 +250,18 @@ def moment(time: np.datetime64 | str, zone: str | None = None) -> str:
     return f"{local:%Y-%m-%d %H:%M} {local.tzname()}"
 
 
-def place(x_mm: float | None, y_mm: float | None) -> str:
-    """Return a place on the plan to the millimetre.
+def place(x: float | None, y: float | None, unit: str = "mm") -> str:
+    """Return a place on the plan to the millimetre, or to the pixel.
 
     Parameters
     ----------
-    x_mm, y_mm : float or None
-        Plan coordinates, mm.
+    x, y : float or None
+        Plan coordinates.
+    unit : str
+        mm, or px where the picture is the plan.
     """
-    x, y = ("–" if value is None else f"{value:.0f}" for value in (x_mm, y_mm))
-    return f"x {x} mm, y {y} mm"
+    across, down = ("–" if value is None else f"{value:.0f}" for value in (x, y))
+    return f"x {across} {unit}, y {down} {unit}"
 
 
 def region_words(name: str) -> str:

@@ -199,7 +199,11 @@ def _frames_content(source: CameraInputs) -> Iterator[str]:
         f"frames: {len(source.frames)} of {first.shape[1]} x {first.shape[0]}, camera {first.camera.model or 'unknown'}{serial}, "
         f"{len(source.frames_rejected)} left out"
     )
-    yield f"plan: {source.grid.width_mm:g} x {source.grid.height_mm:g} mm, {counted(len(source.fiducials), 'fiducial')}"
+    size = f"{source.grid.width_mm:g} x {source.grid.height_mm:g}"
+    if source.plan.in_pixels:
+        yield f"plan: the picture of {size} px in cells of {source.grid.cell_size_mm:g} px, nothing in mm"
+    else:
+        yield f"plan: {size} mm, {counted(len(source.fiducials), 'fiducial')}"
 
 
 def _recordings(source: Inputs) -> Iterator[Recording]:

@@ -23,6 +23,8 @@ from thermography.io.temperature_frames import StackOptions, TemperatureReader
 from thermography.registration.plan import Fiducial, read_fiducials
 
 _FILE = "campaign.toml"
+#: How places of the frames can be given.
+_PLACES = ("pixels", "fiducials")
 #: Values above this are kelvins and no temperatures of a machine table in degC.
 _WARMEST_DEGC = 150.0
 
@@ -184,11 +186,21 @@ def _time_in_name(name: str) -> str:
 
 
 def _plan(content: FolderContent, asker: Asker, *, along_axis: bool) -> Iterator[str]:
+    listed = content.of(Kind.FIDUCIALS)
+    if not (listed or along_axis):
+        where = asker.choice(
+            "No table of fiducials was found: places in pixels of the picture, or on a plan in mm", _PLACES
+        )
+        if where == "pixels":
+            yield from ("", "[plan]")
+            yield 'registration = "pixels"                  # no fiducials were found: the picture is the plan, without millimetres'
+            yield '# cell_px = "4 px"                     # side of a cell, a divisor of both sides of the picture; left out: a usual one'
+            yield "# for a plan in mm: size, cell_size and fiducials (at least four places on the table that are known in mm)"
+            return
     yield from (
         "",
         "[plan]                                   # the table in mm: x to the right, y down, from one corner",
     )
-    listed = content.of(Kind.FIDUCIALS)
     fiducials = read_fiducials(listed[0].path) if listed else []
     width, height = _extent(fiducials)
     size = [

@@ -372,6 +372,44 @@ def _temperatures(
     }
 
 
+def in_pixels(fields: xr.Dataset) -> xr.Dataset:
+    """Return fields on a plan that is the picture itself, with coordinates that say so.
+
+    Parameters
+    ----------
+    fields : Dataset
+        As assembled, with coordinates in px and attributes for mm.
+
+    Returns
+    -------
+    Dataset
+        Attribute ``plan_unit`` is ``"px"``; coordinates are counts of pixels (CF: ``units = "1"``), the uncertainty of the place of a cell,
+        which has none by definition, is absent.
+    """
+    named = fields.drop_vars("position_u", errors="ignore").assign_attrs(
+        title="Temperature fields on the picture", plan_unit="px"
+    )
+    for axis, start in (("x", "left"), ("y", "upper")):
+        named[axis].attrs = {
+            "long_name": f"distance from the {start} edge of the picture",
+            "units": "1",
+            "comment": "px; the centre of the first pixel lies at 0.5",
+            "axis": axis.upper(),
+        }
+    return named
+
+
+def plan_unit(fields: xr.Dataset) -> str:
+    """Return the unit of the places on a plan: mm, or px where the picture itself is the plan.
+
+    Parameters
+    ----------
+    fields : Dataset
+        Fields, or what was made from them.
+    """
+    return str(fields.attrs.get("plan_unit", "mm"))
+
+
 def annotate(dataset: xr.Dataset) -> xr.Dataset:
     """Set the CF attributes of every listed variable, and no fill value for coordinates.
 

@@ -162,8 +162,11 @@ class Displacements:
         """Measure the frames of a block up to the first one of a lasting displacement.
 
         Frames for which the monitor shows a displacement, (frames, 4) px, or nothing are measured exactly. A displacement that the
-        next measurable frame shares is a knock; otherwise the frame is shaken.
+        next measurable frame shares is a knock; otherwise the frame is shaken. Where the picture is the plan, no frame is measured: its
+        content may warm in one place, which cannot be told from a shift of a fraction of a pixel.
         """
+        if self.registrations.spans[block.span].registration.is_picture:
+            return None
         sizes = np.linalg.norm(monitored_px - self.baseline_px, axis=1)
         if (sizes <= SUSPECT_PX).all():
             self.size_px[block.first : block.stop] = sizes
@@ -204,6 +207,8 @@ class Displacements:
         """
         stretches = []
         for index, span in enumerate(self.registrations.spans):
+            if span.registration.is_picture:
+                continue
             stop = self.registrations.stop_frame(index) or len(self.frames)
             chosen = [i for i in range(span.first_frame + 1, stop) if not left_out[i]]
             measured = [i for i in chosen if np.isfinite(self.size_px[i])]

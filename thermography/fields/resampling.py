@@ -160,6 +160,9 @@ def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float
         No pixel lies on the plan.
     """
     window = plan_window(registration, grid)
+    if registration.is_picture:
+        # The edge of the picture is the edge of nothing that could be blurred into it.
+        margin_px = 0.0
     cell, pixel, area, x, y = _pieces(registration, grid, window, margin_px)
     if len(cell) == 0:
         raise ThermographyError("no pixel of the frame lies on the plan; check the fiducials and the plan's size")
@@ -184,7 +187,7 @@ def _pieces(
     rows, columns = window[0].stop - window[0].start, window[1].stop
     across, down = np.meshgrid(np.arange(columns + 1) - 0.5, np.arange(window[0].start, window[0].stop + 1) - 0.5)
     corners = registration.to_plan(np.stack([across, down], axis=-1))
-    discs = np.array([(disc.x_mm, disc.y_mm, disc.diameter_mm / 2) for disc in registration.masked])
+    discs = np.array([(disc.x_mm, disc.y_mm, disc.diameter_mm / 2) for disc in registration.masked]).reshape(-1, 3)
     size = (grid.width_mm, grid.height_mm)
     with ThreadPoolExecutor(THREADS) as executor:
         halves = executor.map(

@@ -142,7 +142,7 @@ def monitor_fiducials(registration: Registration, grid: PlanGrid, window: tuple[
     FiducialMonitor
     """
     places, weights, gains, arms, start = [], [np.empty((3, 0), np.float32)], [], [], 0
-    middle, radius = _middle(registration)
+    middle, radius = (np.zeros(2), 1.0) if registration.is_picture else _middle(registration)
     origin = np.array([window[1].start, window[0].start])
     shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
     for name, disc in registration.fiducials.items():

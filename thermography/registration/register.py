@@ -118,8 +118,15 @@ class Registration:
     covariance: Array = field(repr=False)
 
     @property
+    def is_picture(self) -> bool:
+        """Whether the picture itself is the plan, with lengths in px: see `thermography.registration.picture`."""
+        return not self.fiducials
+
+    @property
     def mirrored(self) -> bool:
         """Whether the plan appears as in a mirror: what turns clockwise on it turns anticlockwise in the frame."""
+        if self.is_picture:
+            return False
         centre = np.mean([(disc.x_mm, disc.y_mm) for disc in self.fiducials.values()], axis=0)
         return bool(np.linalg.det(self.projection.jacobian(centre)) < 0)
 
@@ -150,6 +157,8 @@ class Registration:
             The covariance of the fitted parameters propagated to the plan (law of propagation, JCGM 100:2008, 5.2.2).
         """
         points_mm = np.asarray(points_mm, float)
+        if self.is_picture:
+            return np.zeros((*points_mm.shape, 2))
         flat = points_mm.reshape(-1, 2)
         centres, _ = _geometry(list(self.fiducials.values()))
         sensor = parameter_jacobian(self.projection, centres, len(self.covariance) - 8)(flat)

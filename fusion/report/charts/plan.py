@@ -23,6 +23,7 @@ from fusion.report.charts.style import (
 )
 from fusion.report.wording import number
 from interferometry.figures import ACCENT, INK
+from thermography.fields.cycle_fields import plan_unit
 
 #: Temperatures of a picture are rounded to 1/32 K, far below its noise, so that it is small when it is compressed.
 _STEP_PER_K = 32
@@ -41,8 +42,10 @@ def extent_of(cells: xr.Dataset) -> tuple[float, float, float, float]:
     return float(x[0] - half), float(x[-1] + half), float(y[0] - half), float(y[-1] + half)
 
 
-def new_plan(extent: tuple[float, float, float, float], *, title: str = "", height: int = 260) -> figure:
-    """Return an empty plan view of the table with x to the right and y upwards, one mm as long in both.
+def new_plan(
+    extent: tuple[float, float, float, float], *, title: str = "", height: int = 260, unit: str = "mm"
+) -> figure:
+    """Return an empty plan view of the table with x to the right and y upwards, one mm as long in both; of a picture, y downwards.
 
     Parameters
     ----------
@@ -52,9 +55,14 @@ def new_plan(extent: tuple[float, float, float, float], *, title: str = "", heig
         Above the legend.
     height : int
         CSS px.
+    unit : str
+        Of the plan: mm, or px where the picture is the plan.
     """
     left, right, bottom, top = extent
-    drawn = new_figure(x="x / mm", y="y / mm", title=title, height=height, x_range=(left, right), y_range=(bottom, top))
+    y_range = (top, bottom) if unit == "px" else (bottom, top)
+    drawn = new_figure(
+        x=f"x / {unit}", y=f"y / {unit}", title=title, height=height, x_range=(left, right), y_range=y_range
+    )
     drawn.match_aspect = True
     drawn.grid.grid_line_color = None
     return drawn
@@ -187,10 +195,11 @@ def plot_rise_history(fields: xr.Dataset) -> Chart:
     drawn = new_figure(x="time since first cycle / h", y="rise / K")
     add_zero_line(drawn)
     add_band(drawn, hours, low, high, ACCENT, legend_label="middle 80 % of the cells")
-    add_series(drawn, hours, mean, name="mean of the table", colour=ACCENT)
+    seen_part = "picture" if plan_unit(fields) == "px" else "table"
+    add_series(drawn, hours, mean, name=f"mean of the {seen_part}", colour=ACCENT)
     add_series(drawn, hours, most, name="warmest cell", colour=INK, dash="dashed")
     seen = (
-        f"Rise of the table over {number(float(hours[-1]), 2)} h: the mean of its cells is {span_words(mean, 'K')}, the warmest "
+        f"Rise of the {seen_part} over {number(float(hours[-1]), 2)} h: the mean of its cells is {span_words(mean, 'K')}, the warmest "
         f"cell reaches {number(float(np.nanmax(most)))} K."
     )
     columns = {

@@ -13,8 +13,9 @@ from bokeh.plotting import figure
 from fusion.products.results_axis import HotspotPart
 from fusion.report.charts.plan import extent_of, new_plan
 from fusion.report.charts.style import DIVERGING, SEQUENTIAL, Chart, add_colour_bar, add_hover, palette
-from fusion.report.wording import number
+from fusion.report.wording import number, place
 from interferometry.figures import INK
+from thermography.fields.cycle_fields import plan_unit
 
 #: Largest number of map values in the file; above it cycles are thinned and cells are averaged, and the report says so.
 _MAP_BUDGET = 3_000_000
@@ -92,7 +93,8 @@ def plot_thermal_map(
     kept, note = _thin(fields[[layer.variable for layer in shown]])
     extent = extent_of(kept)
     room = _ROOM * (extent[1] - extent[0])
-    drawn = new_plan((extent[0] - room, extent[1] + room, extent[2] - room, extent[3] + room), height=330)
+    unit = plan_unit(fields)
+    drawn = new_plan((extent[0] - room, extent[1] + room, extent[2] - room, extent[3] + room), height=330, unit=unit)
     steps = {layer.words: _in_steps(kept[layer.variable].values, layer) for layer in shown}
     scales = [_scale(kept[layer.variable].values, layer) for layer in shown]
     first, last = shown[0], kept[shown[0].variable].values[-1]
@@ -105,13 +107,13 @@ def plot_thermal_map(
         [last.astype(np.float32)], x=left, y=bottom, dw=right - left, dh=top - bottom, color_mapper=mapper, level="image", name="cells"
     )  # fmt: skip
     tip = (first.words, f"@image{{0.{'0' * first.decimals}}} {first.unit}")
-    add_hover(drawn, [("x", "$x{0} mm"), ("y", "$y{0} mm"), tip], [cells])
+    add_hover(drawn, [("x", f"$x{{0}} {unit}"), ("y", f"$y{{0}} {unit}"), tip], [cells])
     drawn.select_one(HoverTool).name = "reading"
     add_colour_bar(drawn, mapper, f"{first.words} / {first.unit}")
     drawn.below[-1].name = "bar"
     if "target_x" in fields:
         _draw_line(drawn, fields, position)
-    _draw_hotspots(drawn, hotspots)
+    _draw_hotspots(drawn, hotspots, unit)
     flat = {name: values.reshape(len(values), -1) for name, values in steps.items()}
     more = {name: np.diff(values, axis=0, prepend=np.int16(0)).ravel() for name, values in flat.items()}
     drawn.tags = [ColumnDataSource(more), {"scales": scales, "cycles": kept["cycle"].values.tolist()}]
@@ -131,7 +133,7 @@ def _thin(fields: xr.Dataset) -> tuple[xr.Dataset, str]:
     note = []
     block = int(np.ceil(np.sqrt(max(1.0, cells * layers * min(cycles, 25) / _MAP_BUDGET))))
     if block > 1:
-        fields = fields.coarsen(x=block, y=block, boundary="trim").mean()
+        fields = fields.coarsen(x=block, y=block, boundary="trim").mean(keep_attrs=True)
         note.append(f"The map shows means of {block} × {block} cells")
     every = int(np.ceil(fields.sizes["x"] * fields.sizes["y"] * layers * cycles / _MAP_BUDGET))
     if every > 1:
@@ -193,11 +195,11 @@ def _draw_line(drawn: figure, fields: xr.Dataset, position: xr.DataArray | None)
     )  # fmt: skip
 
 
-def _draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart]) -> None:
+def _draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart], unit: str) -> None:
     """Ring the peak of every hotspot and write its name."""
     if not hotspots:
         return
-    x, y = [spot.x_mm for spot in hotspots], [spot.y_mm for spot in hotspots]
+    x, y = ([getattr(spot, f"{axis}_{unit}") for spot in hotspots] for axis in "xy")
     for colour, width in ((INK, 4), ("#ffffff", 2)):
         drawn.scatter(x, y, marker="circle", size=19, fill_color=None, line_color=colour, line_width=width)
     names = [spot.name or f"hotspot {place}" for place, spot in enumerate(hotspots, start=1)]
@@ -216,7 +218,7 @@ def _seen(kept: xr.Dataset, last: np.ndarray, hotspots: Sequence[HotspotPart], c
     marked = f"; {count} {'hotspot is' if count == 1 else 'hotspots are'} ringed" if count else ""
     return (
         f"Plan of the table: in cycle {cycle} the rise is {number(float(np.nanmin(last)))} to {number(float(np.nanmax(last)))} K, largest "
-        f"at x {float(kept['x'][column]):.0f} mm, y {float(kept['y'][row]):.0f} mm{marked}."
+        f"at {place(float(kept['x'][column]), float(kept['y'][row]), plan_unit(kept))}{marked}."
     )
 
 
@@ -227,4 +229,5 @@ def _columns(kept: xr.Dataset, shown: Sequence[_Layer], cycle: int) -> dict[str,
     values = {
         f"{layer.words}, cycle {cycle}{units[layer.words]}": kept[layer.variable].values[-1].ravel() for layer in shown
     }
-    return {"x / mm": x.ravel(), "y / mm": y.ravel(), **values}
+    unit = plan_unit(kept)
+    return {f"x / {unit}": x.ravel(), f"y / {unit}": y.ravel(), **values}

@@ -13,6 +13,7 @@ from fusion.products.results import Results
 from fusion.products.store import read_dataset
 from fusion.report.findings import quoted_window
 from interferometry import iso230
+from thermography.fields.cycle_fields import plan_unit
 
 #: Bytes of a row of fields.csv, measured on the demo.
 _FIELD_ROW_BYTES = 38
@@ -119,7 +120,8 @@ def fields_table(folder: Path) -> pd.DataFrame:
     fields = read_dataset(folder / "fields.nc")
     frame = fields[["temperature", "temperature_rise", "temperature_rise_u"]].to_dataframe().dropna().reset_index()
     names = {"temperature": "temperature_degC", "temperature_rise": "rise_K", "temperature_rise_u": "rise_u_K"}
-    return frame.rename(columns={"x": "x_mm", "y": "y_mm", **names})
+    unit = plan_unit(fields)
+    return frame.rename(columns={"x": f"x_{unit}", "y": f"y_{unit}", **names})
 
 
 def fields_megabytes(folder: Path) -> float | None:
