@@ -41,6 +41,8 @@ from fusion.campaign.value_types import (
     PositiveSeconds,
     Seconds,
     TimeZone,
+    area_mm2,
+    corner_words,
 )
 from fusion.effects.effect import Effect
 from fusion.effects.library import library
@@ -213,16 +215,6 @@ class StateTable(_Measured):
     temperature_u_K: KelvinU = Field(default=0.1, alias="temperature_u")
 
 
-def _area_mm2(corners: tuple[tuple[float, float], ...]) -> float:
-    """Area of a polygon by Gauss's formula, without its sense."""
-    pairs = zip(corners, (*corners[1:], corners[0]), strict=True)
-    return abs(sum(x * y_next - x_next * y for (x, y), (x_next, y_next) in pairs)) / 2.0
-
-
-def _corners(corners: tuple[tuple[float, float], ...]) -> str:
-    return ", ".join(f"({x:g}, {y:g})" for x, y in corners) + " mm"
-
-
 class SurfaceTable(_Measured):
     """``[[thermography.region]]``: a part of the table with an emissivity of its own, given or from two states."""
 
@@ -246,8 +238,8 @@ class SurfaceTable(_Measured):
         if (self.emissivity is None) == (self.states is None):
             text = f'region {self.name} needs either emissivity, for example "0.35 +- 0.05", or states (two cycles of known temperature)'
             raise PydanticCustomError("region", "{text}", {"text": text})
-        if _area_mm2(self.corners_mm) == 0.0:
-            text = f"region {self.name} with the corners {_corners(self.corners_mm)} has no area; give corners that enclose one"
+        if area_mm2(self.corners_mm) == 0.0:
+            text = f"region {self.name} with the corners {corner_words(self.corners_mm)} has no area; give corners that enclose one"
             raise PydanticCustomError("region", "{text}", {"text": text})
         if self.states is not None and self.states[0].cycle == self.states[1].cycle:
             text = (

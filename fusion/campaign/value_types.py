@@ -111,3 +111,26 @@ def _patch(values: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
 
 #: First column and row, number of columns and rows.
 PixelPatch = Annotated[tuple[int, int, int, int], AfterValidator(_patch)]
+
+
+def area_mm2(corners: tuple[tuple[float, float], ...]) -> float:
+    """Return the area of a polygon by Gauss's formula, without its sense.
+
+    Parameters
+    ----------
+    corners : tuple of (x, y), mm
+        In order.
+    """
+    pairs = zip(corners, (*corners[1:], corners[0]), strict=True)
+    return abs(sum(x * y_next - x_next * y for (x, y), (x_next, y_next) in pairs)) / 2.0
+
+
+def corner_words(corners: tuple[tuple[float, float], ...]) -> str:
+    """Return the corners of a polygon for a message.
+
+    Parameters
+    ----------
+    corners : tuple of (x, y), mm
+        In order.
+    """
+    return ", ".join(f"({x:g}, {y:g})" for x, y in corners) + " mm"

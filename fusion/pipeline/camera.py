@@ -183,7 +183,10 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
     """
     blocks = locate_blocks(survey, registration, source.grid, _travel_shifts(source))
     _refuse_patch_on_plan(source, blocks)
-    disturbed = disturbed_frames(survey, blocks, still=source.thermography.table == "still")
+    # What changes fast in a picture of which nothing is known may be what was to be seen: only a table is known to change slowly.
+    disturbed = (
+        {} if registration.is_picture else disturbed_frames(survey, blocks, still=source.thermography.table == "still")
+    )
     left_out = [
         *survey.damaged,
         *(RejectedFrame(survey.frames[i].path, survey.frames[i].index, reason) for i, reason in disturbed.items()),
@@ -197,7 +200,8 @@ def examine_camera(source: CameraInputs, survey: Survey, registration: Registrat
     if levels is None:
         part = {"frames_checked": len(source.frames), "frames_damaged": rejected, "steps": ()}
         part |= {"drift_K": 0.0, "largest_correction_K": 0.0, "largest_u_K": None}
-        return CameraState(usable, None, np.zeros(len(frames)), part, [*notices, _NOTHING_BESIDE])
+        beside = _NOTHING_BESIDE_A_PICTURE if registration.is_picture else _NOTHING_BESIDE
+        return CameraState(usable, None, np.zeros(len(frames)), part, [*notices, beside])
     background, table, spread = levels
     if survey.patch is not None:
         background = survey.patch[kept]
@@ -322,6 +326,14 @@ _NOTHING_BESIDE = Notice(
     "camera_unchecked",
     "Nothing but the table is in view, so that steps and drift of the camera's zero cannot be told from its warming.",
     "Leave a margin around the table in view.",
+)
+
+
+_NOTHING_BESIDE_A_PICTURE = Notice(
+    "camera_unchecked",
+    "The whole picture is the plan, so that nothing beside it shows steps and drift of the camera's zero, which look like a rise of all "
+    "that is in the picture.",
+    'State the drift as thermography.camera_drift_u = "0.2 K", or give a plan in mm that leaves a margin of the picture.',
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +14,7 @@ from fusion.campaign.config import SurfaceTable, ThermographyTable
 from fusion.campaign.sources import CameraInputs
 from fusion.products.notices import counted
 from fusion.products.results import Notice, Outcome
-from thermography.fields.cycle_fields import reference_cycle
+from thermography.fields.cycle_fields import plan_unit, reference_cycle
 from thermography.fields.surfaces import (
     EmissivityRegion,
     Surface,
@@ -125,6 +126,35 @@ def complete_fields(source: CameraInputs, fields: xr.Dataset, parameters: Overri
         "edge_cells": int(edge.sum()),
     }
     return Outcome(fields, {"radiometry": part}, (*_edge_notices(edge, regions), *_drift_notices(table, fields)))
+
+
+def describe_field(fields: xr.Dataset, radiometry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the part ``field`` of results.json.
+
+    Parameters
+    ----------
+    fields : Dataset
+        Keeps ``thermography.contract.FIELDS``.
+    radiometry : mapping
+        Part ``radiometry`` of results.json.
+    """
+    rise, times = fields["temperature_rise"], fields["time"].values
+    seen = np.isfinite(rise.values).any(axis=(1, 2))
+    mean = float(rise.isel(cycle=int(np.flatnonzero(seen)[-1])).mean())
+    at = np.unravel_index(int(np.nanargmax(rise.values)), rise.shape)
+    cell = rise[at]
+    unit = plan_unit(fields)
+    since = (fields["cycle_time"].values[at[0]] - fields["cycle_time"].values[seen][0]) / np.timedelta64(1, "s")
+    return {
+        "fields": int(seen.sum()),
+        "frames": int(fields["frame_count"].sum()) if "frame_count" in fields else int(times.size),
+        "duration_s": float((times[-1] - times[0]) / np.timedelta64(1, "s")),
+        "mean_rise_K": {"value": mean, "u": radiometry["rise_u"]["common_K"]},
+        "largest_rise_K": {"value": float(cell), "u": float(fields["temperature_rise_u"].values[at])},
+        "largest_cycle": int(cell["cycle"]),
+        "largest_after_s": float(since),
+        **{f"largest_{axis}_{unit}": float(cell[axis]) for axis in "xy"},
+    }
 
 
 def _parameters_at(

@@ -34,6 +34,7 @@ from fusion.pipeline.provenance import (
     stamp_run,
     versions,
 )
+from fusion.pipeline.radiometry import describe_field
 from fusion.pipeline.sizes import choose_targets, lacks_for_correlation, lacks_for_model
 from fusion.products.folder import claim, open_folder
 from fusion.products.progress import Report, silent
@@ -320,13 +321,15 @@ def _run_laser(run: Run, source: LaserInputs) -> tuple[dict[str, Any], list[Chec
 def _reduce(run: Run, source: CameraInputs, tables: tuple[str, ...], *, scheduler: str | None) -> xr.Dataset:
     """The stage of the fields."""
     checkpoint = run.checkpoint(run.key_of("fields", tables, ()))
-    return run.stage(
+    fields = run.stage(
         "fields",
         tables,
         (),
         lambda: thermal.reduce_thermography(source, checkpoint=checkpoint, scheduler=scheduler, report=run.report),
         read_dataset,
     )
+    run.parts["field"] = describe_field(fields, run.parts["radiometry"])
+    return fields
 
 
 def _evaluate(run: Run, source: LaserInputs, *, after: tuple[str, ...]) -> xr.Dataset:

@@ -22,7 +22,7 @@ from fusion.products.progress import Report
 from fusion.products.results import Notice, Outcome
 from fusion.products.store import write_atomically
 from thermography.contract import FIELDS
-from thermography.fields.cycle_fields import in_pixels
+from thermography.fields.cycle_fields import in_pixels, plan_unit
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
 from thermography.io.openexr import write_maps
@@ -96,10 +96,10 @@ def reduce_thermography(source: CameraInputs, *, checkpoint: Path, scheduler: st
         ),
     )
     fields = fields.assign_coords(cycle=source.cycles.number)
-    if registration.is_picture:
-        fields = in_pixels(fields)
     completed = complete_fields(source, fields, override)
     fields = check(completed.dataset, FIELDS, name="the fields")
+    if registration.is_picture:
+        fields = in_pixels(fields)
     notices += [*clock_notices, *_registration_notices(registration), *_frame_notices(fields), *completed.notices]
     for name in ("time", "cycle_time", "frame_time"):
         if name in fields.variables:
@@ -362,6 +362,8 @@ def _frame_notices(fields: xr.Dataset) -> list[Notice]:
     """Return one notice for each kind of frame that the reduction reports."""
     notices = []
     for name, (text, remedy) in _FRAME_ATTRIBUTES.items():
+        if name == "frames_unchecked" and plan_unit(fields) == "px":
+            continue
         frames = json.loads(fields.attrs.get(name, "[]"))
         if frames:
             named = listed([frame if isinstance(frame, str) else _words(frame) for frame in frames])

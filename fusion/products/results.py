@@ -39,7 +39,7 @@ from fusion.products.results_loop import (
     Verdict,
 )
 from fusion.products.results_part import ByDirection, Number, Quantity, ResultPart, TimePart
-from fusion.products.results_radiometry import RadiometryPart
+from fusion.products.results_radiometry import FieldPart, RadiometryPart
 from fusion.products.store import Product, plain
 
 __all__ = [
@@ -130,6 +130,8 @@ class Results(ResultPart):
     """The thermal camera: damaged frames and corrections."""
     radiometry: RadiometryPart | None = None
     """Uncertainty of temperatures and rises."""
+    field: FieldPart | None = None
+    """The temperature fields in short."""
     alignment: AlignmentPart | None = None
     """Both instruments on one clock."""
     iso230: Iso230Part | None = None

@@ -68,3 +68,30 @@ class RadiometryPart(ResultPart):
     """Surfaces of one emissivity each."""
     edge_cells: int
     """Cells that were left empty because they see two surfaces."""
+
+
+class FieldPart(ResultPart):
+    """The temperature fields in short: how many, over which time, and the rise."""
+
+    fields: int
+    """Cycles, or windows of time where no laser gives cycles, that have a field."""
+    frames: int
+    """Thermograms that were used."""
+    duration_s: Number
+    """From the first thermogram to the last, s."""
+    mean_rise_K: Quantity
+    """Rise of the last field since the first, mean over the plan, with what all cells share as its uncertainty, K."""
+    largest_rise_K: Quantity
+    """Largest rise of a cell in any field, K; null where no cell is seen twice."""
+    largest_cycle: int | None
+    """Cycle or window of that rise."""
+    largest_after_s: Number
+    """From the first field to that one, s."""
+    largest_x_mm: Number = None
+    """Place of that cell, x, mm; null where the plan is the picture itself."""
+    largest_y_mm: Number = None
+    """Place of that cell, y, mm; null where the plan is the picture itself."""
+    largest_x_px: Number = None
+    """Place of that cell from the left edge of the picture, px; only where the picture is the plan."""
+    largest_y_px: Number = None
+    """Place of that cell from the upper edge of the picture, px; only where the picture is the plan."""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fusion.diagnosis.causes import CAUSES
+from fusion.products.results import Results
 from fusion.products.results_attribution import CorrelationPart
 from fusion.products.results_axis import AnomalyPart, DriftPart, HotspotPart, Iso230Part, Iso230Window
 from fusion.products.results_inputs import Figures
@@ -216,6 +217,24 @@ def spot_places(spot: HotspotPart) -> SpotPlaces:
     )
     peak, middle = place(spot.x_px, spot.y_px, "px"), place(spot.centroid_x_px, spot.centroid_y_px, "px")
     return SpotPlaces(edges, peak, middle)
+
+
+def figures_of(results: Results) -> list[Figures]:
+    """Return which kinds of figures a run has: of the laser, of the camera, and of both together.
+
+    Parameters
+    ----------
+    results : Results
+        Results of a run.
+    """
+    there: list[Figures] = []
+    if results.iso230 is not None or results.loop is not None:
+        there.append("positions")
+    if results.registration is not None:
+        there.append("field")
+    if results.correlation is not None:
+        there.append("attribution")
+    return there
 
 
 def randomised_causes(correlation: CorrelationPart) -> list[str]:

@@ -26,6 +26,7 @@ from fusion.report.findings import (
     anomaly_cause,
     anomaly_place,
     drift_u_note,
+    figures_of,
     quoted_values,
     quoted_window,
     spot_places,
@@ -43,6 +44,7 @@ from fusion.report.model_section import (
 )
 from fusion.report.tables import Table, Words, table
 from fusion.report.wording import (
+    INPUT_NAMES,
     alike,
     condition,
     decimals_of,
@@ -155,7 +157,7 @@ def describe_campaign(
         "verdict": results.loop.verdict if results.loop else "",
         "headline": headline(results),
         "doubts": results.inputs.doubts if results.inputs else (),
-        "untouched": untouched(results.inputs),
+        "untouched": untouched(results.inputs, figures_of(results)),
         "premises": {section: premise(results.inputs, *figures) for section, figures in _RESTS_ON.items()},
         "measured": _measured(deviations, fields),
         "answers": conclude(results),
@@ -188,7 +190,28 @@ def describe_campaign(
         "joint": joint,
         "loop": None if results.loop is None else _describe_loop(results.loop),
         "uncertainty": _uncertainty(results, fields),
-        "glossary": _GLOSSARY,
+        "glossary": _glossary(results),
+        **_camera_words(results),
+    }
+
+
+def _glossary(results: Results) -> list[tuple[str, str]]:
+    """The terms of what was measured."""
+    there = figures_of(results)
+    left_out = set() if "field" in there else {"Thermal mode", "Rise"}
+    if "positions" not in there:
+        left_out = {term for term, _ in _GLOSSARY} - {"Rise", "Expanded uncertainty"}
+    return [(term, text) for term, text in _GLOSSARY if term not in left_out]
+
+
+def _camera_words(results: Results) -> dict[str, str]:
+    """What the frames show, and what one field stands for."""
+    in_picture = results.registration is not None and results.registration.is_picture
+    windows = "positions" not in figures_of(results)
+    return {
+        "seen": "picture" if in_picture else "table",
+        "field_of": "window" if windows else "cycle",
+        "grey": "no value." if in_picture else "not visible, or covered by a fiducial.",
     }
 
 
@@ -198,7 +221,7 @@ def _titles(results: Results, sections: tuple[tuple[str, str, str], ...]) -> lis
 
 
 def _subtitle(provenance: Mapping[str, Any], deviations: xr.Dataset | None, zone: str | None) -> str:
-    axis = provenance["parameters"]["campaign"].get("axis", "")
+    axis = provenance["parameters"]["campaign"].get("axis", "") if deviations is not None else ""
     start = ""
     if deviations is not None and has(deviations, "drift"):
         start = moment(time_span(deviations)[0], zone)
@@ -222,9 +245,14 @@ def _measured(deviations: xr.Dataset | None, fields: xr.Dataset | None) -> str:
         return ""
     first, last = fields["time"].values[[0, -1]]
     return (
-        f"Measured: {fields.sizes['time']} frames of the table over {duration(float((last - first) / np.timedelta64(1, 's')))}, "
-        f"reduced to {fields.sizes['cycle']} fields; no laser was used, so nothing is said of the positioning."
+        f"Measured: {_frames(fields)} frames over {duration(float((last - first) / np.timedelta64(1, 's')))}, reduced to "
+        f"{fields.sizes['cycle']} fields; no laser was used, so nothing is said of the positioning."
     )
+
+
+def _frames(fields: xr.Dataset) -> int:
+    """Number of frames that the fields are made from."""
+    return int(fields["frame_count"].sum()) if "frame_count" in fields else fields.sizes["time"]
 
 
 def _approaches(deviations: xr.Dataset) -> str:
@@ -258,9 +286,10 @@ def _numbers(results: Results, deviations: xr.Dataset | None, fields: xr.Dataset
         # The noise of single cells averages out over the plan; what all share does not.
         u = None if results.radiometry is None else results.radiometry.rise_u.common_K
         add(
-            "Rise of the table",
+            f"Rise of the {_camera_words(results)['seen']}",
             measured(float(rise.mean()), u, "K"),
-            f"mean of the last cycle; {_warmest(results, rise)} {condition(results.inputs, 'field')}".rstrip(),
+            f"mean of the last {_camera_words(results)['field_of']}; {_warmest(results, rise)} "
+            f"{condition(results.inputs, 'field')}".rstrip(),
         )
     if results.loop is not None:
         loop = results.loop
@@ -357,25 +386,11 @@ def _field_uncertainty(part: RadiometryPart) -> str:
     return " ".join(sentences)
 
 
-_INPUT_NAMES = {
-    "emissivity": "emissivity",
-    "reflected_temperature_K": "reflected apparent temperature / K",
-    "atmospheric_temperature_K": "temperature of the air / K",
-    "relative_humidity": "relative humidity",
-    "object_distance_m": "distance / m",
-    "window_transmission": "transmission of the window",
-    "window_temperature_K": "temperature of the window / K",
-    "camera_offset_K": "camera, constant part / K",
-    "camera_scale": "camera, share of the reading in °C",
-    "camera_drift_K": "camera, drift of its zero between cycles / K",
-}
-
-
 def _budget_table(part: RadiometryPart) -> Table:
     """Return every input that all frames share with its contributions to temperature and rise."""
     rows = [
         [
-            _INPUT_NAMES.get(entry.input, entry.input),
+            INPUT_NAMES.get(entry.input, entry.input),
             "–" if entry.value is None else f"{entry.value:.5g}",
             number(entry.u, 2),
             entry.source,

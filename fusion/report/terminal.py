@@ -17,6 +17,7 @@ from fusion.report.conclusions.actions import next_steps
 from fusion.report.conclusions.answers import conclude, headline
 from fusion.report.findings import (
     baseline_errors,
+    figures_of,
     hold_out_errors,
     scatter_range,
     step_errors,
@@ -58,7 +59,7 @@ def summary_rows(results: Results) -> list[tuple[str, str]]:
     rows: list[tuple[str, str]] = []
     if results.inputs is not None:
         doubts = [f"doubted: {check.evidence} {check.remedy}" for check in results.inputs.doubts]
-        lines = [line for line in (*doubts, untouched(results.inputs)) if line]
+        lines = [line for line in (*doubts, untouched(results.inputs, figures_of(results))) if line]
         rows.append(("inputs", "\n".join(lines) or f"sound in {len(results.inputs.checks)} checks"))
     if results.registration is not None:
         rows.append(("registration", _registration(results.registration)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 from functools import cache
 from typing import NamedTuple
@@ -22,6 +22,20 @@ _FIGURE_WORDS: dict[Figures, str] = {
     "attribution": "which part of the field goes with the drift",
 }
 
+
+#: Inputs of the radiometry in words, with their unit.
+INPUT_NAMES = {
+    "emissivity": "emissivity",
+    "reflected_temperature_K": "reflected apparent temperature / K",
+    "atmospheric_temperature_K": "temperature of the air / K",
+    "relative_humidity": "relative humidity",
+    "object_distance_m": "distance / m",
+    "window_transmission": "transmission of the window",
+    "window_temperature_K": "temperature of the window / K",
+    "camera_offset_K": "camera, constant part / K",
+    "camera_scale": "camera, share of the reading in °C",
+    "camera_drift_K": "camera, drift of its zero between cycles / K",
+}
 
 #: Parts of the drift as the correlation names them, in plain words.
 CHANNELS = {
@@ -340,15 +354,17 @@ def premise(inputs: InputsPart | None, *figures: Figures) -> str:
     return join(premises) if len(premises) <= 2 else f"{len(premises)} doubted inputs are right"
 
 
-def untouched(inputs: InputsPart | None) -> str:
+def untouched(inputs: InputsPart | None, there: Collection[Figures] = tuple(_FIGURE_WORDS)) -> str:
     """Return one sentence on what holds whatever becomes of the doubts, empty where nothing is doubted or nothing is left.
 
     Parameters
     ----------
     inputs : InputsPart or None
         The part ``inputs`` of the results.
+    there : collection of Figures
+        What the run has.
     """
     if inputs is None or not inputs.doubts:
         return ""
-    held = [words for figure, words in _FIGURE_WORDS.items() if not inputs.premises(figure)]
+    held = [words for figure, words in _FIGURE_WORDS.items() if figure in there and not inputs.premises(figure)]
     return f"Not touched by that: {join(held)}." if held else ""

@@ -97,7 +97,7 @@ def draft_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
     yield ""
     yield "[campaign]"
     yield f"title = {_quoted(asker.text('Title of the report', content.folder.name or 'Campaign'))}"
-    if content.frames or readings:
+    if readings:
         yield f"axis = {_quoted(asker.text('Axis that was measured', 'X'))}"
     yield from _time_zone(readings, asker)
     if content.frames:

@@ -331,8 +331,12 @@ class Obstructions:
         self._until = 0
 
     def examine(self, block: Block, result: BlockView) -> None:
-        """Compare the frames of a block with the last frame that shows the table, and with later ones where they differ."""
-        if result.samples.shape[1] < _LEAST_PIXELS:
+        """Compare the frames of a block with the last frame that shows the table, and with later ones where they differ.
+
+        Of a picture nothing is known: what changes fast in it may be what was to be seen.
+        """
+        in_picture = self.registrations.spans[block.span].registration.is_picture
+        if in_picture or result.samples.shape[1] < _LEAST_PIXELS:
             return
         if block.span != self._span:
             self._span, self._state = block.span, self._first_state(block, result.samples)

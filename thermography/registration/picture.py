@@ -65,7 +65,7 @@ def picture_grid(shape: tuple[int, int], cell_px: int | None = None) -> PlanGrid
     if size not in _dividing(shape):
         choice = ", ".join(str(one) for one in _dividing(shape) if 2 * one <= min(shape))
         raise ThermographyError(
-            f'cell_size "{size} px" does not divide frames of {columns} x {rows} pixels; choose one of {choice} px'
+            f'cell_px = "{size} px" does not divide frames of {columns} x {rows} pixels; choose one of {choice} px'
         )
     return PlanGrid(columns, rows, size)
 

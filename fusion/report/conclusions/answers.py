@@ -10,7 +10,7 @@ from fusion.products.results import Results
 from fusion.products.results_attribution import CorrelationPart
 from fusion.products.results_axis import AnomalyPart
 from fusion.products.results_loop import Loop, RecordLoop, StepPart
-from fusion.products.results_part import TimePart
+from fusion.products.results_part import Quantity, TimePart
 from fusion.report.conclusions.effects import phrase, step_phrase
 from fusion.report.findings import (
     anomaly_figures,
@@ -19,15 +19,19 @@ from fusion.report.findings import (
     quoted_values,
     quoted_window,
     randomised_causes,
+    spot_places,
 )
 from fusion.report.wording import (
+    INPUT_NAMES,
     alike,
     conditional,
+    duration,
     effect_words,
     join,
     measured,
     number,
     p_words,
+    place,
 )
 
 #: A drift of less than this share of the median scatter is none that readings can show.
@@ -48,6 +52,10 @@ _ANOMALY_CAUSES = {
     "step": "one step at cycle {cycle}",
     "undetermined": "these data do not tell why",
 }
+
+
+#: Hotspots that the summary names; the table has all.
+_TOLD = 3
 
 
 class Conclusion(NamedTuple):
@@ -75,8 +83,8 @@ def conclude(results: Results) -> list[Conclusion]:
     """
     answers = (
         ("How much", _how_much(results)),
-        ("Where", _where(results)),
-        ("How sure", _how_sure(results)),
+        ("Where", _where(results) + _rise(results)),
+        ("How sure", _how_sure(results) + _rise_u(results)),
         ("Which place", _which_place(results)),
         ("What remains", _what_remains(results)),
     )
@@ -92,10 +100,82 @@ def headline(results: Results) -> str:
         Results of a run.
     """
     if results.loop is None:
-        return conditional("Evaluated without a model of the drift.", results.inputs, "causes")
+        return _without_model(results)
     return conditional(
         _verdict(results.loop, results.time, record=results.registration is None), results.inputs, "causes"
     )
+
+
+def _without_model(results: Results) -> str:
+    """The outcome of a campaign whose drift has no model: the rise where only a camera measured, else the accuracy by the standard."""
+    field = results.field
+    if field is not None and results.iso230 is None:
+        seen = "picture" if results.registration is not None and results.registration.is_picture else "table"
+        mean, largest = measured_quantity(field.mean_rise_K, "K"), measured_quantity(field.largest_rise_K, "K")
+        over = duration(field.duration_s)
+        text = f"Over {over} the {seen} changed by {mean} on average; the largest rise of a cell is {largest}."
+        return conditional(text, results.inputs, "field")
+    if results.iso230 is not None:
+        quoted = quoted_window(results.iso230)
+        symbol, value = next(iter(quoted_values(quoted).items()))
+        text = f"Positioning accuracy {symbol} = {value} by ISO 230-2 (k = 2); the drift has no model."
+        return conditional(text, results.inputs, "positions")
+    return conditional("Evaluated without a model of the drift.", results.inputs, "causes")
+
+
+def measured_quantity(quantity: Quantity, unit: str) -> str:
+    """Return a value with its expanded uncertainty (k = 2).
+
+    Parameters
+    ----------
+    quantity : Quantity
+        Value and standard uncertainty.
+    unit : str
+        Of both.
+    """
+    return measured(quantity.value, quantity.u, unit)
+
+
+def _rise(results: Results) -> list[str]:
+    """Rise of a table or picture of which only the camera tells: where and when it is largest, and the hotspots of the last field."""
+    field = results.field
+    if field is None or results.drift is not None or results.iso230 is not None:
+        return []
+    unit = "mm" if field.largest_x_px is None else "px"
+    x, y = (getattr(field, f"largest_{axis}_{unit}") for axis in "xy")
+    last = field.largest_cycle == field.fields
+    when = "in the last field" if last else f"after {duration(field.largest_after_s)} (field {field.largest_cycle})"
+    sentences = [
+        f"The largest rise of a cell, {measured_quantity(field.largest_rise_K, 'K')}, is at {place(x, y, unit)} {when}."
+    ]
+    spots = results.hotspots or ()
+    named = [
+        f"{spot.name} at {spot_places(spot).peak}, {measured(spot.peak_rise_K, spot.peak_rise_u_K, 'K')}"
+        for spot in spots
+    ]
+    more = f", and {len(named) - _TOLD} more (table of hotspots)" if len(named) > _TOLD else ""
+    sentences.append(
+        f"Warmer than their surroundings in the last field: {'; '.join(named[:_TOLD])}{more}."
+        if named
+        else "In the last field no place stands out from its surroundings."
+    )
+    return [conditional(" ".join(sentences), results.inputs, "field")]
+
+
+def _rise_u(results: Results) -> list[str]:
+    """What the uncertainty of the rise rests on, where only the camera tells."""
+    radiometry = results.radiometry
+    if radiometry is None or results.drift is not None or results.iso230 is not None:
+        return []
+    largest = max(radiometry.budget, key=lambda entry: entry.rise_u_percent or 0.0, default=None)
+    share = radiometry.rise_scale_u
+    if largest is None or share is None or not largest.rise_u_percent:
+        return []
+    return [
+        f"Values after ± are expanded uncertainties (k = 2). Every rise is uncertain by {100 * share:.2g} % of itself (k = 1), most of it "
+        f"from {INPUT_NAMES.get(largest.input, largest.input).split(' / ')[0]} ({largest.source}). Places are not tested against chance, "
+        "as no drift was measured that could follow them."
+    ]
 
 
 def _verdict(loop: Loop, time: TimePart | None, *, record: bool) -> str:

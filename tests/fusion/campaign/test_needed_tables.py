@@ -11,6 +11,7 @@ from fusion.campaign.needed_tables import check_tables
 LASER: dict[str, Any] = {"interferometry": {}}
 CAMERA: dict[str, Any] = {"thermography": {}, "plan": {"size": [], "cell_size": "", "fiducials": ""}}
 AXIS: dict[str, Any] = {"axis": {}}
+PICTURE: dict[str, Any] = {"thermography": {}, "plan": {"registration": "pixels"}}
 SENSORS: dict[str, Any] = {"sensors": {}, "plan": {"size": [], **AXIS}}
 
 
@@ -25,6 +26,8 @@ def check(*tables: dict[str, Any]) -> list[str]:
         (LASER,),
         (LASER, {"plan": {"size": []}}),
         (CAMERA,),
+        (PICTURE,),
+        ({**PICTURE, "plan": {**PICTURE["plan"], "cell_px": "4 px"}},),
         (LASER, CAMERA, {"plan": {**CAMERA["plan"], **AXIS}}),
         (LASER, SENSORS),
         ({"record": {}},),
@@ -47,6 +50,26 @@ def test_any_subset_of_the_instruments_is_a_campaign(tables: tuple[dict[str, Any
         (
             (LASER, CAMERA, {"plan": {**CAMERA["plan"], **AXIS}}, {"thermography": {"window": "5 min"}}),
             "thermography.window: thermography.window divides the frames where no laser gives cycles",
+        ),
+        ((CAMERA, {"plan": {"cell_size": "", "fiducials": ""}}), "plan: [plan] lacks size; add it"),
+        ((CAMERA, {"plan": {**CAMERA["plan"], "cell_px": ""}}), "plan.cell_px: cell_px belongs to a plan of pixels"),
+        (
+            (LASER, PICTURE),
+            'interferometry: plan.registration = "pixels", but [interferometry] needs the measured line',
+        ),
+        (
+            (PICTURE, {"sensors": {}}),
+            'sensors: plan.registration = "pixels", but [sensors] needs the places of the sensors',
+        ),
+        (({"plan": PICTURE["plan"]}, LASER), "plan.registration: "),
+        ((PICTURE, {"thermography": {"table": "moving"}}), 'thermography.table: plan.registration = "pixels"'),
+        ((PICTURE, {"thermography": {"lens": ""}}), 'thermography.lens: plan.registration = "pixels"'),
+        *(
+            (
+                (PICTURE, {"plan": {**PICTURE["plan"], name: ""}}),
+                f'plan.{name}: plan.{name} beside plan.registration = "pixels"',
+            )
+            for name in ("size", "cell_size", "fiducials", "regions", "axis")
         ),
         ((LASER, {"record": {}}), "record: [record] stands instead of [interferometry]"),
         (({"path": ""},), "path: unknown key path"),

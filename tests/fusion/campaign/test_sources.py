@@ -34,6 +34,9 @@ def test_a_window_without_a_frame_is_left_out_and_the_number_says_so() -> None:
         (frames(*np.arange(0, 10, 1 / 60)), 10.0),  # ten minutes at 1 Hz: 60 windows of 10 s
         (frames(0, 45, 90), 3600.0),  # a frame in 45 min: an hour is the first usual length that holds one
         (frames(0, 1), 60.0),
+        (frames(*np.arange(0, 0.004, 0.0005)), 0.05),  # 0.2 s at 33 Hz: shorter than every usual length
+        (frames(0, 0.0661), 2.0),  # two frames 4 s apart: two windows
+        (frames(0, 1e-8), 6e-7),
     ],
 )
 def test_the_usual_window_is_a_round_time_and_makes_at_most_sixty(times: np.ndarray, window_s: float) -> None:

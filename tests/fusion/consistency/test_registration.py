@@ -1,7 +1,12 @@
 """What a registration leaves to doubt."""
 
-import pytest
+from types import SimpleNamespace
 
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from fusion.consistency import registration
 from fusion.consistency.checks import CODES
 from fusion.consistency.registration import check_registration
 
@@ -48,3 +53,23 @@ def test_each_doubt_is_named(changed, code, evidence):
     ((named, text),) = doubts(**changed)
     assert named == code
     assert evidence in text
+
+
+def shifts(monkeypatch, *pictures):
+    """The check of pictures of temperatures, degC."""
+    monkeypatch.setattr(registration, "calibrate", lambda counts, parameters: counts)
+    frames = [SimpleNamespace(read_counts=lambda picture=picture: picture, parameters=None) for picture in pictures]
+    (check,) = registration.check_picture(frames)
+    return check
+
+
+def test_a_picture_that_stays_is_no_doubt_and_one_that_moves_is(monkeypatch):
+    rng = np.random.default_rng(5)
+    scene = 20.0 + 5.0 * ndimage.gaussian_filter(rng.normal(size=(96, 128)), 3.0)
+    still = [scene + rng.normal(scale=0.02, size=scene.shape) for _ in range(4)]
+    assert shifts(monkeypatch, *still).passed
+    moved = shifts(monkeypatch, *still, np.roll(scene, (3, 4), axis=(0, 1)))
+    # A shift of 5 px; the content that comes in at the edge costs a tenth of it.
+    assert not moved.passed and moved.value == pytest.approx(5.0, abs=0.5)
+    other = shifts(monkeypatch, scene, rng.normal(20.0, 1.0, scene.shape))
+    assert not other.passed and "in 1 of them too little is as in the first to tell" in other.evidence

@@ -141,6 +141,52 @@ def test_the_fields_of_the_camera_are_exported_and_no_compensation(camera_result
         export_results(camera_results, "linuxcnc", tmp_path)
 
 
+def test_the_summary_of_the_camera_says_the_rise_and_where_it_is(camera_results: Path) -> None:
+    results = read_results(camera_results)
+    field, rows = results.field, dict(summary_rows(results))
+    assert field is not None and field.fields == 12 and results.hotspots
+    fields = read_dataset(camera_results / "fields.nc")
+    assert field.mean_rise_K.value == pytest.approx(float(fields["temperature_rise"].isel(cycle=-1).mean()), rel=1e-6)
+    assert field.largest_rise_K.value == pytest.approx(float(fields["temperature_rise"].max()), rel=1e-6)
+    page = (camera_results / "report.html").read_text(encoding="utf-8")
+    assert "the table changed by" in page.lower() and "without a model" not in page
+    assert "The largest rise of a cell" in rows["where"] and "hotspot 1 at x " in rows["where"]
+    assert "expanded uncertainties" in rows["how sure"]
+
+
+@pytest.fixture(scope="module")
+def picture_results(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The products of the frames of the small campaign, of whose places nothing is known."""
+    out = tmp_path_factory.mktemp("picture") / "results"
+    path = without(folder / "campaign.toml", "interferometry", "plan", "model", "drivers", name="picture.toml")
+    path.write_text(path.read_text() + '\n[plan]\nregistration = "pixels"\n')
+    run_campaign(path, out)
+    return out
+
+
+def test_frames_without_fiducials_give_fields_in_pixels_and_nothing_in_mm(
+    picture_results: Path, tmp_path: Path
+) -> None:
+    results = read_results(picture_results)
+    fields = read_dataset(picture_results / "fields.nc")
+    rows, columns = fields["reference_frame"].shape
+    cell = float(fields["x"].diff("x")[0])
+    assert (fields.sizes["y"] * cell, fields.sizes["x"] * cell) == (rows, columns)
+    assert fields["x"].attrs["units"] == "1" and fields["x"].attrs["comment"].startswith("px;")
+    assert not [name for name, variable in fields.variables.items() if variable.attrs.get("units") == "mm"]
+    assert results.registration is not None and results.registration.is_picture
+    assert results.hotspots and all(spot.x_mm is None and spot.area is None for spot in results.hotspots)
+    assert results.field is not None and results.field.largest_x_mm is None
+    text = " ".join(text for _, text in summary_rows(results))
+    assert " px" in text and " mm" not in text.replace("plan in mm", "")
+    page = (picture_results / "report.html").read_text(encoding="utf-8")
+    shown = page.replace("nothing is known in mm", "").replace("plan in mm", "").replace("lengths in mm", "")
+    assert not re.search(r"\d mm\b|/ mm\b", shown)
+    assert {"fields", "registration"} <= set(sections(picture_results))
+    (table,) = export_results(picture_results, "csv", tmp_path).files
+    assert table.read_text().splitlines()[0].split(",")[1:3] == ["y_px", "x_px"]
+
+
 @pytest.fixture(scope="module")
 def ordinary_test(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Results]:
     """The first five cycles of the small campaign, with and without camera."""

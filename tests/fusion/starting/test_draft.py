@@ -49,6 +49,18 @@ def test_without_answers_the_missing_lines_are_marked_and_the_check_names_them(c
     assert {fault.split(", line ")[1].split(":")[0] for fault in faults} == numbers
 
 
+def test_a_folder_of_frames_alone_is_ready_with_the_picture_as_its_plan(copied: Path) -> None:
+    path, missing = write_campaign(copied / "thermal", Asker(None))
+    campaign = load_campaign(path)
+    assert missing == [] and campaign.plan is not None and campaign.plan.in_pixels and campaign.campaign.axis == ""
+    checked = check_campaign(path)
+    assert checked.faults == () and any("plan: the picture of " in line for line in checked.content)
+    path.unlink()
+    in_mm = Asker(lambda question, default: "fiducials" if question.startswith("No table of fiducials") else default)
+    _, missing = write_campaign(copied / "thermal", in_mm)
+    assert [line.split(" = ")[0].split(": ")[1] for line in missing] == ["size", "fiducials"]
+
+
 def test_an_existing_file_is_never_replaced(copied: Path) -> None:
     before = (copied / "campaign.toml").read_text()
     with pytest.raises(DraftError, match=r"campaign.toml exists already and is not replaced"):
