@@ -19,6 +19,7 @@ from thermography.radiometry.overrides import Overrides
 from thermography.radiometry.planck import calibrate
 from thermography.registration.displacement import RegistrationSpan
 from thermography.registration.lens import read_lens
+from thermography.registration.picture import picture_grid, register_picture
 from thermography.registration.plan import PlanGrid, read_fiducials
 from thermography.registration.register import Registration, register
 
@@ -40,16 +41,22 @@ class FieldsOfCycles:
     def __init__(self, campaign: Campaign) -> None:
         thermography, plan = campaign.thermography, campaign.plan
         assert thermography is not None and plan is not None
-        assert plan.fiducials is not None and plan.cell_size_mm is not None
-        self.grid = PlanGrid(*plan.size_mm, plan.cell_size_mm)
+        self._plan = plan
         self._moving = thermography.table == "moving"
         self._direction = None if plan.axis is None else plan.axis.direction
         self._override = Overrides(overridden_parameters(thermography))
-        self._fiducials = read_fiducials(campaign.resolve(plan.fiducials))
+        self._fiducials = [] if plan.fiducials is None else read_fiducials(campaign.resolve(plan.fiducials))
         self._lens = None if thermography.lens is None else read_lens(campaign.resolve(thermography.lens))
+        self._grid: PlanGrid | None = None
         self._registration: Registration | None = None
         self._registrations: Registrations | None = None
         self._tried, self._wait = 0, 1
+
+    @property
+    def grid(self) -> PlanGrid:
+        """Cells of the plan; of a plan that is the picture, once a frame was seen."""
+        assert self._grid is not None
+        return self._grid
 
     def reduce(self, frames: Sequence[FrameReference]) -> tuple[xr.DataArray | None, tuple[str, ...]]:
         """Return the mean temperature of a cycle's frames on the plan.
@@ -91,7 +98,14 @@ class FieldsOfCycles:
             : 1 if self._moving else _REGISTRATION_FRAMES
         ]
         reference = np.mean([calibrate(frame.read_counts(), self._override(frame)) for frame in first], axis=0)
-        registration = register(reference, self._fiducials, grid=self.grid, lens=self._lens)
+        plan = self._plan
+        if plan.in_pixels:
+            self._grid = picture_grid(reference.shape, plan.cell_px)
+            registration = register_picture(reference.shape)
+        else:
+            assert plan.size_mm is not None and plan.cell_size_mm is not None
+            self._grid = PlanGrid(*plan.size_mm, plan.cell_size_mm)
+            registration = register(reference, self._fiducials, grid=self._grid, lens=self._lens)
         self._registrations = Registrations([RegistrationSpan(0, registration)], self.grid)
         self._registration = registration
         return registration
