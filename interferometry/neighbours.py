@@ -277,7 +277,8 @@ def telescoping_error(deviations: xr.Dataset) -> float:
     Returns
     -------
     float
-        max |sum of the links up to i - (mean_1 - mean_i)| over directions and targets, um: rounding only where no reading is missing.
+        Largest magnitude of (sum of the links up to i) - (mean_1 - mean_i) over directions and targets, um: rounding only where no
+        reading is missing.
     """
     x = _along_axis(deviations)
     mean = x.mean("cycle").values

@@ -58,7 +58,7 @@ def profile_gains(
     -------
     ProfileGains
         Candidates in the order in which the groups number them. Columns of a candidate that may be present without the effect
-        (:attr:`fusion.effects.effect.Candidate.beside`) are part of the model it is held against, at the price of one unit of
+        (``beside`` of :class:`fusion.effects.effect.Candidate`) are part of the model it is held against, at the price of one unit of
         log-likelihood each.
     """
     n, count = responses.shape

@@ -88,7 +88,7 @@ def evaluate_iso230(
     Notes
     -----
     ISO 230-2:2014, clause 3; docs/method/iso230.md. With mean deviations m and their standard deviations s, up and down for the
-    directions: B = max |m_up - m_down|, R_i = max(2 s_up + 2 s_down + |B_i|, 4 s_up, 4 s_down), R = max R_i, E = max m - min m,
+    directions: B = max(abs(m_up - m_down)), R_i = max(2 s_up + 2 s_down + abs(B_i), 4 s_up, 4 s_down), R = max R_i, E = max m - min m,
     M = range of (m_up + m_down) / 2, A = max(m + 2 s) - min(m - 2 s). Uncertainties by the law of propagation (JCGM 100:2008) with the
     contributions of Annex A.
 

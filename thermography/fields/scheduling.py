@@ -139,7 +139,7 @@ def in_order(pool: Pool, tasks: Iterable[tuple[Task, tuple[Any, ...]]]) -> Gener
     ----------
     pool : Pool
         From `open_pool`.
-    tasks : iterable of (task, (function, *arguments))
+    tasks : iterable of (task, (function, argument, ...))
         The task itself may be any object; it is returned with its result.
 
     Yields

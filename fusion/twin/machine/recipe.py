@@ -347,7 +347,7 @@ class Camera(_TomlTable):
 
 @dataclass(frozen=True)
 class EffectRecipe(_TomlTable):
-    """One undeclared effect; see :data:`fusion.twin.machine.effects.EFFECTS` for the names.
+    """One undeclared effect; see :mod:`fusion.twin.machine.effects` for the names.
 
     Attributes
     ----------

@@ -1,0 +1,182 @@
+"""Pages of the reference that are written from the code: modules, command, campaign file, recipe and results."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+import typing
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import thermofuse
+import typer.cli
+import typer.main
+from sphinx.application import Sphinx
+
+from fusion import cli
+from fusion.campaign.config import campaign_schema
+from fusion.products.results import results_schema
+from fusion.twin.recipe_file import recipe_schema
+
+PACKAGES = ("thermography", "interferometry", "fusion")
+
+
+def first_sentence(text: str | None) -> str:
+    """Return the first paragraph of a docstring in one line."""
+    return " ".join((text or "").strip().partition("\n\n")[0].split())
+
+
+def folders() -> dict[str, list[str]]:
+    """Return every folder of the packages by dotted name, with its modules in alphabetical order."""
+    found: dict[str, list[str]] = {}
+    for package in PACKAGES:
+        found[package] = [package]
+        root = importlib.import_module(package)
+        for module in pkgutil.walk_packages(root.__path__, f"{package}."):
+            if module.name.rpartition(".")[2].startswith("__"):
+                continue
+            home = module.name if module.ispkg else module.name.rpartition(".")[0]
+            found.setdefault(home, [home])
+            if not module.ispkg:
+                found[home].append(module.name)
+    return found
+
+
+def api_page(folder: str, modules: list[str]) -> str:
+    """Return the page of a folder: its modules with every public class and function."""
+    title = f"{folder}"
+    lines = [title, "=" * len(title), ""]
+    for module in modules:
+        if module == folder:
+            lines += [f".. automodule:: {module}", "   :no-members:", ""]
+            continue
+        name = module.removeprefix(f"{folder}.")
+        lines += [name, "-" * len(name), "", f".. automodule:: {module}", "   :members:", "   :ignore-module-all:", "   :show-inheritance:", ""]
+    return "\n".join(lines)
+
+
+def home_of(thing: Any, name: str) -> str:
+    """Return the dotted name under which a public object is defined."""
+    module = getattr(thing, "__module__", "")
+    return f"{module}.{getattr(thing, '__qualname__', name)}"
+
+
+def names_table(names: Mapping[str, Any]) -> str:
+    """Return a table of public names, each with a link to its description and the first sentence of it."""
+    rows = ["| name | what it does |", "|---|---|"]
+    for name, thing in names.items():
+        role = "class" if inspect.isclass(thing) else "func"
+        rows.append(f"| {{py:{role}}}`{name} <{home_of(thing, name)}>` | {first_sentence(thing.__doc__)} |")
+    return "\n".join(rows) + "\n"
+
+
+def public_names() -> Iterator[tuple[str, str]]:
+    """Yield a table of names for thermofuse and for each package."""
+    yield "thermofuse", names_table({name: getattr(thermofuse, name) for name in thermofuse.__all__})
+    for package in PACKAGES:
+        module = importlib.import_module(package)
+        names = {name: getattr(module, name) for name in module.__all__}
+        yield package, names_table(names)
+
+
+def type_of(schema: Mapping[str, Any]) -> str:
+    """Say in a few words what a value of a JSON Schema may be."""
+    if "$ref" in schema:
+        name = schema["$ref"].rpartition("/")[2]
+        return f"[{name}](#{anchor(name)})"
+    if "anyOf" in schema or "oneOf" in schema:
+        choices = [type_of(choice) for choice in schema.get("anyOf", schema.get("oneOf", []))]
+        return " or ".join(dict.fromkeys(choices))
+    if "enum" in schema:
+        return ", ".join(f"`{value}`" for value in schema["enum"])
+    if "const" in schema:
+        return f"`{schema['const']}`"
+    kind = schema.get("type", "any value")
+    if kind == "array" and "prefixItems" in schema:
+        return f"list of {len(schema['prefixItems'])}: {type_of(schema['prefixItems'][0])}"
+    if kind == "array":
+        return f"list of {type_of(schema.get('items', {}))}"
+    if kind == "object" and isinstance(schema.get("additionalProperties"), Mapping):
+        return f"object of {type_of(schema['additionalProperties'])}"
+    return str(kind)
+
+
+def anchor(name: str) -> str:
+    """Return the target of a model's section."""
+    return f"model-{name.lower()}"
+
+
+def cell(text: str) -> str:
+    """Return a text as one cell of a Markdown table."""
+    return " ".join(text.split()).replace("|", "\\|").replace("*", "\\*").replace("[[", "&#91;[").replace("<", "&lt;")
+
+
+def model_section(name: str, schema: Mapping[str, Any]) -> str:
+    """Return the section of one model: its description and a row for each key."""
+    if "properties" not in schema:
+        return ""
+    required = set(schema.get("required", []))
+    described = any(value.get("description") for value in schema["properties"].values())
+    heads = ["key", "value", "left out", *(["meaning"] if described else [])]
+    rows = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    for key, value in schema["properties"].items():
+        default = "must be given" if key in required else f"`{value['default']}`" if value.get("default") not in (None, "") else ""
+        cells = [f"`{key}`", type_of(value), default, *([cell(value.get("description", ""))] if described else [])]
+        rows.append(f"| {' | '.join(cells)} |")
+    about = first_sentence(schema.get("description")).replace("``", "`")
+    return f"({anchor(name)})=\n## {name}\n\n{about}\n\n" + "\n".join(rows) + "\n\n"
+
+
+def schema_page(schema: Mapping[str, Any]) -> str:
+    """Return the models of a JSON Schema, the outermost first."""
+    models = {schema.get("title", "file"): schema, **schema.get("$defs", {})}
+    return "".join(model_section(name, model) for name, model in models.items())
+
+
+def command_page() -> str:
+    """Return what `thermofuse --help` and the help of every command say."""
+    command = typer.main.get_command(cli.app)
+    context = typer.Context(command, info_name="thermofuse")
+    text = typer.cli.get_docs_for_click(obj=command, ctx=context, name="thermofuse")
+    return text.partition("\n")[2]
+
+
+def write_if_new(path: Path, text: str) -> None:
+    """Write a page unless it says so already, so that it is not read again for nothing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        path.write_text(text, encoding="utf-8")
+
+
+def write_pages(app: Sphinx) -> None:
+    """Write all pages that come from the code, and remove those of folders that are gone."""
+    reference = Path(app.srcdir) / "reference"
+    generated = reference / "_generated"
+    pages = {reference / "api" / f"{folder}.rst": api_page(folder, modules) for folder, modules in folders().items()}
+    for stale in set((reference / "api").glob("*.rst")) - set(pages):
+        stale.unlink()
+    pages |= {generated / f"names_{package}.md": table for package, table in public_names()}
+    pages |= {
+        generated / "command.md": command_page(),
+        generated / "campaign.md": schema_page(campaign_schema()),
+        generated / "recipe.md": schema_page(recipe_schema()),
+        generated / "results.md": schema_page(results_schema()),
+    }
+    for path, text in pages.items():
+        write_if_new(path, text)
+
+
+def is_foreign(app: Sphinx, what: str, name: str, thing: Any, skip: bool, options: Any) -> bool | None:
+    """Leave out aliases of types, which have no docstring of their own, and functions of other libraries."""
+    home = getattr(thing, "__module__", None)
+    foreign = isinstance(home, str) and what == "module" and home.partition(".")[0] not in PACKAGES
+    return True if foreign or typing.get_origin(thing) is not None or isinstance(thing, TypeVar) else None
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Write the pages before Sphinx looks for them."""
+    app.connect("builder-inited", write_pages)
+    app.connect("autodoc-skip-member", is_foreign)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
