@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test soak benchmarks lint mutants audit clean
+.PHONY: demo test docs screenshots soak benchmarks lint mutants audit clean
 
 $(VENV)/.run: pyproject.toml constraints.txt
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" || { echo "thermofuse needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python3.12"; exit 1; }
@@ -14,6 +14,10 @@ $(VENV)/.run: pyproject.toml constraints.txt
 
 $(VENV)/.test: $(VENV)/.run
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[test]"
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.run
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[docs]"
 	@touch $@
 
 # The main job on a campaign of the twin: simulate, run, print the summary and the path of report.html.
@@ -30,6 +34,15 @@ lint: $(VENV)/.test
 # One process per core, each with one thread for linear algebra: more would only wait for one another.
 test: lint
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist loadfile
+
+# The documentation site, tutorials run, in build/docs. Needs no network; measured files that cannot be had leave their page unexecuted, and it says so.
+docs: $(VENV)/.docs
+	OPENBLAS_NUM_THREADS=1 $(BIN)/sphinx-build --fail-on-warning --keep-going --nitpicky --quiet docs build/docs
+	@echo "documentation: $(CURDIR)/build/docs/index.html"
+
+# The pictures of README and documentation, from the demo's report in a headless Chromium.
+screenshots: $(VENV)/.test demo
+	$(BIN)/python docs/pictures/take.py build/demo/results docs/pictures
 
 # Long simulations: the figures that the documentation quotes come from here.
 soak: $(VENV)/.test

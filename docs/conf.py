@@ -14,6 +14,9 @@ sys.path.insert(0, str(HERE / "_extensions"))
 # What tutorials run: the command of this environment, in lines that fit the page.
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
 os.environ["COLUMNS"] = "100"
+os.environ["TTY_COMPATIBLE"] = "0"
+# A progress bar of another library misses its widgets; nothing on these pages would show them.
+os.environ["PYTHONWARNINGS"] = "ignore:IProgress not found"
 
 project = "thermofuse"
 author = "The thermofuse authors"
@@ -25,11 +28,15 @@ extensions = [
     "sphinx.ext.autodoc",
     "numpydoc",
     "myst_nb",
+    "sphinx_design",
     "sphinx.ext.mathjax",
     "reference_pages",
     "measured_files",
 ]
 exclude_patterns = ["reference/_generated"]
+if tags.has("without_modules"):  # noqa: F821 - Sphinx puts it there; `sphinx-build -t without_modules` is quick
+    exclude_patterns += ["reference/api"]
+    suppress_warnings = ["toc.empty_glob", "toc.glob"]
 source_suffix = {".rst": "restructuredtext", ".md": "myst-nb"}
 default_role = "literal"
 # Own names must resolve. Those of other libraries cannot: their inventories would have to be fetched.
@@ -42,7 +49,6 @@ nitpick_ignore_regex = [
 
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist", "attrs_inline"]
 myst_heading_anchors = 3
-suppress_warnings = ["myst.header"]
 
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"

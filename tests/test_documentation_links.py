@@ -15,8 +15,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fusion.sample_data import read_registry
+
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = sorted((ROOT / "docs").rglob("*.md"))
+#: Without those that are written from the code when the site is built.
+PAGES = sorted(page for page in (ROOT / "docs").rglob("*.md") if "_generated" not in page.parts)
 PACKAGES = ("thermography", "interferometry", "fusion")
 DOTTED = rf"(?:{'|'.join(PACKAGES)})(?:\.\w+)+"
 QUOTED = re.compile(rf"`({DOTTED})(?:\((\w+)\))? = ([^`]+)`")
@@ -84,6 +87,8 @@ def test_every_quoted_constant_has_the_value_of_the_code(document: Path) -> None
 def test_every_module_named_in_a_page_exists(document: Path) -> None:
     missing = []
     for dotted in sorted(set(re.findall(rf"`({DOTTED})[`(]", document.read_text(encoding="utf-8")))):
+        if dotted == "fusion.nc":  # a product
+            continue
         try:
             resolve(dotted)
         except (ModuleNotFoundError, AttributeError):
@@ -95,12 +100,19 @@ def test_every_module_named_in_a_page_exists(document: Path) -> None:
 def test_every_file_and_test_named_in_a_page_exists(document: Path) -> None:
     text = document.read_text(encoding="utf-8")
     missing = []
-    for name, test in re.findall(r"\b((?:tests|data|fusion|docs)/[\w./-]*\w)(?:::(\w+))?", text):
+    for name, test in re.findall(r"(?<![\w/])((?:tests|data|fusion|docs)/[\w./-]*\w)(?:::(\w+))?", text):
         path = ROOT / name
         if not path.exists() or (test and not re.search(rf"^def {test}\(", path.read_text(encoding="utf-8"), re.M)):
             missing.append(f"{name}::{test}" if test else name)
     missing += [link for link in re.findall(r"\]\(([\w./-]+\.md)", text) if not (document.parent / link).exists()]
     assert not missing, f"{name_of(document)} names {', '.join(missing)}"
+
+
+@pytest.mark.parametrize("document", PAGES, ids=name_of)
+def test_every_measured_file_of_a_tutorial_is_listed(document: Path) -> None:
+    _, _, head = document.read_text(encoding="utf-8").partition("measured_files:\n")
+    names = re.findall(r"^  - (.*)$", head.partition("---")[0], re.M)
+    assert set(names) <= set(read_registry())
 
 
 def test_every_page_and_test_cited_in_the_code_exists() -> None:

@@ -6,7 +6,7 @@ import importlib
 import inspect
 import pkgutil
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -115,18 +115,38 @@ def cell(text: str) -> str:
 
 def model_section(name: str, schema: Mapping[str, Any]) -> str:
     """Return the section of one model: its description and a row for each key."""
-    if "properties" not in schema:
-        return ""
-    required = set(schema.get("required", []))
-    described = any(value.get("description") for value in schema["properties"].values())
-    heads = ["key", "value", "left out", *(["meaning"] if described else [])]
-    rows = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
-    for key, value in schema["properties"].items():
-        default = "must be given" if key in required else f"`{value['default']}`" if value.get("default") not in (None, "") else ""
-        cells = [f"`{key}`", type_of(value), default, *([cell(value.get("description", ""))] if described else [])]
-        rows.append(f"| {' | '.join(cells)} |")
+    rows = kinds_table(schema["oneOf"]) if "oneOf" in schema else keys_table(schema)
     about = first_sentence(schema.get("description")).replace("``", "`")
     return f"({anchor(name)})=\n## {name}\n\n{about}\n\n" + "\n".join(rows) + "\n\n"
+
+
+def keys_table(schema: Mapping[str, Any]) -> list[str]:
+    """Return a row for each key of a model."""
+    properties = schema.get("properties", {})
+    described = any(value.get("description") for value in properties.values())
+    heads = ["key", "value", "left out", *(["meaning"] if described else [])]
+    rows = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    for key, value in properties.items():
+        meaning = [cell(value.get("description", ""))] if described else []
+        rows.append(f"| {' | '.join([f'`{key}`', type_of(value), left_out(key, schema), *meaning])} |")
+    return rows
+
+
+def left_out(key: str, schema: Mapping[str, Any]) -> str:
+    """Say what holds where a key is left out."""
+    if key in schema.get("required", []):
+        return "must be given"
+    default = schema["properties"][key].get("default")
+    return "" if default in (None, "") else f"`{default}`"
+
+
+def kinds_table(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a row for each kind of a model whose keys hang on its name."""
+    rows = ["| name | further keys |", "|---|---|"]
+    for kind in kinds:
+        keys = [f"`{key}`" for key in kind["properties"] if key != "name"]
+        rows.append(f"| `{kind['title']}` | {', '.join(keys)} |")
+    return rows
 
 
 def schema_page(schema: Mapping[str, Any]) -> str:

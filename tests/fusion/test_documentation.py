@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from typer.main import get_command
@@ -17,29 +18,41 @@ from fusion.effects.library import LIBRARY
 from fusion.effects.thermal import QUASI_STATIC
 from fusion.products.results import CorrelationPart, Notice, SourcePart, assemble
 from fusion.report.terminal import summary_rows
+from fusion.twin.recipe_file import read_recipe
 from tests.fusion.results_sample import PARTS
+from thermography.io.frame_readers import FrameReader
+from thermography.io.temperature_frames import StackOptions
+from thermography.registration.plan import read_fiducials
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+START = (ROOT / "docs/start/index.md").read_text(encoding="utf-8")
+CAMPAIGN_FILE = (ROOT / "docs/reference/campaign-file.md").read_text(encoding="utf-8")
+TUTORIALS = ROOT / "docs/tutorials"
 
 
 def blocks(text: str, language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
 
 
-def test_the_campaign_file_of_the_readme_loads(tmp_path: Path) -> None:
-    campaign, record = blocks(README, "toml")
+def test_the_campaign_files_of_readme_and_reference_load(tmp_path: Path) -> None:
+    (short,) = blocks(README, "toml")
+    campaign, record = blocks(CAMPAIGN_FILE, "toml")
     (tmp_path / "thermal").mkdir()
     for name in ("thermal/a.jpg", "fiducials.csv", "laser.csv", "environment.csv", "drivers.csv", "spindle.xlsx"):
         (tmp_path / name).touch()
     (tmp_path / "campaign.toml").write_text(campaign, encoding="utf-8")
     assert load_campaign(tmp_path / "campaign.toml").model.declared == ("axis_expansion", "table_offset")
+    (tmp_path / "short.toml").write_text(short, encoding="utf-8")
+    assert load_campaign(tmp_path / "short.toml").interferometry is not None
     (tmp_path / "record.toml").write_text('[campaign]\ntitle = "Spindle"\n' + record, encoding="utf-8")
     assert load_campaign(tmp_path / "record.toml").record is not None
 
 
-def test_the_demo_of_the_readme_has_the_rows_that_a_run_prints() -> None:
-    (shown,) = re.findall(r"^Demo: (.*?)^```", README, flags=re.DOTALL | re.MULTILINE)
+def test_the_demo_of_the_start_page_has_the_rows_that_a_run_prints() -> None:
+    (shown,) = re.findall(r"^Demo: (.*?)^```", START, flags=re.DOTALL | re.MULTILINE)
+    (begun,) = re.findall(r"^Demo: .*?\n(.*?)^```", README, flags=re.DOTALL | re.MULTILINE)
+    assert begun and all(line in shown for line in begun.splitlines())
     names = [name.strip() for name in re.findall(r"^│(.*?)│", shown, flags=re.MULTILINE) if name.strip()]
     source = SourcePart.model_construct(kind="cell", name="", part="common", x_mm=355.0, y_mm=95.0, p_value=0.002)
     correlation = CorrelationPart.model_construct(verdict="attributable", source=source, randomised_duty=None)
@@ -54,6 +67,46 @@ def test_every_command_of_the_readme_exists() -> None:
     known = set(get_command(cli.app).commands)  # type: ignore[attr-defined]
     shown = {line.split()[1] for line in "\n".join(blocks(README, "sh")).splitlines() if line.startswith("thermofuse ")}
     assert shown == known
+
+
+def test_the_readme_is_short_and_its_pictures_are_small() -> None:
+    assert len(README.splitlines()) < 150
+    for name in re.findall(r"!\[.*?\]\((.*?)\)", README):
+        assert (ROOT / name).stat().st_size < 150_000, name
+
+
+def test_the_demo_of_the_tutorial_is_the_demo() -> None:
+    page = (TUTORIALS / "demo.md").read_text(encoding="utf-8")
+    (recipe,) = re.findall(r"%%writefile demo.toml\n(.*?)```", page, flags=re.DOTALL)
+    assert tomllib.loads(recipe) == tomllib.loads((ROOT / "data/demo.toml").read_text(encoding="utf-8"))
+
+
+def test_the_recipes_of_the_tutorials_are_valid(tmp_path: Path) -> None:
+    page = (TUTORIALS / "position-3.md").read_text(encoding="utf-8")
+    (recipe,) = re.findall(r"%%writefile loose.toml\n(.*?)```", page, flags=re.DOTALL)
+    (tmp_path / "loose.toml").write_text(recipe, encoding="utf-8")
+    assert read_recipe(tmp_path / "loose.toml").test.cycles == 60
+
+
+def test_the_reader_of_the_how_to_reads_a_file(tmp_path: Path) -> None:
+    reader, readings = blocks((ROOT / "docs/how-to/own-reader.md").read_text(encoding="utf-8"), "python")
+    names: dict[str, Any] = {"__name__": "own_reader"}
+    exec(compile(reader, "own-reader.md", "exec"), names)
+    file = tmp_path / "20260309_063000.txt"
+    file.write_text("THERM 3 2\n20.0 20.5 21.0\n22.0 22.5 23.0\n", encoding="ascii")
+    therm = names["ThermReader"]()
+    assert isinstance(therm, FrameReader) and therm.recognises(file, file.read_bytes())
+    (frame,) = therm.index(file, StackOptions(time_in_name="%Y%m%d_%H%M%S"))
+    assert frame.time == np.datetime64("2026-03-09T06:30:00")
+    assert frame.read_temperature().tolist() == [[20.0, 20.5, 21.0], [22.0, 22.5, 23.0]]
+    exec(compile(readings, "own-reader.md", "exec"), names)
+    assert names["test"].sizes == {"cycle": 2, "direction": 2, "target": 3}
+
+
+def test_the_points_of_the_how_to_are_fiducials(tmp_path: Path) -> None:
+    (table,) = blocks((ROOT / "docs/how-to/no-markers.md").read_text(encoding="utf-8"), "text")
+    (tmp_path / "fiducials.csv").write_text(table, encoding="utf-8")
+    assert all(point.is_point for point in read_fiducials(tmp_path / "fiducials.csv"))
 
 
 def test_the_effect_of_contributing_is_a_whole_effect() -> None:

@@ -50,6 +50,21 @@ def test_sc660_sequence_stores_the_transmission_that_the_formula_gives(real_file
     assert path_transmission(frame.parameters) == pytest.approx(stored, rel=1e-7)
 
 
+@pytest.mark.real_data
+def test_half_the_path_taken_twice_is_not_what_the_vendor_calculates(real_file) -> None:
+    folder = "gpereyrairujo__IRimage/Windows/IRimage/test/"
+    frame = read_frame(real_file(folder + "test_image.jpg"))
+    vendor = np.genfromtxt(real_file(folder + "csv/test_image.csv"), delimiter=",", encoding="utf-8-sig")
+    half = path_transmission(override(frame.parameters, object_distance_m=frame.parameters.object_distance_m / 2))
+    assert (path_transmission(frame.parameters), half**2) == pytest.approx((0.98640, 0.98090), abs=5e-6)
+    twice = override(frame.parameters, stored_transmission=half**2)
+    difference = temperature_from_counts(frame.counts, twice) - vendor
+    # As the method page quotes it: 0.102 K at most, positive above the temperature of the air and negative below.
+    assert np.abs(difference).max() == pytest.approx(0.102, abs=0.0005)
+    air_degC = frame.parameters.atmospheric_temperature_K - 273.15
+    assert (difference[vendor > air_degC + 1] > 0).all() and (difference[vendor < air_degC - 1] < 0).all()
+
+
 def test_formula_at_hand_calculated_points() -> None:
     """By hand, with rounded constants: S(300 K) = 21106.77 / (0.012545258 (exp(1501/300) - 1)) + 7340 = 18714.9 counts."""
     black = replace(PARAMETERS, emissivity=1.0, object_distance_m=0.0)

@@ -1,0 +1,64 @@
+"""The documentation site builds without a warning, every page is reached, and nothing on it is loaded from elsewhere.
+
+The pages of single modules and the runs of the tutorials are left out: `make docs` has them.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+#: What makes a browser load something at once, as opposed to a link.
+LOADED = re.compile(
+    r"""<(?:script|img|iframe|source|embed)\b[^>]*?\bsrc=["'](.*?)["']|<link\b[^>]*?\bhref=["'](.*?)["']|@import\s+["'](.*?)["']|url\(["']?(.*?)["']?\)"""
+)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site in a folder of its own; any warning of Sphinx fails here: unknown pages and headings, pages that no table of contents names."""
+    out = tmp_path_factory.mktemp("site")
+    options = ["--fail-on-warning", "--keep-going", "--quiet", "--tag", "without_modules"]
+    command = [sys.executable, "-m", "sphinx", *options, "-d", str(out / "doctrees"), str(ROOT / "docs"), str(out / "html")]
+    environment = os.environ | {"THERMOFUSE_DOCS_EXECUTION": "off"}
+    built = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=ROOT, check=False)
+    assert built.returncode == 0, built.stderr
+    return out / "html"
+
+
+def test_nothing_is_loaded_from_a_network(site: Path) -> None:
+    outside = []
+    for file in [*site.rglob("*.html"), *site.rglob("*.css")]:
+        found = [name for names in LOADED.findall(file.read_text(encoding="utf-8")) for name in names]
+        outside += [f"{file.name}: {name}" for name in found if re.match(r"(?:\w+:)?//", name)]
+    assert not outside, outside[:10]
+
+
+def test_every_page_is_there_and_a_tutorial_that_was_not_run_says_so(site: Path) -> None:
+    pages = {page.relative_to(ROOT / "docs").with_suffix(".html") for page in (ROOT / "docs").rglob("*.md") if "_generated" not in page.parts}
+    assert pages <= {page.relative_to(site) for page in site.rglob("*.html")}
+    for page in sorted((ROOT / "docs/tutorials").glob("*.md")):
+        runs = "{code-cell}" in page.read_text(encoding="utf-8")
+        text = (site / "tutorials" / f"{page.stem}.html").read_text(encoding="utf-8")
+        assert ("not executed" in text.split("<article", 1)[1].split("</h1>", 1)[1][:2000]) is runs
+
+
+def test_equations_are_drawn_by_a_script_of_the_site(site: Path) -> None:
+    page = (site / "method/radiometry.html").read_text(encoding="utf-8")
+    assert r"\frac{R_1}" in page
+    (script,) = re.findall(r'src="\.\./_static/(tex-svg\.js)', page)
+    assert (site / "_static" / script).stat().st_size > 1e6
+
+
+def test_reference_comes_from_the_models_and_the_command(site: Path) -> None:
+    assert "camera_scale_u" in (site / "reference/campaign-file.html").read_text(encoding="utf-8")
+    assert "held-out error" in (site / "start/reading-a-report.html").read_text(encoding="utf-8")
+    assert "--no-plugins" in (site / "reference/command.html").read_text(encoding="utf-8")
+    assert "cross_rmse_before_um" in (site / "reference/results.html").read_text(encoding="utf-8")
+    assert "unseen_heat_source" in (site / "reference/recipe.html").read_text(encoding="utf-8")
