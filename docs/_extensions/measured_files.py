@@ -58,10 +58,8 @@ def leave_out(app: Sphinx, config: Config) -> None:
 def say_so(app: Sphinx, page: str, source: list[str]) -> None:
     """Put the warning below the title of a page that is not run."""
     runs = "{code-cell}" in source[0]
-    if app.config.nb_execution_mode == "off" and runs:
-        reason = "execution was switched off"
-    else:
-        reason = app.not_executed.get(page, "")  # type: ignore[attr-defined]
+    left_out: dict[str, str] = app.not_executed  # type: ignore[attr-defined]
+    reason = "execution was switched off" if runs and app.config.nb_execution_mode == "off" else left_out.get(page, "")
     if reason:
         head, title, rest = source[0].partition("\n# ")
         line, _, body = rest.partition("\n")

@@ -10,11 +10,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import thermofuse
 import typer.cli
 import typer.main
 from sphinx.application import Sphinx
 
+import thermofuse
 from fusion import cli
 from fusion.campaign.config import campaign_schema
 from fusion.products.results import results_schema
@@ -53,7 +53,16 @@ def api_page(folder: str, modules: list[str]) -> str:
             lines += [f".. automodule:: {module}", "   :no-members:", ""]
             continue
         name = module.removeprefix(f"{folder}.")
-        lines += [name, "-" * len(name), "", f".. automodule:: {module}", "   :members:", "   :ignore-module-all:", "   :show-inheritance:", ""]
+        lines += [
+            name,
+            "-" * len(name),
+            "",
+            f".. automodule:: {module}",
+            "   :members:",
+            "   :ignore-module-all:",
+            "   :show-inheritance:",
+            "",
+        ]
     return "\n".join(lines)
 
 

@@ -24,7 +24,9 @@ def compact(picture: bytes) -> bytes:
         image.quantize(colours, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
         if small.tell() < _MOST_BYTES:
             return small.getvalue()
-    raise SystemExit(f"a picture of {image.size} px is larger than {_MOST_BYTES} bytes with 64 colours; take less of the page")
+    raise SystemExit(
+        f"a picture of {image.size} px is larger than {_MOST_BYTES} bytes with 64 colours; take less of the page"
+    )
 
 
 def take(report: Path, folder: Path) -> None:
