@@ -22,7 +22,7 @@ LOADED = re.compile(
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The site in a folder of its own; any warning of Sphinx fails here, as of unknown pages and of pages without a place in the contents."""
+    """The site in a folder of its own; any warning of Sphinx fails here, as of pages without a place in the contents."""
     out = tmp_path_factory.mktemp("site")
     options = ["--fail-on-warning", "--keep-going", "--quiet", "--tag", "few_modules"]
     command = [
