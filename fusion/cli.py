@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from enum import StrEnum
+from functools import reduce
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -78,10 +79,15 @@ def common(
 @app.command()
 def run(
     campaigns: Annotated[
-        list[Path], typer.Argument(metavar="CAMPAIGN.toml...", help="One campaign file, or two of one machine.")
+        list[str],
+        typer.Argument(
+            metavar="CAMPAIGN.toml...",
+            help="One campaign file or its address (s3://, https://), or two of one machine.",
+        ),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Results folder; left out: 'results' beside the campaign file.")
+        Path | None,
+        typer.Option(help="Results folder; left out: 'results' beside the campaign file, or here for an address."),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue a run that is in the results folder.")] = False,
     scheduler: Annotated[
@@ -118,7 +124,8 @@ def run(
         errors.print("thermofuse: one campaign can be watched at a time", highlight=False)
         raise typer.Exit(ExitCode.BAD_INPUT)
 
-    folders = _folders(campaigns, out)
+    places = [_place(text) for text in campaigns]
+    folders = _folders(places, out)
     with _answering([folder for _, folder in folders]):
         # The libraries may take seconds to load: something is seen before that.
         with _progress(quiet=quiet) as report:
@@ -130,8 +137,8 @@ def run(
         if no_plugins:
             leave_plugins_out()
         if watch:
-            _watch(campaigns[0], until_idle_s=until_idle, wanted=wanted, quiet=quiet)
-        join = _joining(campaigns) if len(folders) == 2 else None
+            _watch(_here(places[0], "--watch follows"), until_idle_s=until_idle, wanted=wanted, quiet=quiet)
+        join = _joining([_here(place, "two are joined from") for place in places]) if len(folders) == 2 else None
         for campaign, folder in folders:
             with _progress(quiet=quiet) as report:
                 results = _run_or_keep(campaign, folder, resume=resume, scheduler=scheduler, report=report)
@@ -162,9 +169,9 @@ def _watch(campaign: Path, *, until_idle_s: float | None, wanted: str, quiet: bo
                 console.print(live_line(state), soft_wrap=True, highlight=False, markup=False)
 
 
-def _run_or_keep(campaign: Path, folder: Path, *, resume: bool, scheduler: str | None, report: Report) -> Results:
+def _run_or_keep(campaign: Path | str, folder: Path, *, resume: bool, scheduler: str | None, report: Report) -> Results:
     """Run a campaign, or read the results of a run that is whole, for which the libraries of the analysis are not loaded."""
-    if resume:
+    if resume and isinstance(campaign, Path):
         from fusion.campaign.config import load_campaign
         from fusion.pipeline.provenance import kept_results
 
@@ -197,11 +204,26 @@ def _progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
         yield report
 
 
-def _folders(campaigns: list[Path], out: Path | None) -> list[tuple[Path, Path]]:
+def _place(text: str) -> Path | str:
+    """Return an address as it is written, anything else as a path."""
+    return text if "://" in text else Path(text)
+
+
+def _here(place: Path | str, what: str) -> Path:
+    """Return a path; refuse an address, which `what` cannot use."""
+    if isinstance(place, str):
+        from fusion.remote import RemoteError
+
+        raise RemoteError(f"{place}: {what} campaigns of this machine; name a path")
+    return place
+
+
+def _folders(campaigns: list[Path | str], out: Path | None) -> list[tuple[Path | str, Path]]:
     """Return each campaign with its results folder; two share `out` as subfolders named after the folders of their files."""
     if len(campaigns) == 1:
-        return [(campaigns[0], out or campaigns[0].parent / "results")]
-    names = [path.resolve().parent.name for path in campaigns]
+        beside = Path() if isinstance(campaigns[0], str) else campaigns[0].parent
+        return [(campaigns[0], out or beside / "results")]
+    names = [Path(path).absolute().parent.name for path in campaigns]
     unique = names if len(set(names)) == len(names) else [f"{name}_{k}" for k, name in enumerate(names, start=1)]
     base = out or Path("results")
     return [(path, base / name) for path, name in zip(campaigns, unique, strict=True)]
@@ -317,7 +339,9 @@ def application(
 
 @app.command()
 def check(
-    campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN.toml", help="The campaign file.")],
+    campaign: Annotated[
+        str, typer.Argument(metavar="CAMPAIGN.toml", help="The campaign file, or its address (s3://, https://).")
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print faults and doubts only.")] = False,
 ) -> None:
@@ -328,20 +352,36 @@ def check(
     from fusion.starting.check import check_campaign
 
     with _answering():
-        checked = check_campaign(campaign)
+        place, told = _fetched(campaign, whole=True, quiet=quiet or as_json)
+        checked = check_campaign(place)
         if as_json:
-            sys.stdout.write(json.dumps(checked.as_json(), indent=1, ensure_ascii=False) + "\n")
+            sys.stdout.write(told(json.dumps(checked.as_json(), indent=1, ensure_ascii=False)) + "\n")
         else:
             for line in checked.lines(quiet=quiet):
-                console.print(line, soft_wrap=True, highlight=False, markup=False)
+                console.print(told(line), soft_wrap=True, highlight=False, markup=False)
         if checked.faults:
             raise typer.Exit(ExitCode.BAD_INPUT)
+
+
+def _fetched(text: str, *, whole: bool, quiet: bool) -> tuple[Path, Callable[[str], str]]:
+    """Return a path as it is; of an address, the file that was fetched, or the `whole` campaign, and what puts the address in messages."""
+    if "://" not in text:
+        return Path(text), lambda line: line
+    from fusion.remote import fetch_campaign, fetch_file
+
+    with _progress(quiet=quiet) as report:
+        mirror = (fetch_campaign if whole else fetch_file)(text, report=report)
+    if not quiet:
+        errors.print(mirror.line(), highlight=False, markup=False)
+    return mirror.path, mirror.told
 
 
 @app.command()
 def reproduce(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Results folder of a finished run; only read.")],
-    campaign: Annotated[Path | None, typer.Option(help="The campaign file; left out: where the run found it.")] = None,
+    campaign: Annotated[
+        str | None, typer.Option(help="The campaign file or its address; left out: where the run found it.")
+    ] = None,
 ) -> None:
     """Compute a run again and tell whether its results are equal, byte for byte.
 
@@ -352,7 +392,7 @@ def reproduce(
 
     with _answering():
         with Reporter(console) as report:
-            found = compute_again(results, campaign=campaign, report=report)
+            found = compute_again(results, campaign=None if campaign is None else _place(campaign), report=report)
         for line in found.lines:
             console.print(line, soft_wrap=True, highlight=False, markup=False)
         if not found.equal:
@@ -379,7 +419,11 @@ def simulate(
 @app.command()
 def inspect(
     paths: Annotated[
-        list[Path], typer.Argument(metavar="FILE|FOLDER...", help="Any file that a run reads, or folders of them.")
+        list[str],
+        typer.Argument(
+            metavar="FILE|FOLDER...",
+            help="Any file that a run reads or its address (s3://, https://), or folders of them.",
+        ),
     ],
     thumbnails: Annotated[Path | None, typer.Option(help="Folder for a small PNG of every thermal file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
@@ -393,17 +437,23 @@ def inspect(
 
     with _answering():
         looked_into = []
-        for one in inspect_paths(paths):
+        fetched = [_fetched(text, whole=False, quiet=quiet or as_json) for text in paths]
+        places = [place for place, _ in fetched]
+
+        def told(line: str) -> str:
+            return reduce(lambda text, name: name(text), (name for _, name in fetched), line)
+
+        for one in inspect_paths(places):
             looked_into.append(one)
             for line in [] if as_json else one.shown(quiet=quiet):
-                console.print(line, soft_wrap=True, highlight=False, markup=False)
+                console.print(told(line), soft_wrap=True, highlight=False, markup=False)
         if thumbnails is not None:
-            for picture in write_thumbnails(paths, thumbnails):
+            for picture in write_thumbnails(places, thumbnails):
                 if not (quiet or as_json):
                     console.print(f"  thumbnail: {picture}", soft_wrap=True, highlight=False, markup=False)
         if as_json:
             files = [one.as_json() for one in looked_into]
-            sys.stdout.write(json.dumps({"files": files}, indent=1, ensure_ascii=False) + "\n")
+            sys.stdout.write(told(json.dumps({"files": files}, indent=1, ensure_ascii=False)) + "\n")
         if any(one.fails for one in looked_into):
             raise typer.Exit(ExitCode.BAD_INPUT)
 

@@ -14,6 +14,7 @@ from fusion.pipeline.provenance import hash_inputs, versions
 from fusion.pipeline.run import run_campaign
 from fusion.products.progress import Report, silent
 from fusion.products.results import ResultsError
+from fusion.remote import fetched_campaign, is_address
 
 #: Differences of numbers that are told one by one; the others are counted.
 _MOST_TOLD = 12
@@ -35,15 +36,16 @@ class Reproduction:
     lines: tuple[str, ...]
 
 
-def reproduce(results: Path, *, campaign: Path | None = None, report: Report = silent) -> Reproduction:
+def reproduce(results: Path, *, campaign: Path | str | None = None, report: Report = silent) -> Reproduction:
     """Compute a run again and compare its ``results.json``, byte for byte.
 
     Parameters
     ----------
     results : Path
         Results folder of a finished run; it is only read.
-    campaign : Path, optional
-        The campaign file; left out: where the run found it, as seen from the results folder.
+    campaign : Path or str, optional
+        The campaign file or its address; left out: where the run found it, as seen from the results folder. An address is not taken from
+        the results: the network is asked only for what the user names.
     report : callable
         ``report(label, done, total)``, for progress.
 
@@ -65,7 +67,14 @@ def reproduce(results: Path, *, campaign: Path | None = None, report: Report = s
     times; those are in ``provenance.json``.
     """
     provenance = _read_provenance(results)
-    path = campaign or _campaign_of(results, provenance)
+    if is_address(campaign):
+        with fetched_campaign(str(campaign), report=report) as mirror:
+            return _compare(results, provenance, mirror.path, report)
+    return _compare(results, provenance, Path(campaign or _campaign_of(results, provenance)), report)
+
+
+def _compare(results: Path, provenance: Mapping[str, Any], path: Path, report: Report) -> Reproduction:
+    """Compute a run again from a campaign file of this machine and compare it."""
     loaded = load_campaign(path)
     strange = tuple(_compare_inputs(provenance["inputs"], hash_inputs(loaded.input_files(), report=report)))
     if strange:
@@ -104,6 +113,11 @@ def _campaign_of(results: Path, provenance: Mapping[str, Any]) -> Path:
     place = provenance.get("campaign_file")
     if isinstance(place, str) and (path := results / place).is_file():
         return path
+    address = provenance.get("campaign_address")
+    if isinstance(address, str):
+        raise ResultsError(
+            f"{results}: the campaign was read from {address}; name that with --campaign, and it is fetched again"
+        )
     raise ResultsError(
         f"{results}: the campaign file is not where the run found it, seen from the results; name it with --campaign"
     )

@@ -193,6 +193,7 @@ def describe_run(
     *,
     started: datetime,
     seconds: Mapping[str, float],
+    address: str | None = None,
 ) -> dict[str, Any]:
     """Return the provenance of a run, without names of machine or user.
 
@@ -208,12 +209,15 @@ def describe_run(
         Start of the run, UTC.
     seconds : mapping
         Wall time of each stage, s; 0 for a stage that was kept from an earlier run.
+    address : str or None
+        Where the campaign file was fetched from; None for one of this machine.
     """
     return {
         "software": "thermofuse",
         "versions": versions(),
         "command": [Path(sys.argv[0]).stem, *(_without_folder(argument) for argument in sys.argv[1:])],
-        "campaign_file": _place_from(folder, campaign.path),
+        "campaign_file": _place_from(folder, campaign.path) if address is None else None,
+        **({} if address is None else {"campaign_address": address}),
         "started": started.isoformat(timespec="seconds"),
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "stage_seconds": {name: round(value, 2) for name, value in seconds.items()},

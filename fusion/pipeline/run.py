@@ -50,6 +50,7 @@ from fusion.products.store import (
     write_json,
     write_text,
 )
+from fusion.remote import fetched_campaign, is_address
 
 #: Where each stage keeps its Dataset; what ends up in fusion.nc is kept apart while it may have to be resumed.
 FILES = {
@@ -83,6 +84,8 @@ class Run:
         Size and time of change of each input before it was read.
     started : datetime
         Start of the run, UTC.
+    address : str or None
+        Where the campaign file was fetched from.
     parts, notices : dict, list
         Parts of results.json and notices of the stages so far.
     seconds, keys : dict
@@ -98,6 +101,7 @@ class Run:
     inputs: Mapping[str, Mapping[str, Any]]
     seen: Mapping[str, FileState]
     started: datetime
+    address: str | None = None
     parts: dict[str, Any] = field(default_factory=dict)
     notices: list[Notice] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
@@ -178,7 +182,7 @@ def run_campaign(
     Parameters
     ----------
     path : str or Path
-        The campaign file.
+        The campaign file, or its address: ``s3://``, ``https://`` or ``http://``.
     out : str or Path
         Results folder; must be empty or absent unless `resume`.
     resume : bool
@@ -208,8 +212,17 @@ def run_campaign(
         results = run_campaign("campaign.toml", "results")
         accuracy, verdict = results.iso230.A_um, results.loop.verdict
     """
+    if is_address(path):
+        with fetched_campaign(str(path), report=report) as mirror:
+            return _run_file(mirror.path, Path(out), str(path), resume=resume, scheduler=scheduler, report=report)
+    return _run_file(Path(path), Path(out), None, resume=resume, scheduler=scheduler, report=report)
+
+
+def _run_file(
+    path: Path, folder: Path, address: str | None, *, resume: bool, scheduler: str | None, report: Report
+) -> Results:
+    """Run a campaign file of this machine, which may have been fetched from an address."""
     campaign = load_campaign(path)
-    folder = Path(out)
     if resume and (kept := kept_results(campaign, folder)) is not None:
         report("run (kept)", 1, 1)
         return kept
@@ -219,17 +232,19 @@ def run_campaign(
         record = record_stage.read_source(campaign)
         report("reading and checking", 1, 1)
         with open_folder(folder, resume=resume):
-            return _run_record(_start_run(campaign, folder, seen, report), record)
+            return _run_record(_start_run(campaign, folder, seen, report, address), record)
     source = read_source(campaign)
     checks = check_source(source)
     refuse_contradictions(checks)
     report("reading and checking", 1, 1)
     with open_folder(folder, resume=resume):
-        run = _start_run(campaign, folder, seen, report)
+        run = _start_run(campaign, folder, seen, report, address)
         return _run_instruments(run, source, checks, scheduler=scheduler)
 
 
-def _start_run(campaign: Campaign, folder: Path, seen: Mapping[str, FileState], report: Report) -> Run:
+def _start_run(
+    campaign: Campaign, folder: Path, seen: Mapping[str, FileState], report: Report, address: str | None
+) -> Run:
     """Start a run in the folder that it holds: claim the products, and note what they are made from."""
     products = [name for name in FILES.values() if not name.startswith(".")]
     claim(folder, *products, *PAGES)
@@ -237,7 +252,7 @@ def _start_run(campaign: Campaign, folder: Path, seen: Mapping[str, FileState], 
     inputs = hash_inputs(campaign.input_files(), report=report)
     stamps = StageStamps(folder)
     forget_run(stamps)
-    return Run(campaign, folder, report, stamps, inputs, seen, started)
+    return Run(campaign, folder, report, stamps, inputs, seen, started, address)
 
 
 def _run_instruments(
@@ -396,7 +411,9 @@ def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
     run.parts["plugins"] = [asdict(plugin) for plugin in plugins()]
     run.notices.extend(note_changes(run.seen, input_states(run.campaign)))
     results = assemble(run.campaign.campaign.title, run.parts, run.notices)
-    provenance = describe_run(run.campaign, run.inputs, run.folder, started=run.started, seconds=run.seconds)
+    provenance = describe_run(
+        run.campaign, run.inputs, run.folder, started=run.started, seconds=run.seconds, address=run.address
+    )
     run.report("report", 0, 1)
     write_json(run.folder / "results.json", results.as_json())
     write_json(run.folder / "provenance.json", provenance)
