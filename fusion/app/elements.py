@@ -63,7 +63,9 @@ def bullets(lines: Iterable[str]) -> pn.pane.HTML:
     return pn.pane.HTML(f"<ul>{items}</ul>", sizing_mode="stretch_width")
 
 
-def table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str) -> pn.pane.HTML:
+def table(
+    columns: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str, stacked: bool = False
+) -> pn.pane.HTML:
     """Return a table whose first column names its rows.
 
     Parameters
@@ -74,15 +76,18 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str
         A text per column.
     caption : str
         What the table shows.
+    stacked : bool
+        Whether the cells of a row stand below one another on a phone: for cells that hold sentences.
     """
     head = "".join(f'<th scope="col">{escape(name)}</th>' for name in columns)
     body = "".join(
         f'<tr><th scope="row">{escape(first)}</th>{"".join(f"<td>{escape(cell)}</td>" for cell in rest)}</tr>'
         for first, *rest in rows
     )
+    kind = ' class="stacked"' if stacked else ""
     return pn.pane.HTML(
-        f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}"><table><caption>{escape(caption)}</caption>'
-        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>",
+        f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}"><table{kind}>'
+        f"<caption>{escape(caption)}</caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>",
         sizing_mode="stretch_width",
     )
 

@@ -42,11 +42,12 @@ def build_page(root: Path) -> Any:
     Template
         Of Panel.
     """
+    pn.extension("filedropper")
     state = state_of(root)
     shown: dict[str, Viewable] = {}
     content = pn.Column(sizing_mode="stretch_width", css_classes=["screen"])
     bar = pn.widgets.RadioButtonGroup(
-        name="Screens", options=list(SCREENS), sizing_mode="stretch_width", css_classes=["bar"]
+        label="Screens", options=list(SCREENS), sizing_mode="stretch_width", css_classes=["bar"]
     )
 
     def show(name: str) -> None:

@@ -30,10 +30,10 @@ class RunScreen:
     def __init__(self, state: State) -> None:
         self._state = state
         self._shown: tuple[object, ...] = ()
-        self._campaign = pn.widgets.TextInput(name="Campaign file", sizing_mode="stretch_width")
-        self._results = pn.widgets.TextInput(name="Results folder", sizing_mode="stretch_width")
-        self._start = pn.widgets.Button(name="Run", button_type="primary")
-        self._cancel = pn.widgets.Button(name="Cancel", disabled=True)
+        self._campaign = pn.widgets.TextInput(label="Campaign file", sizing_mode="stretch_width")
+        self._results = pn.widgets.TextInput(label="Results folder", sizing_mode="stretch_width")
+        self._start = pn.widgets.Button(label="Run", button_type="primary")
+        self._cancel = pn.widgets.Button(label="Cancel", disabled=True)
         self._outcome = pn.Column(sizing_mode="stretch_width")
         self._stages = pn.pane.HTML("", sizing_mode="stretch_width")
         self._messages = pn.Column(sizing_mode="stretch_width")
@@ -111,7 +111,7 @@ class RunScreen:
         self._shown = new
         runs = run is not None and run.runs
         self._start.disabled, self._cancel.disabled = runs, not runs
-        self._start.name = "Resume" if begun else "Run"
+        self._start.label = "Resume" if begun else "Run"
         self._stages.object = "" if run is None else stages_markup(run)
         told = [] if not begun else [f"{one['message']} {one['remedy']}".strip() for one in noted_messages(results)]
         self._messages[:] = [heading("Messages", level=3), bullets(dict.fromkeys(told))] if told else []

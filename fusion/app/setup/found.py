@@ -30,7 +30,7 @@ def found_in_folder(folder: Path) -> list[pn.viewable.Viewable]:
     parts = [heading("What was recognised", level=3)]
     if usable:
         rows = [(name_in(folder, one), one.kind.value, content_of(one)) for one in usable]
-        parts.append(table(("file or series", "kind", "content"), rows, caption=f"Files in {folder}"))
+        parts.append(table(("file or series", "kind", "content"), rows, caption=f"Files in {folder}", stacked=True))
     for one in looked_into:
         name = name_in(folder, one)
         parts += [paragraph(f"{name}: {line}", kind="warning") for line in warnings_of(one)]

@@ -1,0 +1,178 @@
+"""The campaign file as text with values: drafted as `thermofuse init` does, or read back; its comments stay where values change."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+
+from fusion.errors import FusionError
+from fusion.products.store import write_text
+from fusion.starting.draft import draft_lines
+from fusion.starting.folder import scan_folder
+from fusion.starting.questions import TO_FILL, Asker
+
+_FILE = "campaign.toml"
+#: Where the version of a campaign file goes that is replaced.
+_BEFORE = "campaign.toml.before"
+
+#: Names of tables and of the key in them.
+Key = tuple[str, ...]
+
+
+class CampaignTextError(FusionError):
+    """A campaign file that cannot be opened or saved; the message says why and what to do."""
+
+
+@dataclass(frozen=True)
+class CampaignText:
+    """A campaign file that is being written.
+
+    Attributes
+    ----------
+    path : Path
+        Where it is saved.
+    text : str
+        Its content so far.
+    saved : str or None
+        Its content in the folder when it was opened or saved; None where there is none yet.
+    """
+
+    path: Path
+    text: str
+    saved: str | None
+
+    def value(self, *key: str) -> Any:
+        """Return a value.
+
+        Parameters
+        ----------
+        *key : str
+            Names of the tables and of the key.
+
+        Returns
+        -------
+        object
+            None where it is not written, or has to be filled in.
+        """
+        found: Any = tomllib.loads(self.text)
+        for name in key:
+            found = found.get(name) if isinstance(found, dict) else None
+        return _without_marks(found)
+
+    def with_values(self, values: Mapping[Key, object]) -> CampaignText:
+        """Return it with other values; comments and everything else stay.
+
+        Parameters
+        ----------
+        values : mapping
+            New values by key; None takes the key away where it is written. A list of dict is an array of tables.
+        """
+        text = self.text
+        for (*tables, name), value in values.items():
+            if value is not None:
+                text = _uncommented(text, tables, name)
+        document = tomlkit.parse(text)
+        for (*tables, name), value in values.items():
+            table: Any = document
+            for each in tables:
+                if each not in table:
+                    if value is None:
+                        break
+                    table[each] = tomlkit.table()
+                table = table[each]
+            else:
+                _set(table, name, value)
+        return CampaignText(self.path, tomlkit.dumps(document), self.saved)
+
+    def save(self) -> CampaignText:
+        """Write it into its folder; the version before stays beside it.
+
+        Raises
+        ------
+        CampaignTextError
+            If somebody else has changed the file since it was opened.
+        """
+        present = self.path.read_text(encoding="utf-8") if self.path.exists() else None
+        if present != self.saved:
+            raise CampaignTextError(
+                f"{self.path} was changed by another page or program since it was opened here; look into the folder again to see its values"
+            )
+        if present == self.text:
+            return self
+        if present is not None:
+            write_text(self.path.with_name(_BEFORE), present)
+        write_text(self.path, self.text)
+        return CampaignText(self.path, self.text, self.text)
+
+
+def open_campaign(folder: Path) -> CampaignText:
+    """Open the campaign file of a folder, or draft one where there is none.
+
+    Parameters
+    ----------
+    folder : Path
+        With the files of one measurement.
+
+    Raises
+    ------
+    CampaignTextError
+        If there is one that is no TOML.
+    DraftError
+        If there is none, and nothing that can be evaluated.
+    """
+    path = folder / _FILE
+    if not path.exists():
+        return CampaignText(path, "\n".join(draft_lines(scan_folder(folder), Asker(None))) + "\n", None)
+    try:
+        text = path.read_text(encoding="utf-8")
+        tomllib.loads(text)
+        tomlkit.parse(text)
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, TOMLKitError) as error:
+        raise CampaignTextError(
+            f"{path}: this is not TOML ({error}); correct it in an editor, or move it away"
+        ) from None
+    return CampaignText(path, text, text)
+
+
+def _uncommented(text: str, tables: Sequence[str], name: str) -> str:
+    """Return a text in which the example of a key in a comment of its table is written as the key itself."""
+    header, example = f"[{'.'.join(tables)}]", f"# {name} = "
+    lines, inside = text.splitlines(keepends=True), False
+    for index, line in enumerate(lines):
+        if line.startswith("["):
+            inside = line.startswith(header)
+        if inside and line.startswith(f"{name} = "):
+            return text
+        if inside and line.startswith(example):
+            return "".join([*lines[:index], line.removeprefix("# "), *lines[index + 1 :]])
+    return text
+
+
+def _set(table: Any, name: str, value: object) -> None:
+    """Set, replace or take away one key."""
+    if value is None:
+        if name in table:
+            del table[name]
+    elif isinstance(value, list) and value and all(isinstance(item, dict) for item in value):
+        entries = tomlkit.aot()
+        for item in value:
+            entry = tomlkit.table()
+            entry.update(item)
+            entry.add(tomlkit.nl())
+            entries.append(entry)
+        table[name] = entries
+    else:
+        table[name] = value
+
+
+def _without_marks(found: Any) -> Any:
+    """Return a value with None in place of every mark of what has to be filled in."""
+    if isinstance(found, list):
+        return [_without_marks(item) for item in found]
+    return None if found == TO_FILL else found

@@ -1,0 +1,113 @@
+"""Time bars of all recordings on one axis, with the offset of the camera's clock as a slider."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import panel as pn
+from bokeh.models import ColumnDataSource, DataRange1d, FactorRange
+
+from fusion.app.elements import heading, paragraph_markup
+from fusion.app.setup.drawing import ACCENT, TEAL, drawing
+from fusion.app.setup.times import FRAMES, coverage, estimate, shifted
+from fusion.starting.time_bars import Recording
+
+#: A slider reaches this far to both sides at least, s: clocks that nobody set differ by minutes.
+_REACH_S = 600.0
+
+
+class TimesView:
+    """What was recorded when.
+
+    Parameters
+    ----------
+    on_offset : callable
+        Takes a chosen clock offset, s.
+    """
+
+    def __init__(self, on_offset: Callable[[float], None]) -> None:
+        self._recordings: Sequence[Recording] = ()
+        self._on_offset = on_offset
+        self._filling = False
+        self._bars = ColumnDataSource({"name": [], "start": [], "end": [], "colour": []})
+        self._slider = pn.widgets.FloatSlider(
+            label="Camera clock minus laser clock (s)",
+            start=-_REACH_S,
+            end=_REACH_S,
+            step=1.0,
+            sizing_mode="stretch_width",
+        )
+        self._take = pn.widgets.Button(label="Take the estimate", visible=False)
+        self._told = pn.pane.HTML("", sizing_mode="stretch_width")
+        self._picture = pn.Column(sizing_mode="stretch_width")
+        self._slider.param.watch(lambda event: self._chosen(event.new), "value")
+        self._take.on_click(lambda event: self._chosen(estimate(self._recordings) or 0.0))
+        self.view = pn.Column(
+            heading("Recordings on one clock", level=3),
+            self._picture,
+            self._slider,
+            self._told,
+            self._take,
+            sizing_mode="stretch_width",
+        )
+
+    def show(self, recordings: Sequence[Recording], clock_offset_s: float) -> None:
+        """Show recordings.
+
+        Parameters
+        ----------
+        recordings : sequence of Recording
+            Each by its own clock.
+        clock_offset_s : float, s
+            Camera clock minus laser clock, as written.
+        """
+        self._recordings = recordings
+        names = list(dict.fromkeys(one.name for one in recordings))
+        self.view.visible = bool(names)
+        self._slider.visible = FRAMES in names and len(names) > 1
+        if not names:
+            return
+        drawn = drawing(
+            DataRange1d(),
+            FactorRange(factors=names[::-1]),
+            x_label="UTC",
+            y_label="",
+            size_px=(1100, 70 + 34 * len(names)),
+            scaled=False,
+            x_axis_type="datetime",
+        )
+        drawn.hbar(y="name", left="start", right="end", height=0.5, source=self._bars, color="colour")
+        drawn.ygrid.grid_line_color = None
+        self.move(clock_offset_s)
+        self._picture[:] = [pn.pane.Bokeh(drawn, sizing_mode="stretch_width")]
+
+    def move(self, clock_offset_s: float) -> None:
+        """Show the recordings with another offset.
+
+        Parameters
+        ----------
+        clock_offset_s : float, s
+            Camera clock minus laser clock.
+        """
+        self._filling = True
+        reach = max(_REACH_S, 1.5 * abs(clock_offset_s))
+        self._slider.param.update(start=-reach, end=reach, value=clock_offset_s)
+        self._filling = False
+        bars = shifted(self._recordings, clock_offset_s)
+        self._bars.data = {
+            "name": [bar.name for bar in bars],
+            "start": [bar.start for bar in bars],
+            "end": [bar.end for bar in bars],
+            "colour": [ACCENT if bar.name == FRAMES else TEAL for bar in bars],
+        }
+        likely = estimate(self._recordings)
+        self._take.visible = likely is not None and likely != clock_offset_s
+        told = coverage(self._recordings, clock_offset_s)
+        if self._take.visible:
+            told += f" The clocks look as in two time zones: estimated offset {likely:g} s."
+        self._told.object = paragraph_markup(told.strip(), kind="warning" if self._take.visible else "note")
+
+    def _chosen(self, clock_offset_s: float) -> None:
+        if not self._filling:
+            self.move(clock_offset_s)
+            self._on_offset(clock_offset_s)
