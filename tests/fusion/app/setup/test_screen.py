@@ -1,23 +1,127 @@
-"""The screen *Set up* in a browser."""
+"""The screen *Set up*: what it reads from a folder, and the way to a campaign file in a browser, by keyboard and by mouse."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+import tomllib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-pytestmark = pytest.mark.browser
+from fusion.app.setup.campaign_text import open_campaign
+from fusion.app.setup.screen import grid_of, listed_fiducials, open_folder, told_of_check
+from fusion.starting.check import check_campaign
 
 
-def test_a_folder_is_looked_into_and_one_outside_is_refused(
-    app: tuple[str, Path], new_page: Callable[..., Any]
+def test_a_folder_is_opened_with_its_frame_fiducials_and_times(campaign_folder: Path) -> None:
+    opened = open_folder(campaign_folder, campaign_folder)
+    assert opened.frame is not None and opened.frame.shape == (480, 640)
+    assert opened.placed.registration is not None and len(opened.placed.residual_mm) == 12
+    assert len(opened.recordings) == 4 and opened.positions_mm == (0.0, 50.0, 100.0, 150.0, 200.0, 250.0)
+    assert not opened.remarks
+
+
+def test_what_is_damaged_or_outside_becomes_a_remark(copied: Path) -> None:
+    text = (copied / "campaign.toml").read_text()
+    (copied / "campaign.toml").write_text(text.replace('"fiducials.csv"', '"../fiducials.csv"'))
+    assert "lies outside" in open_folder(copied, copied).remarks[0]
+    (copied / "campaign.toml").write_text(text.replace('["700 mm", "180 mm"]', '["FILL IN", "FILL IN"]'))
+    assert grid_of(open_campaign(copied)) is None
+    (copied / "laser.csv").write_text("cycle,direction,target,position_mm,time,deviation_um\n1,x,1,0,,0\n")
+    assert open_folder(copied, copied).positions_mm == ()
+    (copied / "campaign.toml").unlink()
+    (copied / "fiducials.csv").unlink()
+    assert listed_fiducials(copied, open_campaign(copied)) == []
+
+
+def test_a_check_is_told_with_its_faults_or_as_ready(copied: Path) -> None:
+    assert "ready to run" in told_of_check(check_campaign(copied / "campaign.toml"))[0].object
+    (copied / "environment.csv").unlink()
+    shown = "".join(part.object for part in told_of_check(check_campaign(copied / "campaign.toml")))
+    assert "not ready to run" in shown and "environment.csv" in shown
+
+
+@pytest.fixture
+def new_folder(app: tuple[str, Path], campaign_folder: Path) -> Iterator[Path]:
+    """A folder inside that of the application, without a campaign file, which the folder above does not show."""
+    folder = app[1] / ".new"
+    shutil.copytree(campaign_folder, folder, ignore=shutil.ignore_patterns("campaign.toml"))
+    yield folder
+    shutil.rmtree(folder)
+
+
+def look_into(page: Any, written: str) -> None:
+    button = page.get_by_role("button", name="Look into it")
+    page.get_by_text("24 frames of 640 x 480").first.wait_for()
+    field = page.get_by_label("Folder of the measurement")
+    field.fill(written)
+    field.press("Tab")
+    page.wait_for_function("button => !button.disabled", arg=button.element_handle())
+    button.press("Enter")
+    page.get_by_text(f"/{written}").filter(has_text="Files in").wait_for()
+
+
+@pytest.mark.browser
+def test_a_campaign_file_is_made_by_keyboard_and_opened_again(
+    app: tuple[str, Path], new_folder: Path, new_page: Callable[..., Any]
 ) -> None:
     page = new_page(app[0])
-    page.get_by_text("24 frames of 640 x 480").wait_for()
+    look_into(page, ".new")
+    page.get_by_text("12 fiducials agree").wait_for()
+    save = page.get_by_role("button", name="Save campaign.toml")
+    save.press("Enter")
+    page.get_by_text("Before it can run, fill in:").wait_for()
+    for label, text in (
+        ("Spindle at axis position 0, x", "500 mm"),
+        ("Spindle at axis position 0, y", "90 mm"),
+        ("It moves, as the position grows", "left"),
+        ("Machine, as the report names it", "<b>Mill</b>"),
+    ):
+        page.get_by_label(label).fill(text)
+        page.get_by_label(label).press("Tab")
+    column = page.get_by_label("Column in the frame (px)")
+    column.fill("90")
+    column.press("Tab")
+    page.get_by_text("F1 lies").wait_for()
+    page.get_by_role("button", name="Find automatically").press("Enter")
+    page.get_by_text("12 fiducials agree").wait_for()
+    save.press("Enter")
+    page.get_by_text("Saved and ready to run").wait_for()
+    written = tomllib.loads((new_folder / "campaign.toml").read_text())
+    assert written["plan"]["axis"] == {"origin": ["500 mm", "90 mm"], "direction": [-1.0, 0.0]}
+    assert written["report"]["machine"] == "<b>Mill</b>"
+    page.get_by_role("button", name="Go to Run").press("Enter")
+    assert page.get_by_label("Campaign file").input_value() == str(new_folder / "campaign.toml")
+    again = new_page(app[0])
+    look_into(again, ".new")
+    again.get_by_label("Machine, as the report names it").wait_for()
+    assert again.get_by_label("Spindle at axis position 0, x").input_value() == "500 mm"
+
+
+@pytest.mark.browser
+def test_files_are_dropped_into_the_folder_and_a_wrong_or_large_one_is_refused(
+    app: tuple[str, Path], new_folder: Path, new_page: Callable[..., Any], tmp_path: Path
+) -> None:
+    page = new_page(app[0])
+    page.get_by_text("24 frames of 640 x 480").first.wait_for()
     field = page.get_by_label("Folder of the measurement")
+    field.fill(".new")
+    field.press("Tab")
+    (tmp_path / "notes.csv").write_text("nonsense\n1\n")
+    with (tmp_path / "large.seq").open("wb") as large:
+        large.truncate(101_000_000)
+    page.locator("input[type=file]").set_input_files([tmp_path / "notes.csv", tmp_path / "large.seq"])
+    page.get_by_text("notes.csv is in the folder now").wait_for()
+    page.get_by_text("File is too large").first.wait_for()
+    assert (new_folder / "notes.csv").read_text() == "nonsense\n1\n" and not (new_folder / "large.seq").exists()
+    look = page.get_by_role("button", name="Look into it")
+    page.wait_for_function("button => !button.disabled", arg=look.element_handle())
+    look.press("Enter")
+    page.get_by_text("notes.csv is not used:").wait_for()
+    page.wait_for_function("button => !button.disabled", arg=look.element_handle())
     field.fill("../outside")
     field.press("Tab")
-    page.get_by_role("button", name="Look into it").press("Enter")
+    look.press("Enter")
     page.get_by_role("alert").get_by_text("lies outside").wait_for()
