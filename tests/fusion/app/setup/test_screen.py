@@ -60,7 +60,7 @@ def look_into(page: Any, written: str) -> None:
     field.press("Tab")
     page.wait_for_function("button => !button.disabled", arg=button.element_handle())
     button.press("Enter")
-    page.get_by_text(f"/{written}").filter(has_text="Files in").wait_for()
+    page.locator("caption", has_text=f"/{written}").wait_for()
 
 
 @pytest.mark.browser
