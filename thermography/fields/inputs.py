@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from thermography._typing import Array
 from thermography.errors import ThermographyError
 from thermography.io.frame import CameraParameters, FrameReference
-from thermography.io.frame_index.frame_list import frame_times
+from thermography.io.frame_index.frame_list import frame_shapes, frame_times
 from thermography.radiometry.planck import calibrate
 
 Override = Callable[[FrameReference], CameraParameters]
@@ -137,19 +137,21 @@ def _check_frames(references: Sequence[FrameReference], shape: tuple[int, int]) 
     if not references:
         raise ReductionError("there is no frame to reduce")
     times = frame_times(references)
-    for i, frame in enumerate(references):
-        where = f"{frame.path}: frame {frame.index}"
-        if tuple(frame.shape) != tuple(shape):
-            raise ReductionError(
-                f"{where} has {frame.shape} pixels, the registered frames {shape}; reduce one size at a time"
-            )
-        if np.isnat(times[i]):
-            raise ReductionError(f"{where} has no time; leave it out")
-        if i and times[i] <= times[i - 1]:
-            raise ReductionError(
-                f"{where} has the time {frame.time}, not after {references[i - 1].time}; sort the frames"
-            )
-    return times
+    shapes = frame_shapes(references)
+    wrong = (shapes != shape).any(axis=1) | np.isnat(times)
+    wrong[1:] |= times[1:] <= times[:-1]
+    if not wrong.any():
+        return times
+    i = int(np.argmax(wrong))
+    frame = references[i]
+    where = f"{frame.path}: frame {frame.index}"
+    if tuple(frame.shape) != tuple(shape):
+        raise ReductionError(
+            f"{where} has {frame.shape} pixels, the registered frames {shape}; reduce one size at a time"
+        )
+    if np.isnat(times[i]):
+        raise ReductionError(f"{where} has no time; leave it out")
+    raise ReductionError(f"{where} has the time {frame.time}, not after {references[i - 1].time}; sort the frames")
 
 
 def _check_correction(correction_K: ArrayLike | None, frames: int) -> Array:

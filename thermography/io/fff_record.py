@@ -100,6 +100,20 @@ class FffSource:
             offset = max(0, offset - available)
         return b"".join(pieces)
 
+    def read_once(self, offset: int, length: int) -> memoryview:
+        """Return `length` bytes from `offset` of the record, or fewer at its end, read to their place without a copy between."""
+        data, filled = memoryview(np.empty(max(0, min(length, self.size - offset)), np.uint8)), 0  # type: ignore[arg-type]
+        for start, available in self.segments:
+            if offset < available and filled < len(data):
+                self.file.seek(start + offset)
+                part = data[filled : filled + available - offset]
+                read = self.file.readinto(part)  # type: ignore[attr-defined]
+                filled += read
+                if read < len(part):
+                    break
+            offset = max(0, offset - available)
+        return data[:filled]
+
     def take(self, offset: int, length: int, what: str) -> bytes:
         """Return exactly `length` bytes from `offset` of the record; `what` names them in the FlirFormatError if some are missing."""
         data = self.read(offset, length)
@@ -272,9 +286,9 @@ def damaged_records(source: FffSource, directory: Directory) -> list[int]:
     ]
 
 
-def _differs(data: bytes, checksum: int) -> bool:
+def _differs(data: bytes | memoryview, checksum: int) -> bool:
     """Return whether bytes differ from their CRC-32; never where none (0) is stored."""
-    return checksum != 0 and int(imagecodecs.deflate_crc32(data)) != checksum
+    return checksum != 0 and int(imagecodecs.deflate_crc32(data)) != checksum  # type: ignore[arg-type]
 
 
 def find_camera_info(source: FffSource, directory: Directory) -> tuple[int, int]:
@@ -549,15 +563,15 @@ def _read_samples(source: FffSource, samples: SampleLocation) -> memoryview:
     """Return the bytes of the samples, fewer at the end of the record, after comparing the record with its checksum."""
     offset, length = samples.record
     if not samples.checksum or length > 2 * _MAX_PIXELS:
-        return memoryview(source.read(samples.offset, min(samples.length, 2 * _MAX_PIXELS)))
-    record = source.read(offset, length)
+        return source.read_once(samples.offset, min(samples.length, 2 * _MAX_PIXELS))
+    record = source.read_once(offset, length)
     # A record without its last padding bytes cannot be compared.
     if len(record) == length and _differs(record, samples.checksum):
         raise source.error(
             offset, f"a raw image with the CRC-32 {samples.checksum:08X}", "another one: the samples are damaged"
         )
     start = samples.offset - offset
-    return memoryview(record)[start : start + samples.length]
+    return record[start : start + samples.length]
 
 
 def _decode(source: FffSource, samples: SampleLocation, data: memoryview) -> NDArray[np.uint16]:
@@ -573,16 +587,14 @@ def _decode(source: FffSource, samples: SampleLocation, data: memoryview) -> NDA
         counts = np.frombuffer(data, "<u2" if samples.little_endian else ">u2").reshape(rows, columns)
         return counts if counts.dtype.isnative else counts.astype(np.uint16)
     # Writers pad the stream to a multiple of 8 bytes; after the last frame of a file the padding may be missing.
-    packed = bytes(data)
     if samples.encoding == "jpegls":
-        return _decode_jpegls(source, samples, packed)
+        return _decode_jpegls(source, samples, bytes(data))
     from thermography.io.png16 import PngError, decode_png  # compiled: loaded with the first PNG
 
     try:
-        counts = decode_png(packed, samples.shape)
+        return decode_png(data, samples.shape, little_endian=samples.little_endian)
     except PngError as error:
         raise source.error(samples.offset, *error.args) from error
-    return counts.byteswap() if samples.little_endian else counts
 
 
 def _decode_jpegls(source: FffSource, samples: SampleLocation, data: bytes) -> NDArray[np.uint16]:

@@ -26,10 +26,13 @@ from thermography.io.fff_record import (
 )
 from thermography.io.frame import FlirFormatError, Frame, FrameReference, RejectedFrame, Segments
 from thermography.io.frame_index.flir_frame import FlirFrameReference
-from thermography.io.frame_index.frame_list import FrameList, FrameRun, order_by_time
+from thermography.io.frame_index.frame_list import FrameList, FrameTable, order_by_time
 
 if TYPE_CHECKING:
-    from thermography.io.frame_index.header_scan import FlirRun
+    from thermography.io.frame_index.header_scan import FlirTable
+
+#: Frames are read together where the file has room for this number of them: fewer are read one by one before the code is loaded.
+FEWEST_FRAMES = 256
 
 
 class FlirReader:
@@ -48,7 +51,7 @@ class FlirReader:
         """
         return start[:2] == b"\xff\xd8" or start[:4] == MAGIC
 
-    def index(self, path: Path, options: object) -> Iterator[FrameReference | FrameRun | RejectedFrame]:
+    def index(self, path: Path, options: object) -> Iterator[FrameReference | FrameTable | RejectedFrame]:
         """Yield the frames of a file in its order; damaged ones as `RejectedFrame`, those of a long sequence together.
 
         Parameters
@@ -145,7 +148,7 @@ def index_frames(
     >>> frames, rejected[0].reason
     ([], "[Errno 2] No such file or directory: 'does_not_exist.seq'")
     """
-    frames: list[FrameReference | FrameRun] = []
+    frames: list[FrameReference | FrameTable] = []
     rejected: list[RejectedFrame] = []
     for path in map(Path, [paths] if isinstance(paths, str | os.PathLike) else paths):
         try:
@@ -202,7 +205,7 @@ def index_sequence(
         size = file.seek(0, os.SEEK_END)
         first = _find_header(file, start, size)
         walked = _walk_sequence(file, path, first, size, index=index) if first < size else iter(())
-        found = [one for some in walked for one in (some if isinstance(some, FrameRun) else [some])]
+        found = [one for some in walked for one in (some if isinstance(some, FrameTable) else [some])]
     whole = [at for at, one in enumerate(found) if isinstance(one, FlirFrameReference)]
     if not whole:
         return [], [] if growing else [one for one in found if isinstance(one, RejectedFrame)], start
@@ -214,7 +217,7 @@ def index_sequence(
     return frames, [one for one in kept if isinstance(one, RejectedFrame)], offset if growing else offset + length
 
 
-def _walk(file: BinaryIO, path: Path) -> Iterator[FlirFrameReference | FrameRun | RejectedFrame]:
+def _walk(file: BinaryIO, path: Path) -> Iterator[FlirFrameReference | FrameTable | RejectedFrame]:
     """Yield the frames of one file in file order; damaged ones as `RejectedFrame`, those of a long sequence together."""
     start = file.read(4)
     if start[:2] == b"\xff\xd8":
@@ -258,7 +261,7 @@ def _reference(source: FffSource, directory: Directory, index: int) -> FlirFrame
 
 def _walk_sequence(
     file: BinaryIO, path: Path, start: int, size: int, *, index: int
-) -> Iterator[FlirFrameReference | FrameRun | RejectedFrame]:
+) -> Iterator[FlirFrameReference | FrameTable | RejectedFrame]:
     """Yield the frames of consecutive FFF records from `start` on; padding and damaged frames are skipped and reported."""
     notes: tuple[str, ...] = ()
     while start < size:
@@ -287,11 +290,13 @@ def _walk_sequence(
         start, index = following, index + 1
 
 
-def _scan(file: BinaryIO, reference: FlirFrameReference, size: int) -> FlirRun | None:
-    """Return the run of frames that follow one and are laid out as it is; a file of one frame is read without the compiled scan."""
-    from thermography.io.frame_index.header_scan import scan_run
+def _scan(file: BinaryIO, reference: FlirFrameReference, size: int) -> FlirTable | None:
+    """Return the frames that follow one and are laid out as it is; a file with few frames is read without the compiled scan."""
+    if size - sum(reference.segments[0]) < FEWEST_FRAMES * reference.segments[0][1]:
+        return None
+    from thermography.io.frame_index.header_scan import scan_table
 
-    return scan_run(file, reference, size)
+    return scan_table(file, reference, size)
 
 
 def _holds_data(file: BinaryIO, offset: int, length: int) -> bool:

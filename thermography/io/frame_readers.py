@@ -21,7 +21,7 @@ from typing import Protocol, runtime_checkable
 from thermography.errors import ThermographyError
 from thermography.io.flir import FlirReader
 from thermography.io.frame import FrameReference, RejectedFrame
-from thermography.io.frame_index.frame_list import FrameList, FrameRun, order_by_time
+from thermography.io.frame_index.frame_list import FrameList, FrameTable, order_by_time
 from thermography.io.temperature_frames import StackError, StackOptions
 from thermography.io.text_frames import TextReader
 
@@ -46,10 +46,10 @@ class FrameReader(Protocol):
         """Return whether a file is of this kind, by its content; `start` holds its first 512 bytes, none of a folder."""
         ...
 
-    def index(self, path: Path, options: StackOptions) -> Iterator[FrameReference | FrameRun | RejectedFrame]:
+    def index(self, path: Path, options: StackOptions) -> Iterator[FrameReference | FrameTable | RejectedFrame]:
         """Yield the frames of a file in its order without reading pixels, damaged ones as `RejectedFrame`.
 
-        Frames of a long file may be yielded together as a `FrameRun`, which makes their references on access.
+        Frames of a long file may be yielded together as a `FrameTable`, which makes their references on access.
 
         Raise a ThermographyError or OSError where nothing in the file can be used.
         """
@@ -145,7 +145,7 @@ def index_recordings(
     "[Errno 2] No such file or directory: 'does_not_exist.tif'"
     """
     options = options or StackOptions()
-    frames: list[FrameReference | FrameRun] = []
+    frames: list[FrameReference | FrameTable] = []
     rejected: list[RejectedFrame] = []
     for path in map(Path, paths):
         try:

@@ -108,7 +108,7 @@ def temperature_from_counts(
     RadiometryError
         Where a parameter or an emissivity makes the formula meaningless.
     """
-    gain, offset = count_line(parameters, emissivity)
+    gain, offset = _stored_line(parameters) if emissivity is None else count_line(parameters, emissivity)
     return temperature_of_signal((np.asarray(counts, np.float64) - offset) / gain, parameters)
 
 
@@ -246,6 +246,12 @@ def count_line(
         )
     )
     return line_of_signals(e, transmission(p), p.window_transmission, reflected, air, window)
+
+
+@lru_cache(maxsize=256)
+def _stored_line(parameters: CameraParameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """`count_line` with the emissivity of the parameters; cached because the frames of a recording share them."""
+    return count_line(parameters)
 
 
 def line_of_signals(

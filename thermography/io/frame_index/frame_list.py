@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, overload
 
@@ -15,7 +17,7 @@ from thermography._typing import Array
 from thermography.io.frame import CameraParameters, FrameReference, RejectedFrame
 
 
-class FrameRun(Sequence[FrameReference]):
+class FrameTable(Sequence[FrameReference]):
     """Consecutive frames of one file that share size, camera and layout; a reference is made when its frame is asked for.
 
     Attributes
@@ -59,7 +61,7 @@ class FrameRun(Sequence[FrameReference]):
         """Return a frame, or those of a slice as a list."""
         if isinstance(place, slice):
             return [self.reference(i) for i in range(*place.indices(len(self)))]
-        return self.reference(range(len(self))[place])
+        return self.reference(place if place >= 0 else len(self) + place)
 
     @abstractmethod
     def reference(self, place: int) -> FrameReference:
@@ -74,22 +76,22 @@ class FrameList(Sequence[FrameReference]):
 
     Parameters
     ----------
-    parts : sequence of FrameRun and of lists of FrameReference
+    parts : sequence of FrameTable and of lists of FrameReference
         In any order.
     order : (n,) ndarray of int, optional
         Places in the concatenated parts; their own order by default.
     """
 
     def __init__(
-        self, parts: Sequence[FrameRun | list[FrameReference]], order: NDArray[np.integer[Any]] | None = None
+        self, parts: Sequence[FrameTable | list[FrameReference]], order: NDArray[np.integer[Any]] | None = None
     ) -> None:
         self._parts = [part for part in parts if len(part)]
-        self._starts = np.cumsum([0, *(len(part) for part in self._parts)])
+        self._starts = [0, *accumulate(len(part) for part in self._parts)]
         self._order = order
 
     def __len__(self) -> int:
         """Return the number of frames."""
-        return int(self._starts[-1]) if self._order is None else len(self._order)
+        return self._starts[-1] if self._order is None else len(self._order)
 
     @overload
     def __getitem__(self, place: int) -> FrameReference: ...
@@ -100,10 +102,22 @@ class FrameList(Sequence[FrameReference]):
     def __getitem__(self, place: int | slice) -> FrameReference | list[FrameReference]:
         """Return a frame, or those of a slice as a list."""
         if isinstance(place, slice):
-            return [self[i] for i in range(*place.indices(len(self)))]
-        stored = range(len(self))[place] if self._order is None else int(self._order[place])
-        part = int(np.searchsorted(self._starts, stored, side="right")) - 1
-        return self._parts[part][stored - int(self._starts[part])]
+            return [self._stored(i) for i in self._places[place]]
+        return self._stored(self._places[place])
+
+    def __iter__(self) -> Iterator[FrameReference]:
+        """Make the references one after the other."""
+        return map(self._stored, self._places)
+
+    @property
+    def _places(self) -> Sequence[int]:
+        """Places of the frames in the concatenated parts."""
+        return range(self._starts[-1]) if self._order is None else self._order  # type: ignore[return-value]
+
+    def _stored(self, place: int) -> FrameReference:
+        """The frame at a place in the concatenated parts."""
+        part = bisect_right(self._starts, place) - 1
+        return self._parts[part][place - self._starts[part]]
 
     def __eq__(self, other: object) -> bool:
         """Compare with any sequence, frame by frame."""
@@ -120,17 +134,17 @@ class FrameList(Sequence[FrameReference]):
     @cached_property
     def times(self) -> Array:
         """Times (UTC), (n,) datetime64[ms]."""
-        return self.column(lambda run: run.times, lambda frame: frame.time, "datetime64[ms]")
+        return self.column(lambda table: table.times, lambda frame: frame.time, "datetime64[ms]")
 
     def column(
-        self, of_run: Callable[[FrameRun], Array], of_frame: Callable[[FrameReference], Any], kind: str | type
+        self, of_table: Callable[[FrameTable], Array], of_frame: Callable[[FrameReference], Any], kind: str | type
     ) -> Array:
         """One value per frame.
 
         Parameters
         ----------
-        of_run : callable
-            From a run to the values of its frames, (n,).
+        of_table : callable
+            From a table to the values of its frames, (n,).
         of_frame : callable
             From a single reference to its value.
         kind : str or type
@@ -140,9 +154,9 @@ class FrameList(Sequence[FrameReference]):
         -------
         (n,) ndarray
         """
-        values = np.empty(int(self._starts[-1]), kind)
+        values = np.empty(self._starts[-1], kind)
         for part, start in zip(self._parts, self._starts, strict=False):
-            of_part = of_run(part) if isinstance(part, FrameRun) else list(map(of_frame, part))
+            of_part = of_table(part) if isinstance(part, FrameTable) else list(map(of_frame, part))
             for_all = values[start : start + len(part)]
             for_all[...] = of_part if isinstance(of_part, np.ndarray) else np.array(of_part, kind)
         return values if self._order is None else values[self._order]
@@ -150,17 +164,17 @@ class FrameList(Sequence[FrameReference]):
     def files(self) -> Array:
         """Names of the files, (n,) of str objects."""
         return self.column(
-            lambda run: np.full(len(run), str(run.path), object), lambda frame: str(frame.path), "object"
+            lambda table: np.full(len(table), str(table.path), object), lambda frame: str(frame.path), "object"
         )
 
     def numbers(self) -> NDArray[np.int64]:
         """Indices of the frames in their files, (n,)."""
-        return self.column(lambda run: run.first_index + np.arange(len(run)), lambda frame: frame.index, "int64")
+        return self.column(lambda table: table.first_index + np.arange(len(table)), lambda frame: frame.index, "int64")
 
     def shapes(self) -> NDArray[np.int64]:
         """Rows and columns of the frames, (n, 2)."""
-        rows = self.column(lambda run: np.full(len(run), run.shape[0]), lambda frame: frame.shape[0], "int64")
-        columns = self.column(lambda run: np.full(len(run), run.shape[1]), lambda frame: frame.shape[1], "int64")
+        rows = self.column(lambda table: np.full(len(table), table.shape[0]), lambda frame: frame.shape[0], "int64")
+        columns = self.column(lambda table: np.full(len(table), table.shape[1]), lambda frame: frame.shape[1], "int64")
         return np.stack([rows, columns], axis=-1)
 
     def parameter_sets(self) -> tuple[list[CameraParameters], NDArray[np.int64]]:
@@ -171,7 +185,7 @@ class FrameList(Sequence[FrameReference]):
             return known.setdefault(parameters, len(known))
 
         which = self.column(
-            lambda run: np.array([number(each) for each in run.parameter_sets])[run.parameter_set],
+            lambda table: np.array([number(each) for each in table.parameter_sets])[table.parameter_set],
             lambda frame: number(frame.parameters),
             "int64",
         )
@@ -179,18 +193,18 @@ class FrameList(Sequence[FrameReference]):
 
     def temperatures(self) -> dict[str, Array]:
         """Temperatures inside the camera by sensor, (n,) K; NaN where a frame has none."""
-        of_runs = {id(part): part.temperatures() for part in self._parts if isinstance(part, FrameRun)}
+        of_tables = {id(part): part.temperatures() for part in self._parts if isinstance(part, FrameTable)}
         names = dict.fromkeys(
             name
             for part in self._parts
-            for readings in ([of_runs[id(part)]] if isinstance(part, FrameRun) else [f.housekeeping for f in part])
+            for readings in ([of_tables[id(part)]] if isinstance(part, FrameTable) else [f.housekeeping for f in part])
             for name in readings
         )
-        return {name: self._temperature(name, of_runs) for name in names}
+        return {name: self._temperature(name, of_tables) for name in names}
 
-    def _temperature(self, name: str, of_runs: dict[int, dict[str, Array]]) -> Array:
+    def _temperature(self, name: str, of_tables: dict[int, dict[str, Array]]) -> Array:
         return self.column(
-            lambda run: of_runs[id(run)].get(name, np.full(len(run), np.nan)),
+            lambda table: of_tables[id(table)].get(name, np.full(len(table), np.nan)),
             lambda frame: frame.housekeeping.get(name, np.nan),
             "float64",
         )
@@ -198,9 +212,9 @@ class FrameList(Sequence[FrameReference]):
     def noted(self) -> list[FrameReference]:
         """Frames that carry notes, in order."""
 
-        def flags(run: FrameRun) -> Array:
-            noted = np.zeros(len(run), bool)
-            noted[run.noted()] = True
+        def flags(table: FrameTable) -> Array:
+            noted = np.zeros(len(table), bool)
+            noted[table.noted()] = True
             return noted
 
         return [self[int(i)] for i in np.flatnonzero(self.column(flags, lambda frame: bool(frame.notes), "bool"))]
@@ -210,12 +224,12 @@ class FrameList(Sequence[FrameReference]):
         return FrameList(self._parts, np.flatnonzero(chosen) if self._order is None else self._order[chosen])
 
 
-def order_by_time(found: Iterable[FrameReference | FrameRun]) -> tuple[FrameList, list[RejectedFrame]]:
+def order_by_time(found: Iterable[FrameReference | FrameTable]) -> tuple[FrameList, list[RejectedFrame]]:
     """Sort frames by time, and take out those whose time occurs twice.
 
     Parameters
     ----------
-    found : iterable of FrameReference and FrameRun
+    found : iterable of FrameReference and FrameTable
 
     Returns
     -------
@@ -224,9 +238,9 @@ def order_by_time(found: Iterable[FrameReference | FrameRun]) -> tuple[FrameList
     repeated : list of RejectedFrame
         Every second frame of one time.
     """
-    parts: list[FrameRun | list[FrameReference]] = []
+    parts: list[FrameTable | list[FrameReference]] = []
     for each in found:
-        if isinstance(each, FrameRun):
+        if isinstance(each, FrameTable):
             parts.append(each)
         elif parts and isinstance(parts[-1], list):
             parts[-1].append(each)
@@ -259,3 +273,13 @@ def frame_times(frames: Sequence[FrameReference]) -> Array:
     if isinstance(frames, FrameList):
         return frames.times.astype("datetime64[ns]")
     return np.array([frame.time for frame in frames], "datetime64[ns]")
+
+
+def frame_shapes(frames: Sequence[FrameReference]) -> NDArray[np.int64]:
+    """Return rows and columns of frames, (n, 2).
+
+    Parameters
+    ----------
+    frames : sequence of FrameReference
+    """
+    return frames.shapes() if isinstance(frames, FrameList) else np.array([frame.shape for frame in frames], np.int64)

@@ -10,7 +10,7 @@ the first frame. The first frame that differs in any of these ends the run and i
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import BinaryIO, NamedTuple
 
@@ -42,12 +42,10 @@ from thermography.io.fff_record import (
     select_temperatures,
     sensor_names,
 )
-from thermography.io.frame import CameraParameters
+from thermography.io.frame import CameraParameters, SampleLocation
 from thermography.io.frame_index.flir_frame import FlirFrameReference
-from thermography.io.frame_index.frame_list import FrameRun
+from thermography.io.frame_index.frame_list import FrameTable
 
-#: A run is looked for where the file has room for this number of frames: fewer are read one by one before the compiled code is loaded.
-FEWEST_FRAMES = 256
 #: Frames whose headers are read and checked at once: few at first, because a run may end soon.
 _FIRST_BATCH, _LARGEST_BATCH = 8, 256
 #: Headers this close together are read as one piece, bytes.
@@ -106,7 +104,7 @@ class _Columns(NamedTuple):
         )
 
 
-class FlirRun(FrameRun):
+class FlirTable(FrameTable):
     """Frames of a SEQ or CSQ file that share the layout of a first frame, which is not among them.
 
     Parameters
@@ -127,10 +125,10 @@ class FlirRun(FrameRun):
         self, first: FlirFrameReference, order: str, names: list[str], columns: _Columns, parameter_bytes: list[bytes]
     ) -> None:
         self.first, self.order, self.names, self.columns = first, order, names, columns
-        self.parameter_bytes = parameter_bytes
+        self._parameters = [parse_parameters(order, data) for data in parameter_bytes]
         self.path, self.first_index, self.shape = first.path, first.index + 1, first.shape
         self.parameter_set = columns.parameters
-        self.parameter_sets: list[CameraParameters] = [parse_parameters(order, data)[0] for data in parameter_bytes]
+        self.parameter_sets: list[CameraParameters] = [parameters for parameters, _ in self._parameters]
         self.times = columns.time.view("datetime64[ms]")
         start, length = first.segments[0]
         self.ends = start + length + np.cumsum(columns.length)
@@ -152,14 +150,18 @@ class FlirRun(FrameRun):
     def reference(self, place: int) -> FlirFrameReference:
         """Make the reference of a frame, 0 to n - 1."""
         first, columns = self.first, self.columns
-        length, raw_length = int(columns.length[place]), int(columns.raw_length[place])
-        values = self._sensor_values[place].tolist()
-        parameters, notes = parse_parameters(self.order, self.parameter_bytes[self.parameter_set[place]])
-        samples = replace(
-            first.samples,
-            length=first.samples.length if first.samples.encoding == "raw" else raw_length - RAW_HEADER_SIZE,
-            record=(first.samples.record[0], raw_length),
-            checksum=int(columns.checksum[place]),
+        length, raw_length = columns.length.item(place), columns.raw_length.item(place)
+        values, named = self._sensor_values[place].tolist(), len(self.names)
+        parameters, notes = self._parameters[self.parameter_set[place]]
+        alike = first.samples
+        samples = SampleLocation(
+            encoding=alike.encoding,
+            offset=alike.offset,
+            length=alike.length if alike.encoding == "raw" else raw_length - RAW_HEADER_SIZE,
+            little_endian=alike.little_endian,
+            shape=alike.shape,
+            record=(alike.record[0], raw_length),
+            checksum=columns.checksum.item(place),
         )
         return FlirFrameReference(
             parameters=parameters,
@@ -168,11 +170,11 @@ class FlirRun(FrameRun):
             camera=first.camera,
             limits=first.limits,
             settings=parse_settings(self.order, columns.settings[place].tobytes()),
-            housekeeping=select_temperatures(self.names, values[: len(self.names)], values[len(self.names) :]),
+            housekeeping=select_temperatures(self.names, values[:named], values[named:]),
             notes=notes,
             path=first.path,
             index=self.first_index + place,
-            segments=((int(self.ends[place]) - length, length),),
+            segments=((self.ends.item(place) - length, length),),
             camera_info_place=first.camera_info_place,
             samples=samples,
         )
@@ -191,7 +193,7 @@ class FlirRun(FrameRun):
 
     def noted(self) -> list[int]:
         """Places of the frames that carry notes."""
-        noted = [bool(parse_parameters(self.order, data)[1]) for data in self.parameter_bytes]
+        noted = [bool(notes) for _, notes in self._parameters]
         return [int(i) for i in np.flatnonzero(np.array(noted)[self.parameter_set])]
 
 
@@ -216,7 +218,7 @@ class _Layout:
     names: list[str]
 
 
-def scan_run(file: BinaryIO, first: FlirFrameReference, size: int) -> FlirRun | None:
+def scan_table(file: BinaryIO, first: FlirFrameReference, size: int) -> FlirTable | None:
     """Read the headers of the frames that follow a frame and are laid out as it is.
 
     Parameters
@@ -230,10 +232,10 @@ def scan_run(file: BinaryIO, first: FlirFrameReference, size: int) -> FlirRun | 
 
     Returns
     -------
-    FlirRun or None
+    FlirTable or None
     """
     start = sum(first.segments[0])
-    layout = _layout(file, first) if size - start >= FEWEST_FRAMES * first.segments[0][1] else None
+    layout = _layout(file, first)
     if layout is None:
         return None
     largest = _LARGEST_BATCH if layout.expected.encoding == 0 else 1
@@ -250,7 +252,7 @@ def scan_run(file: BinaryIO, first: FlirFrameReference, size: int) -> FlirRun | 
         batch = min(4 * batch, largest)
     if not gathered.frames:
         return None
-    return FlirRun(first, layout.order, layout.names, gathered.columns(), list(known))
+    return FlirTable(first, layout.order, layout.names, gathered.columns(), list(known))
 
 
 def _layout(file: BinaryIO, first: FlirFrameReference) -> _Layout | None:

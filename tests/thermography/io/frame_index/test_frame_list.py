@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from tests.thermography.flir_mutations import frame, sequence
+from thermography.io import flir
 from thermography.io.flir import index_frames
 from thermography.io.flir_writer import write_sequence
-from thermography.io.frame_index import header_scan
-from thermography.io.frame_index.frame_list import FrameList, FrameRun, frame_times, order_by_time
+from thermography.io.frame_index.frame_list import FrameList, FrameTable, frame_times, order_by_time
 
 
 @pytest.fixture
 def mixed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FrameList:
     """Twenty frames of a sequence, one of another file between them in time, and one after them."""
-    monkeypatch.setattr(header_scan, "FEWEST_FRAMES", 1)
+    monkeypatch.setattr(flir, "FEWEST_FRAMES", 1)
     sequence(tmp_path / "b.seq", frames=20)
     for name, seconds in (("a.fff", 4.5), ("c.fff", 100.0)):
         data = frame()
@@ -79,7 +79,7 @@ def test_frames_without_time_come_last_and_are_kept(tmp_path: Path) -> None:
 def test_a_frame_of_a_long_sequence_costs_a_few_hundred_bytes(tmp_path: Path) -> None:
     sequence(tmp_path / "a.seq", frames=1000)
     frames, _ = index_frames(tmp_path / "a.seq")
-    (run,) = [part for part in frames._parts if isinstance(part, FrameRun)]
+    (run,) = [part for part in frames._parts if isinstance(part, FrameTable)]
     assert len(run) == 999
     assert sum(column.nbytes for column in run.columns) / len(run) < 300  # type: ignore[attr-defined]
 

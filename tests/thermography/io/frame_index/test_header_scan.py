@@ -14,8 +14,7 @@ from tests.thermography.flir_mutations import frame, sequence, without_checksums
 from thermography.io.flir import index_frames
 from thermography.io.flir_writer import write_sequence
 from thermography.io.frame import CameraIdentity
-from thermography.io.frame_index import header_scan
-from thermography.io.frame_index.frame_list import FrameRun
+from thermography.io.frame_index.frame_list import FrameTable
 
 ENCODINGS = ("raw", "png", "jpegls")
 FRAMES = 6
@@ -23,21 +22,21 @@ FRAMES = 6
 
 @pytest.fixture(autouse=True)
 def runs_of_any_length(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(header_scan, "FEWEST_FRAMES", 1)
+    monkeypatch.setattr(flir, "FEWEST_FRAMES", 1)
 
 
 def frames_in_runs(path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
     """Compare both ways of reading; the number of frames that were read together."""
     together, rejected = index_frames(path)
     with monkeypatch.context() as patch:
-        patch.setattr(flir, "scan_run", lambda *_: None)
+        patch.setattr(flir, "_scan", lambda *_: None)
         one_by_one, rejected_then = index_frames(path)
     # NaT differs from itself.
     start = np.datetime64("1970-01-01", "ms")
     assert [replace(each, time=start) for each in together] == [replace(each, time=start) for each in one_by_one]
     assert [str(each.time) for each in together] == [str(each.time) for each in one_by_one]
     assert rejected == rejected_then
-    return sum(len(part) for part in together._parts if isinstance(part, FrameRun))
+    return sum(len(part) for part in together._parts if isinstance(part, FrameTable))
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -100,7 +99,7 @@ def test_a_truncated_last_frame_is_refused_or_noted(
 
 
 def test_a_short_file_is_read_frame_by_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(header_scan, "FEWEST_FRAMES", 256)
+    monkeypatch.setattr(flir, "FEWEST_FRAMES", 256)
     sequence(tmp_path / "a.seq", frames=200)
     assert frames_in_runs(tmp_path / "a.seq", monkeypatch) == 0
 
