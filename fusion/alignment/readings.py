@@ -126,6 +126,8 @@ class Readings:
         Names of the series that were logged as drivers.
     left_out : mapping of str to int
         Number of readings that could not be used, by reason.
+    places : int or None
+        Places along the axis at which contact sensors measured its temperature; None where no such sensors stand for the camera.
     """
 
     seconds: Array
@@ -139,6 +141,7 @@ class Readings:
     series: Mapping[str, Series]
     drivers: tuple[str, ...]
     left_out: Mapping[str, int]
+    places: int | None = None
 
     @property
     def span_mm(self) -> float:
@@ -301,6 +304,7 @@ def read_fused(fused: xr.Dataset) -> Readings:
             "missing": int((~present).sum()),
             "outside the frames' time": int((present & ~inside).sum()),
         },
+        places=int(fused["axis_places"]) if "axis_places" in fused else None,
     )
 
 

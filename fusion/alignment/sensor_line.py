@@ -38,7 +38,8 @@ def add_sensor_line(
     -------
     Dataset
         With ``mean_rise_series`` (K) and ``axis_integral_series`` (K mm) along ``sensor_time``; ``interpolation_u`` (K), by which a sensor
-        is missed by the line through the others, and ``axis_scale_u`` (1), the same as a share of the rise.
+        is missed by the line through the others, and ``axis_scale_u`` (1), the same as a share of the rise; ``axis_places`` (1), the
+        different places along the axis.
 
     Raises
     ------
@@ -85,6 +86,7 @@ def add_sensor_line(
         ),
         axis_integral_series=(("sensor_time", "target"), at_targets, {"units": "K mm"}),
         interpolation_u=((), missed, {"units": "K"}),
+        axis_places=((), int(places.size), {"units": "1"}),
         axis_scale_u=((), missed / max(float(np.sqrt((rise**2).mean())), 1e-12), {"units": "1"}),
     ).assign_coords(sensor_time=times)
 

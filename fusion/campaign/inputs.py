@@ -322,9 +322,25 @@ def _window_notice(source: CameraInputs) -> Notice:
     )
 
 
+def _sensor_notices(source: Inputs) -> list[Notice]:
+    """Return a notice for the contact sensors that are left out."""
+    sensors = source.sensors
+    if sensors is None or not sensors.faults:
+        return []
+    named = "; ".join(f"{sensors.logged['sensor'].values[fault.sensor]} {fault.words}" for fault in sensors.faults)
+    return [
+        Notice(
+            "sensors_left_out",
+            f"Faulty contact sensors of {sensors.file}: {named}. They are left out of all that is calculated, also before the fault, so "
+            "that one set of sensors serves the whole test and the fault is no step of the table.",
+            "Look at contact and cable.",
+        )
+    ]
+
+
 def _log_notices(source: Inputs) -> list[Notice]:
-    """Return a notice for the lines of the logs that are left out."""
-    notices = []
+    """Return a notice for the lines of the logs and the contact sensors that are left out."""
+    notices = _sensor_notices(source)
     for table, code in ((source.environment, "environment_rows_left_out"), (source.drivers, "driver_rows_left_out")):
         if table is not None:
             notices += left_out_notices(table, code)

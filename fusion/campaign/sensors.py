@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from fusion._typing import Array
+from fusion.alignment.sensor_health import SensorFault, examine_sensors
 from fusion.campaign.config import Campaign
 from fusion.campaign.logged_tables import TableError, read_drivers
 from fusion.campaign.quantities import QuantityError, conversion
@@ -24,24 +25,48 @@ class ContactSensors:
     ----------
     file : str
         File of the temperatures, for messages.
-    temperature : (time, sensor) DataArray, degC
-        Times in UTC; the sensors by name.
-    x_mm, y_mm : (sensors,) ndarray, mm
+    logged : (time, sensor) DataArray, degC
+        As logged, the faulty sensors among them; times in UTC, the sensors by name; NaN where a sensor gave nothing.
+    logged_x_mm, logged_y_mm : (sensors,) ndarray, mm
         Places on the plan.
     u_K : float, K
         Standard uncertainty of one sensor.
+    faults : tuple of SensorFault
+        What is clearly wrong with a sensor (docs/method/sensor-health.md), which is then left out of everything that is calculated.
     """
 
     file: str
-    temperature: xr.DataArray
-    x_mm: Array
-    y_mm: Array
+    logged: xr.DataArray
+    logged_x_mm: Array
+    logged_y_mm: Array
     u_K: float
+    faults: tuple[SensorFault, ...] = ()
+
+    @property
+    def sound(self) -> list[int]:
+        """Places among the logged sensors of those that are used."""
+        faulty = {fault.sensor for fault in self.faults}
+        return [k for k in range(self.logged.sizes["sensor"]) if k not in faulty]
+
+    @property
+    def temperature(self) -> xr.DataArray:
+        """Temperatures of the sound sensors at the times at which all of them gave one, (time, sensor) degC."""
+        return self.logged.isel(sensor=self.sound).dropna("time")
+
+    @property
+    def x_mm(self) -> Array:
+        """Places of the sound sensors along x, (sensors,) mm."""
+        return self.logged_x_mm[self.sound]
+
+    @property
+    def y_mm(self) -> Array:
+        """Places of the sound sensors along y, (sensors,) mm."""
+        return self.logged_y_mm[self.sound]
 
     @property
     def names(self) -> list[str]:
-        """Names of the sensors."""
-        return [str(name) for name in self.temperature["sensor"].values]
+        """Names of the sound sensors."""
+        return [str(name) for name in self.logged["sensor"].values[self.sound]]
 
 
 def read_sensors(campaign: Campaign) -> ContactSensors | None:
@@ -60,7 +85,7 @@ def read_sensors(campaign: Campaign) -> ContactSensors | None:
     Raises
     ------
     TableError, LaserFormatError
-        If a file is no table, a column is no temperature, or names and places do not belong to each other.
+        If a file is no table, a column is no temperature, names and places do not belong to each other, or no sensor is sound.
     """
     table, plan = campaign.sensors, campaign.plan
     if table is None or plan is None or plan.size_mm is None:
@@ -79,7 +104,18 @@ def read_sensors(campaign: Campaign) -> ContactSensors | None:
     temperature = xr.concat(columns, xr.IndexVariable("sensor", names), join="override").transpose("time", "sensor")
     temperature["time"].attrs.update(logged["time"].attrs)
     x_mm, y_mm = np.array([places[name] for name in names]).T
-    return ContactSensors(table.file, temperature.dropna("time"), x_mm, y_mm, table.temperature_u_K)
+    return ContactSensors(table.file, temperature, x_mm, y_mm, table.temperature_u_K, _faults(temperature, path))
+
+
+def _faults(temperature: xr.DataArray, path: Path) -> tuple[SensorFault, ...]:
+    """What is clearly wrong with sensors; refused where none is sound."""
+    times = temperature["time"].values
+    seconds = np.asarray((times - times[0]) / np.timedelta64(1, "s"), float)
+    faults = tuple(fault for fault in examine_sensors(seconds, temperature.values) if fault.is_clear)
+    if len(faults) == temperature.sizes["sensor"]:
+        named = "; ".join(f"{temperature['sensor'].values[fault.sensor]} {fault.words}" for fault in faults)
+        raise TableError(f"{path}: no contact sensor is sound ({named}); repeat the test, or remove [sensors]")
+    return faults
 
 
 def _read_places(path: Path, names: list[str], size_mm: tuple[float, float]) -> dict[str, tuple[float, float]]:

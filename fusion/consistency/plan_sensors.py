@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import xarray as xr
 
@@ -17,8 +19,8 @@ _CONTACT = 0.02
 _FIGURES = "temperatures, rises, the declared coefficients, and every cause that follows them"
 
 
-def check_sensors(temperature: xr.DataArray, *, file: str) -> list[Check]:
-    """Check that no contact sensor jumps, ramps, sticks or falls silent by itself.
+def check_sensors(temperature: xr.DataArray, *, file: str, left_out: Sequence[str] = ()) -> list[Check]:
+    """Check that no contact sensor in use jumps, ramps, sticks or falls silent by itself.
 
     Parameters
     ----------
@@ -26,6 +28,8 @@ def check_sensors(temperature: xr.DataArray, *, file: str) -> list[Check]:
         ``time`` in UTC.
     file : str
         The file, for the message.
+    left_out : sequence of str
+        Sensors that are not in use, each with what is wrong with it.
 
     Returns
     -------
@@ -44,7 +48,8 @@ def check_sensors(temperature: xr.DataArray, *, file: str) -> list[Check]:
             not clear,
             f"{file}: {named}."
             if clear
-            else f"No contact sensor of {file} jumps, ramps, sticks or falls silent by itself.",
+            else f"No {'other ' if left_out else ''}contact sensor of {file} jumps, ramps, sticks or falls silent by itself"
+            + (f"; left out: {'; '.join(left_out)}." if left_out else "."),
             f"Look at contact and cable, and leave the column out of {file}." if clear else "",
             _FIGURES,
         )

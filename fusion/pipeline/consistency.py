@@ -55,7 +55,9 @@ def check_source(source: Inputs) -> list[Check]:
     if isinstance(source, LaserInputs):
         checks += _check_readings_and_logs(source)
     if source.sensors is not None:
-        checks += check_sensors(source.sensors.temperature, file=source.sensors.file)
+        sensors = source.sensors
+        left_out = [f"{sensors.logged['sensor'].values[fault.sensor]} {fault.words}" for fault in sensors.faults]
+        checks += check_sensors(sensors.temperature, file=sensors.file, left_out=left_out)
     if isinstance(source, CameraInputs):
         checks += check_order(source.frames)
         checks += _phase(source) if isinstance(source, Source) else []

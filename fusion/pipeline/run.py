@@ -12,9 +12,10 @@ from typing import Any
 
 import xarray as xr
 
+from fusion.alignment.contact_log import describe_sensors, join_sensors
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import compensate_by_camera, read_source
-from fusion.campaign.sources import CameraInputs, LaserInputs, Source
+from fusion.campaign.sources import CameraInputs, Inputs, LaserInputs, Source
 from fusion.consistency.checks import Check, doubt_notices, inputs_part, refuse_contradictions
 from fusion.effects.plugins import plugins
 from fusion.pipeline import attribution, drift_model, interferometry, thermal
@@ -60,6 +61,8 @@ FILES = {
     "model": ".stages/model.nc",
     "record": "fusion.nc",
 }
+#: The contact sensors, made from the logs in a moment.
+_SENSORS = "sensors.nc"
 #: What a run writes last.
 PAGES = ("results.json", "provenance.json", "report.html")
 
@@ -266,6 +269,7 @@ def _run_instruments(
         datasets, found = _run_camera(run, source, scheduler=scheduler)
     else:
         datasets, found = _run_laser(run, source)
+    datasets |= _join_sensors(run, source, datasets.get("fields"))
     accepted = run.campaign.accept.doubts
     checks = [*checks, *found]
     run.parts["inputs"] = inputs_part(
@@ -276,6 +280,19 @@ def _run_instruments(
     )
     run.notices = [*doubt_notices(checks, accepted), *run.notices]
     return _finish(run, datasets)
+
+
+def _join_sensors(run: Run, source: Inputs, fields: xr.Dataset | None) -> dict[str, xr.Dataset]:
+    """Write sensors.nc: the contact sensors, and the camera at their places."""
+    sensors = source.sensors
+    if sensors is None:
+        return {}
+    joined = join_sensors(sensors.logged, sensors.logged_x_mm, sensors.logged_y_mm, sensors.faults, fields)
+    run.parts["sensors"] = describe_sensors(joined, file=sensors.file)
+    joined = run.described(joined)
+    claim(run.folder, _SENSORS)
+    write_dataset(run.folder / _SENSORS, joined)
+    return {"sensors": joined}
 
 
 def _run_both(run: Run, source: Source, *, scheduler: str | None) -> tuple[dict[str, Any], list[Check]]:

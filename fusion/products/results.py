@@ -39,7 +39,7 @@ from fusion.products.results_loop import (
     Verdict,
 )
 from fusion.products.results_part import ByDirection, Number, Quantity, ResultPart, TimePart
-from fusion.products.results_radiometry import FieldPart, RadiometryPart
+from fusion.products.results_radiometry import ContactSensorPart, FieldPart, RadiometryPart
 from fusion.products.store import Product, plain
 
 __all__ = [
@@ -132,6 +132,8 @@ class Results(ResultPart):
     """Uncertainty of temperatures and rises."""
     field: FieldPart | None = None
     """The temperature fields in short."""
+    sensors: tuple[ContactSensorPart, ...] | None = None
+    """Contact sensors on the table."""
     alignment: AlignmentPart | None = None
     """Both instruments on one clock."""
     iso230: Iso230Part | None = None

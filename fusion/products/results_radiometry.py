@@ -95,3 +95,26 @@ class FieldPart(ResultPart):
     """Place of that cell from the left edge of the picture, px; only where the picture is the plan."""
     largest_y_px: Number = None
     """Place of that cell from the upper edge of the picture, px; only where the picture is the plan."""
+
+
+class ContactSensorPart(ResultPart):
+    """A contact sensor on the table."""
+
+    name: str
+    """Name of its column."""
+    file: str
+    """File of its temperatures, as the campaign names it."""
+    x_mm: float
+    """Place on the plan, x, mm."""
+    y_mm: float
+    """Place on the plan, y, mm."""
+    rise_K: Number
+    """Last temperature minus the first of the common time with the camera, of a faulty sensor the last before its fault, K."""
+    camera_rise_K: Number
+    """The camera's rise of the cell at its place over its own common time, K; null without a camera or where the cell is not seen."""
+    used: bool
+    """Whether it takes part in what is calculated; a faulty one does not."""
+    fault: str
+    """What is wrong with it, in words; empty where it is sound."""
+    fault_time: str | None
+    """From when on, UTC; null where it is sound."""

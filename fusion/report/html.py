@@ -16,7 +16,7 @@ from fusion.products.results import RecordLoop, Results, read_results
 from fusion.products.store import read_dataset, read_tree
 from fusion.report import record_section, summary_section
 from fusion.report.attribution_section import leading_region
-from fusion.report.charts import attribution, drift, iso230, neighbours, plan, prediction, readings, timeline
+from fusion.report.charts import attribution, drift, iso230, neighbours, plan, prediction, readings, sensors, timeline
 from fusion.report.charts import loop as closed_loop
 from fusion.report.charts.style import Chart
 from fusion.report.charts.thermal_map import plot_thermal_map
@@ -27,6 +27,7 @@ _READERS: Mapping[str, Callable[[Path], Any]] = {
     "fields": read_dataset,
     "deviations": read_dataset,
     "fusion": read_tree,
+    "sensors": read_dataset,
 }
 
 
@@ -87,7 +88,9 @@ def render_report(
     charts, thermal_map = _draw_charts(results, datasets), None
     if "fields" in datasets:
         position = datasets["deviations"]["position"] if "deviations" in datasets else None
-        thermal_map = plot_thermal_map(datasets["fields"], results.hotspots or (), position)
+        thermal_map = plot_thermal_map(
+            datasets["fields"], results.hotspots or (), position, sensors=results.sensors or ()
+        )
         charts["thermal_map"] = thermal_map.chart
     return render_page(
         "report.html.j2",
@@ -139,6 +142,8 @@ def _draw_charts(results: Results, datasets: Mapping[str, Any]) -> dict[str, Cha
     if deviations is not None:
         charts |= _reading_charts(deviations)
         charts |= _drift_charts(results, deviations) if has(deviations, "drift") else {}
+    if "sensors" in datasets:
+        charts["sensors"] = sensors.plot_sensors(datasets["sensors"])
     if fused is not None:
         root = fused.to_dataset()
         if "time" in root:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from fusion.products.results_axis import NeighboursPart
 from fusion.products.results_inputs import Figures
 from fusion.products.results_loop import AxisLoop, Loop
 from fusion.products.results_part import Quantity
-from fusion.products.results_radiometry import RadiometryPart
+from fusion.products.results_radiometry import ContactSensorPart, RadiometryPart
 from fusion.report.attribution_section import describe_correlation
 from fusion.report.conclusions.actions import next_steps
 from fusion.report.conclusions.answers import conclude, describe_anomaly, headline, prediction_sentence, reconcile
@@ -54,6 +54,7 @@ from fusion.report.wording import (
     moment,
     number,
     p_cell,
+    place,
     premise,
     quantity,
     untouched,
@@ -106,6 +107,7 @@ _SECTIONS = (
     ("drift", "drift", "Drift"),
     ("anomalies", "anomalies", "Positions"),
     ("fields", "hotspots", "Heat"),
+    ("sensors", "sensors", "Contact sensors"),
     ("cause", "loop", "Cause"),
     ("place", "correlation", "Place"),
 )
@@ -175,6 +177,7 @@ def describe_campaign(
         "fiducials": _fiducials_table(fields) if fields is not None and "fiducial" in fields.sizes else None,
         "field_uncertainty": "" if results.radiometry is None else _field_uncertainty(results.radiometry),
         "budget": None if results.radiometry is None else _budget_table(results.radiometry),
+        "sensors": _sensors_table(results.sensors) if results.sensors else None,
         "surfaces": _surfaces_table(results.radiometry)
         if results.radiometry and results.radiometry.edge_cells
         else None,
@@ -424,6 +427,23 @@ def _surfaces_table(part: RadiometryPart) -> Table:
         "Monte Carlo over first order",
     )
     return table([Words("Surface"), *titles], rows)
+
+
+def _sensors_table(sensors: Sequence[ContactSensorPart]) -> Table:
+    """Return name, place and rise of every contact sensor, the camera's rise there, and whether it is used."""
+    seen = any(sensor.camera_rise_K is not None for sensor in sensors)
+    rows = [
+        [
+            sensor.name,
+            place(sensor.x_mm, sensor.y_mm),
+            number(sensor.rise_K, 3),
+            *([number(sensor.camera_rise_K, 3)] if seen else ()),
+            "used" if sensor.used else f"left out: {sensor.fault}",
+        ]
+        for sensor in sensors
+    ]
+    titles = ["Rise / K", *(["Camera at its place / K"] if seen else []), Words("State")]
+    return table([Words("Sensor"), Words("Place"), *titles], rows)
 
 
 def _hotspots_table(results: Results) -> Table:

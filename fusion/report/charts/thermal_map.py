@@ -11,6 +11,7 @@ from bokeh.models import Arrow, ColumnDataSource, HoverTool, LinearColorMapper, 
 from bokeh.plotting import figure
 
 from fusion.products.results_axis import HotspotPart
+from fusion.products.results_radiometry import ContactSensorPart
 from fusion.report.charts.plan import extent_of, new_plan
 from fusion.report.charts.style import DIVERGING, SEQUENTIAL, Chart, add_colour_bar, add_hover, palette
 from fusion.report.wording import number, place
@@ -67,7 +68,11 @@ class ThermalMap(NamedTuple):
 
 
 def plot_thermal_map(
-    fields: xr.Dataset, hotspots: Sequence[HotspotPart] = (), position: xr.DataArray | None = None
+    fields: xr.Dataset,
+    hotspots: Sequence[HotspotPart] = (),
+    position: xr.DataArray | None = None,
+    *,
+    sensors: Sequence[ContactSensorPart] = (),
 ) -> ThermalMap:
     """Draw the plan of the table with measured line, targets and hotspots.
 
@@ -79,6 +84,8 @@ def plot_thermal_map(
         Places that are ringed and numbered.
     position : (target,) DataArray, optional
         Target positions, mm; they give the arrow of the line its direction. None: the order of the targets.
+    sensors : sequence of ContactSensorPart
+        Contact sensors, drawn as squares with their names.
 
     Returns
     -------
@@ -114,6 +121,7 @@ def plot_thermal_map(
     if "target_x" in fields:
         _draw_line(drawn, fields, position)
     _draw_hotspots(drawn, hotspots, unit)
+    _draw_sensors(drawn, sensors)
     flat = {name: values.reshape(len(values), -1) for name, values in steps.items()}
     more = {name: np.diff(values, axis=0, prepend=np.int16(0)).ravel() for name, values in flat.items()}
     drawn.tags = [ColumnDataSource(more), {"scales": scales, "cycles": kept["cycle"].values.tolist()}]
@@ -207,6 +215,21 @@ def _draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart], unit: str) ->
         x, y, names, y_offset=-13, text_align=["right" if at > np.mean([drawn.x_range.start, drawn.x_range.end]) else "left" for at in x],
         text_color="#ffffff", text_font_size="12px", background_fill_color=INK, background_fill_alpha=0.75, padding=2,
     )  # fmt: skip
+
+
+def _draw_sensors(drawn: figure, sensors: Sequence[ContactSensorPart]) -> None:
+    """Mark the places of the contact sensors by squares with their names; faulty ones are crossed."""
+    for marker, used in (("square", True), ("square_x", False)):
+        shown = [sensor for sensor in sensors if sensor.used is used]
+        if not shown:
+            continue
+        x, y = [sensor.x_mm for sensor in shown], [sensor.y_mm for sensor in shown]
+        for colour, width in ((INK, 4), ("#ffffff", 2)):
+            drawn.scatter(x, y, marker=marker, size=11, fill_color=None, line_color=colour, line_width=width)
+        drawn.text(
+            x, y, [sensor.name for sensor in shown], y_offset=16, text_align="center", text_baseline="middle", text_color="#ffffff",
+            text_font_size="12px", background_fill_color=INK, background_fill_alpha=0.75, padding=2,
+        )  # fmt: skip
 
 
 def _seen(kept: xr.Dataset, last: np.ndarray, hotspots: Sequence[HotspotPart], cycle: int) -> str:

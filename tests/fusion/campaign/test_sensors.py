@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fusion.campaign.config import load_campaign
@@ -41,6 +42,29 @@ def test_temperatures_are_read_with_their_places(copied: Path) -> None:
 def test_what_does_not_fit_is_named(copied: Path, log: str, places: str, fault: str) -> None:
     with pytest.raises(TableError, match=fault):
         read(copied, log, places)
+
+
+def long_log(*, broken: bool) -> str:
+    """Two hours of three sensors, of which the second may jump by 15 K half way."""
+    minutes = np.arange(120)
+    warm = 20.0 + 4.0 * (1.0 - np.exp(-minutes / 40.0))[:, None] * np.array([1.0, 0.8, 0.9])
+    warm += np.random.default_rng(2).normal(0.0, 0.02, warm.shape)
+    warm[60:, 1] += 15.0 if broken else 0.0
+    stamps = np.datetime64("2026-03-09T08:00:00") + 60 * minutes
+    rows = [f"{stamp}Z,{a:.3f},{b:.3f},{c:.3f}" for stamp, (a, b, c) in zip(stamps, warm, strict=True)]
+    return "\n".join(["time,t1 [degC],t2 [degC],t3 [degC]", *rows]) + "\n"
+
+
+def test_a_sensor_that_breaks_is_left_out_and_named(copied: Path) -> None:
+    places = PLACES + "t3,350,90\n"
+    whole = read(copied, long_log(broken=False), places)
+    assert whole is not None and whole.faults == () and whole.names == ["t1", "t2", "t3"]
+    sensors = read(copied, long_log(broken=True), places)
+    assert sensors is not None and sensors.names == ["t1", "t3"] and sensors.x_mm.tolist() == [500.0, 350.0]
+    (fault,) = sensors.faults
+    assert fault.sensor == 1 and "jumps by 15 K" in fault.words and fault.onset_s == pytest.approx(3600.0, abs=120.0)
+    # The others keep every sample.
+    assert sensors.temperature.shape == (120, 2) and sensors.logged.shape == (120, 3)
 
 
 def test_a_campaign_without_sensors_has_none(copied: Path) -> None:

@@ -36,6 +36,10 @@ def test_sound_sensors_pass_and_one_that_breaks_is_named() -> None:
     broken.values[60:, 2] += 15.0
     (check,) = check_sensors(broken, file="t.csv")
     assert not check.passed and "t3" in check.evidence
+    (check,) = check_sensors(sound, file="t.csv", left_out=["t5 jumps by 15 K"])
+    assert (
+        check.passed and check.evidence.startswith("No other contact sensor") and "left out: t5 jumps" in check.evidence
+    )
 
 
 def test_a_camera_that_reads_the_rise_too_small_is_doubted() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -124,6 +126,12 @@ def test_without_field_and_load_only_warm_ups_are_left():
 def test_the_expansion_of_the_axis_is_unmeasured_without_a_temperature_of_the_table():
     assert unmeasured_expansion(campaign(series={"mean_rise": logged(np.arange(60.0), "K")})) is None
     assert "its own expansion looks the same" in str(unmeasured_expansion(campaign()))
+
+
+def test_two_sensors_do_not_show_how_the_expansion_bends_along_the_axis():
+    seen = campaign(series={"mean_rise": logged(np.arange(60.0), "K")})
+    assert "what 2 contact sensors along the axis miss" in str(unmeasured_expansion(replace(seen, places=2)))
+    assert unmeasured_expansion(replace(seen, places=3)) is None
 
 
 def test_the_unit_of_a_coefficient_follows_from_what_drives_it():

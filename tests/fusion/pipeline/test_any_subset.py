@@ -294,6 +294,9 @@ def test_contact_sensors_stand_for_the_camera(folder: Path, results_folder: Path
     # The same rise, from five places instead of all cells: the coefficients agree within their uncertainties.
     assert abs(here.value - there.value) < 2.0 * np.hypot(here.u, there.u)
     assert "the campaign has no camera" in results.loop.not_tried["camera_offset"]
+    assert results.sensors is not None and [sensor.used for sensor in results.sensors] == [True] * 5
+    assert results.sensors[0].camera_rise_K is None and results.sensors[0].rise_K is not None
+    assert "sensors" in sections(tmp_path / "results")
     (notice,) = [warning for warning in results.warnings if warning.code == "sensors_for_the_camera"]
     assert "which enters the uncertainty of every coefficient per kelvin" in notice.message
     assert results.inputs is not None
@@ -307,6 +310,11 @@ def test_contact_sensors_beside_the_camera_tell_a_wrong_rise(
     write_sensors(folder, results_folder / "fields.nc", gain=1.5)
     path = without(folder / "campaign.toml", "interferometry", "drivers", "model", name="beside.toml", added=SENSORS)
     results = run_campaign(path, tmp_path / "results")
+    assert results.sensors is not None
+    for sensor in results.sensors:
+        assert sensor.rise_K == pytest.approx(1.5 * sensor.camera_rise_K, rel=0.1), sensor.name
+    assert read_dataset(tmp_path / "results" / "sensors.nc")["camera_rise"].notnull().any()
+    assert {"sensors", "fields"} <= set(sections(tmp_path / "results"))
     assert results.inputs is not None and results.inputs.state == "doubted"
     (doubt,) = [check for check in results.inputs.doubts if check.code == "sensors_rise"]
     assert "the camera shows a rise of" in doubt.evidence
