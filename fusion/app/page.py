@@ -10,7 +10,10 @@ import panel as pn
 from panel.theme.base import Design, Inherit
 from panel.viewable import Viewable
 
+from fusion.app.compare.screen import compare_screen
 from fusion.app.elements import paragraph
+from fusion.app.live.screen import live_screen
+from fusion.app.results.screen import results_screen
 from fusion.app.run.screen import run_screen
 from fusion.app.setup.screen import set_up
 from fusion.app.state import State, state_of
@@ -20,7 +23,13 @@ _TEMPLATES = Path(__file__).parent / "templates"
 #: A screen shows a state, and changes it.
 Screen = Callable[[State], Viewable]
 #: Screens in the order of the work.
-SCREENS: dict[str, Screen] = {"Set up": set_up, "Run": run_screen}
+SCREENS: dict[str, Screen] = {
+    "Set up": set_up,
+    "Run": run_screen,
+    "Results": results_screen,
+    "Compare": compare_screen,
+    "Live": live_screen,
+}
 
 
 class Look(Design):

@@ -125,7 +125,7 @@ def _size(change: Change) -> str:
 
 
 def changes_table(pair: PairComparison) -> Table:
-    """Return everything that was compared, with both values, the change and the verdict; what changed is marked.
+    """Return everything that was compared, with both values, the change and the verdict; what differs is marked and comes first.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def changes_table(pair: PairComparison) -> Table:
             ],
             marked=change.significant,
         )
-        for change in pair.changes
+        for change in sorted(pair.changes, key=lambda one: not one.significant)
     ]
     headings = [
         Words("Quantity"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,8 +27,20 @@ _BEYOND = "#7fe3ff"
 _ROOM = 0.025
 
 
-class _Layer(NamedTuple):
-    """A quantity of the menu: its variable in fields.nc, words, unit, decimals that are shown, and colours."""
+class Layer(NamedTuple):
+    """A quantity of the map.
+
+    Attributes
+    ----------
+    variable : str
+        Its name in fields.nc.
+    words, unit : str
+        As they are shown; "1" for a number without unit.
+    decimals : int
+        That are shown.
+    colours : str
+        Name of its scale.
+    """
 
     variable: str
     words: str
@@ -37,12 +49,13 @@ class _Layer(NamedTuple):
     colours: str
 
 
-_LAYERS = (
-    _Layer("temperature_rise", "rise", "K", 2, SEQUENTIAL),
-    _Layer("temperature", "temperature", "°C", 2, SEQUENTIAL),
-    _Layer("temperature_rate", "rate", "K/h", 2, DIVERGING),
-    _Layer("temperature_rise_u", "standard uncertainty of the rise", "K", 3, SEQUENTIAL),
-    _Layer("count", "frames averaged", "1", 0, SEQUENTIAL),
+#: Quantities of the map, the first one shown first.
+LAYERS = (
+    Layer("temperature_rise", "rise", "K", 2, SEQUENTIAL),
+    Layer("temperature", "temperature", "°C", 2, SEQUENTIAL),
+    Layer("temperature_rate", "rate", "K/h", 2, DIVERGING),
+    Layer("temperature_rise_u", "standard uncertainty of the rise", "K", 3, SEQUENTIAL),
+    Layer("count", "frames averaged", "1", 0, SEQUENTIAL),
 )
 
 
@@ -96,31 +109,16 @@ def plot_thermal_map(
     Values are kept as steps of the last decimal that is shown, in 16 bits, each cycle as its difference to the one before: noise of the
     camera is some steps, so that the compressed maps of a long test stay small.
     """
-    shown = [layer for layer in _LAYERS if layer.variable in fields]
+    shown = [layer for layer in LAYERS if layer.variable in fields]
     kept, note = _thin(fields[[layer.variable for layer in shown]])
-    extent = extent_of(kept)
-    room = _ROOM * (extent[1] - extent[0])
     unit = plan_unit(fields)
-    drawn = new_plan((extent[0] - room, extent[1] + room, extent[2] - room, extent[3] + room), height=330, unit=unit)
     steps = {layer.words: _in_steps(kept[layer.variable].values, layer) for layer in shown}
-    scales = [_scale(kept[layer.variable].values, layer) for layer in shown]
-    first, last = shown[0], kept[shown[0].variable].values[-1]
-    mapper = LinearColorMapper(
-        palette(first.colours), low=scales[0]["low"], high=scales[0]["high"], nan_color="#e1e5e7", low_color=_BEYOND,
-        high_color=_BEYOND, name="scale",
-    )  # fmt: skip
-    left, right, bottom, top = extent
-    cells = drawn.image(
-        [last.astype(np.float32)], x=left, y=bottom, dw=right - left, dh=top - bottom, color_mapper=mapper, level="image", name="cells"
-    )  # fmt: skip
-    tip = (first.words, f"@image{{0.{'0' * first.decimals}}} {first.unit}")
-    add_hover(drawn, [("x", f"$x{{0}} {unit}"), ("y", f"$y{{0}} {unit}"), tip], [cells])
-    drawn.select_one(HoverTool).name = "reading"
-    add_colour_bar(drawn, mapper, f"{first.words} / {first.unit}")
-    drawn.below[-1].name = "bar"
+    scales = [scale_of(kept[layer.variable].values, layer) for layer in shown]
+    last = kept[shown[0].variable].values[-1]
+    drawn = draw_map(last, extent_of(kept), shown[0], scales[0], unit=unit)
     if "target_x" in fields:
-        _draw_line(drawn, fields, position)
-    _draw_hotspots(drawn, hotspots, unit)
+        draw_line(drawn, fields, position)
+    draw_hotspots(drawn, hotspots, unit)
     _draw_sensors(drawn, sensors)
     flat = {name: values.reshape(len(values), -1) for name, values in steps.items()}
     more = {name: np.diff(values, axis=0, prepend=np.int16(0)).ravel() for name, values in flat.items()}
@@ -132,6 +130,52 @@ def plot_thermal_map(
         kept["cycle"].values.tolist(),
         note,
     )
+
+
+def draw_map(
+    values: np.ndarray,
+    extent: tuple[float, float, float, float],
+    layer: Layer,
+    scale: Mapping[str, Any],
+    *,
+    unit: str = "mm",
+) -> figure:
+    """Draw one quantity in one cycle on the plan of the table.
+
+    Parameters
+    ----------
+    values : (y, x) ndarray
+        NaN where no cell is seen.
+    extent : tuple of float
+        Left, right, bottom, top of the cells, mm.
+    layer : Layer
+        The quantity.
+    scale : mapping
+        From `scale_of`.
+    unit : {"mm", "px"}
+        Of the plan, or of the picture that stands for it.
+
+    Returns
+    -------
+    figure
+        Its renderer "cells", colour mapper "scale", colour bar "bar" and hover tool "reading" may be set to other values.
+    """
+    left, right, bottom, top = extent
+    room = _ROOM * (right - left)
+    drawn = new_plan((left - room, right + room, bottom - room, top + room), height=330, unit=unit)
+    mapper = LinearColorMapper(
+        palette(layer.colours), low=scale["low"], high=scale["high"], nan_color="#e1e5e7", low_color=_BEYOND, high_color=_BEYOND,
+        name="scale",
+    )  # fmt: skip
+    cells = drawn.image(
+        [values.astype(np.float32)], x=left, y=bottom, dw=right - left, dh=top - bottom, color_mapper=mapper, level="image", name="cells"
+    )  # fmt: skip
+    tip = (layer.words, f"@image{{0.{'0' * layer.decimals}}} {layer.unit}")
+    add_hover(drawn, [("x", f"$x{{0}} {unit}"), ("y", f"$y{{0}} {unit}"), tip], [cells])
+    drawn.select_one(HoverTool).name = "reading"
+    add_colour_bar(drawn, mapper, f"{layer.words} / {layer.unit}")
+    drawn.below[-1].name = "bar"
+    return drawn
 
 
 def _thin(fields: xr.Dataset) -> tuple[xr.Dataset, str]:
@@ -151,15 +195,24 @@ def _thin(fields: xr.Dataset) -> tuple[xr.Dataset, str]:
     return fields, f"{', '.join(note)}; fields.nc holds all." if note else ""
 
 
-def _in_steps(values: np.ndarray, layer: _Layer) -> np.ndarray:
+def _in_steps(values: np.ndarray, layer: Layer) -> np.ndarray:
     """Return values as 16-bit steps of the last decimal that is shown; cells without a value hold the lowest number."""
     steps = np.round(values.astype(float) * 10.0**layer.decimals)
     return np.where(np.isfinite(steps), np.clip(steps, -32767, 32767), _MISSING).astype(np.int16)
 
 
-def _scale(values: np.ndarray, layer: _Layer) -> dict[str, Any]:
-    """Return what the script needs to show a quantity: its step, its words, and one colour scale for all cycles.
+def scale_of(values: np.ndarray, layer: Layer) -> dict[str, Any]:
+    """Return how a quantity is shown: its step, its words, and one colour scale for all cycles.
 
+    Parameters
+    ----------
+    values : (cycle, y, x) ndarray
+        NaN where no cell is seen.
+    layer : Layer
+        The quantity.
+
+    Notes
+    -----
     The scale holds every value, unless a few cells are so far outside that they would hide all others; these have a colour of their own.
     """
     finite = values[np.isfinite(values)].astype(float)
@@ -176,8 +229,18 @@ def _scale(values: np.ndarray, layer: _Layer) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _draw_line(drawn: figure, fields: xr.Dataset, position: xr.DataArray | None) -> None:
-    """Draw the measured line with an arrow to its positive end, its targets, and the numbers of the first and the last."""
+def draw_line(drawn: figure, fields: xr.Dataset, position: xr.DataArray | None) -> None:
+    """Draw the measured line with an arrow to its positive end, its targets, and the numbers of the first and the last.
+
+    Parameters
+    ----------
+    drawn : figure
+        From `draw_map`.
+    fields : Dataset
+        With ``target_x`` and ``target_y`` (target; mm).
+    position : (target,) DataArray or None
+        Target positions, mm; None: the order of the targets.
+    """
     targets = fields["target"].values
     order = np.arange(targets.size)
     if position is not None:
@@ -203,8 +266,18 @@ def _draw_line(drawn: figure, fields: xr.Dataset, position: xr.DataArray | None)
     )  # fmt: skip
 
 
-def _draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart], unit: str) -> None:
-    """Ring the peak of every hotspot and write its name."""
+def draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart], unit: str) -> None:
+    """Ring the peak of every hotspot and write its name.
+
+    Parameters
+    ----------
+    drawn : figure
+        From `draw_map`.
+    hotspots : sequence of HotspotPart
+        The part ``hotspots`` of the results.
+    unit : {"mm", "px"}
+        Of the plan, or of the picture that stands for it.
+    """
     if not hotspots:
         return
     x, y = ([getattr(spot, f"{axis}_{unit}") for spot in hotspots] for axis in "xy")
@@ -245,7 +318,7 @@ def _seen(kept: xr.Dataset, last: np.ndarray, hotspots: Sequence[HotspotPart], c
     )
 
 
-def _columns(kept: xr.Dataset, shown: Sequence[_Layer], cycle: int) -> dict[str, np.ndarray]:
+def _columns(kept: xr.Dataset, shown: Sequence[Layer], cycle: int) -> dict[str, np.ndarray]:
     """Return the cells of the last cycle, one row each."""
     x, y = np.meshgrid(kept["x"].values, kept["y"].values)
     units = {layer.words: "" if layer.unit == "1" else f" / {layer.unit}" for layer in shown}

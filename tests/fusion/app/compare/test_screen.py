@@ -1,0 +1,63 @@
+"""The screen *Compare*: what is offered, and in a browser what it says."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fusion.app.compare.screen import CompareScreen, comparison_parts, find_results, label_of
+from fusion.app.state import State
+from fusion.comparison.campaigns import compare_campaigns
+from tests.fusion.app.texts import texts
+from tests.fusion.compared_tests import readings_of, repaired, write_results
+
+
+def test_results_are_found_below_a_folder_and_no_others(tmp_path: Path) -> None:
+    for name in ("b/results", "a", "a/deeper", ".hidden", "1/2/3/4/5"):
+        (tmp_path / name).mkdir(parents=True)
+        for file in ("results.json", "provenance.json"):
+            (tmp_path / name / file).write_text("{}")
+    (tmp_path / "linked").symlink_to(tmp_path / "b")
+    found, whole = find_results(tmp_path)
+    assert [folder.relative_to(tmp_path).as_posix() for folder in found] == ["a", "b/results"]
+    assert whole
+    assert label_of(tmp_path, tmp_path / "a") == "a (cannot be read by this version)"
+
+
+def test_with_fewer_than_two_results_nothing_is_compared(tmp_path: Path) -> None:
+    screen = CompareScreen(State(root=tmp_path))
+    assert "There is no results folder of a finished run" in texts([screen.view])
+    assert screen._compare.disabled
+
+
+def test_what_changed_comes_first(tmp_path: Path) -> None:
+    before = write_results(tmp_path / "before", readings_of(31), title="<b>before</b>")
+    after = write_results(tmp_path / "after", repaired(readings_of(33), -1.2))
+    parts = comparison_parts(
+        compare_campaigns([before, after, write_results(tmp_path / "y", readings_of(32), axis="Y")])
+    )
+    told = texts(parts)
+    assert told.index("Changed by more than the uncertainties: deviation at 80 mm") < told.index("Side by side")
+    assert "the axes differ (X and Y)" in told
+    assert not any(
+        "<b>before" in str(pane.object) for part in parts for pane in part.select() if hasattr(pane, "object")
+    )
+
+
+@pytest.mark.browser
+def test_two_campaigns_are_chosen_and_compared_by_keyboard(app: tuple[str, Path], new_page: Callable[..., Any]) -> None:
+    shutil.copytree(app[1] / "results", app[1] / "later")
+    page = new_page(app[0], width=390)
+    page.get_by_role("button", name="Compare", exact=True).first.press("Enter")
+    page.get_by_label("Reference").select_option("results: Small campaign, 2026-03-09")
+    box = page.get_by_role("checkbox", name="later: Small campaign")
+    box.focus()
+    page.keyboard.press("Space")
+    page.get_by_role("button", name="Compare", exact=True).last.press("Enter")
+    page.get_by_text("No change of the machine is shown").wait_for()
+    page.get_by_role("heading", name="Side by side").wait_for()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390

@@ -1,0 +1,99 @@
+"""The screen *Results* in a browser: linked selection, keyboard, results that lack an instrument, texts of a file."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture(scope="module")
+def page(app: tuple[str, Path], new_page: Callable[..., Any]) -> Any:
+    """The application, with results of a laser alone whose title is markup beside the whole ones."""
+    laser = shutil.copytree(app[1] / "results", app[1] / "laser_alone")
+    (laser / "fields.nc").unlink()
+    results = json.loads((laser / "results.json").read_text(encoding="utf-8"))
+    results["campaign"] = "<img src=x onerror=alert(1)>"
+    (laser / "results.json").write_text(json.dumps(results), encoding="utf-8")
+    return new_page(app[0], width=390)
+
+
+def opened(page: Any, part: str) -> None:
+    """Open a screen or a part of it."""
+    page.get_by_role("button", name=part, exact=True).first.click()
+
+
+def name_folder(page: Any, folder: Path) -> None:
+    page.get_by_label("Results folder").fill(str(folder))
+    page.get_by_label("Results folder").press("Enter")
+    opened(page, "Open")
+
+
+def test_a_cycle_and_a_position_are_shown_everywhere_by_keyboard(page: Any) -> None:
+    opened(page, "Results")
+    page.get_by_text("Cycle 24 (").wait_for()
+    page.get_by_role("slider").focus()
+    for _ in range(4):
+        page.keyboard.press("ArrowLeft")
+    page.get_by_text("Cycle 20 (").wait_for()
+    menu = page.get_by_label("Position shown everywhere")
+    menu.focus()
+    menu.select_option("Position 5 (200 mm)")
+    page.get_by_role("button", name="Laser", exact=True).press("Enter")
+    page.get_by_text("Readings at 200 mm").wait_for()
+    opened(page, "Map")
+    page.get_by_text("Cycle 20 (").wait_for()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_places_are_added_by_keyboard_and_by_click(page: Any) -> None:
+    page.get_by_label("x / mm").fill("300")
+    page.get_by_label("x / mm").press("Enter")
+    page.get_by_role("button", name="Add place").press("Enter")
+    page.get_by_text("over time. x 300 mm").wait_for()
+    page.locator(".bk-Figure").first.click(position={"x": 220, "y": 130})
+    page.get_by_text("over time. x 300 mm").filter(has_text=";").wait_for()
+
+
+def test_the_loop_and_the_positions_say_what_was_found(page: Any) -> None:
+    opened(page, "Loop")
+    page.get_by_role("heading", name="Round 1").wait_for()
+    page.get_by_text("What the final model leaves").first.wait_for()
+    opened(page, "Positions")
+    page.get_by_text("stand").first.wait_for()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_a_changed_run_goes_to_a_folder_of_its_own_and_is_shown(page: Any, app: tuple[str, Path]) -> None:
+    opened(page, "Run again")
+    start = page.get_by_role("button", name="Run again", exact=True).last
+    assert start.is_disabled()
+    page.get_by_role("checkbox", name="table_offset").uncheck()
+    page.get_by_text("thermal fields, deviations and correlation are kept").wait_for()
+    start.click()
+    page.get_by_text("campaign_2.toml was written").wait_for()
+    page.get_by_text("Cycle 24 (").wait_for(timeout=120_000)
+    assert page.get_by_label("Results folder").input_value() == str(app[1] / "results_2")
+    declared = json.loads((app[1] / "results_2" / "results.json").read_text(encoding="utf-8"))["loop"]["declared"]
+    assert declared == ["axis_expansion"]
+
+
+def test_a_laser_alone_shows_what_there_is_and_its_texts_are_no_markup(page: Any, app: tuple[str, Path]) -> None:
+    name_folder(page, app[1] / "laser_alone")
+    page.get_by_text("<img src=x onerror=alert(1)>").wait_for()
+    page.get_by_text("Deviation along the axis").wait_for()
+    opened(page, "Map")
+    page.get_by_text("This run has no camera").wait_for()
+
+
+def test_a_folder_without_results_says_so(page: Any, app: tuple[str, Path]) -> None:
+    name_folder(page, app[1] / "thermal")
+    page.get_by_role("alert").filter(has_text="there is no results.json in it").wait_for()
+    name_folder(page, Path("/"))
+    page.get_by_role("alert").filter(has_text="outside").wait_for()
