@@ -42,7 +42,7 @@ docs: $(VENV)/.docs
 
 # The pictures of README and documentation, from the demo's report in a headless Chromium.
 screenshots: $(VENV)/.test demo
-	$(BIN)/python docs/pictures/take.py build/demo/results docs/pictures
+	$(BIN)/python docs/pictures/take.py build/demo/results build/demo/campaign docs/pictures
 
 # Long simulations: the figures that the documentation quotes come from here.
 soak: $(VENV)/.test

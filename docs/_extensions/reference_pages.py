@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+import re
 import typing
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -114,7 +115,7 @@ def type_of(schema: Mapping[str, Any]) -> str:
 
 def anchor(name: str) -> str:
     """Return the target of a model's section."""
-    return f"model-{name.lower()}"
+    return f"model-{name.lower().replace(' ', '-')}"
 
 
 def cell(text: str) -> str:
@@ -126,7 +127,7 @@ def model_section(name: str, schema: Mapping[str, Any]) -> str:
     """Return the section of one model: its description and a row for each key."""
     rows = kinds_table(schema["oneOf"]) if "oneOf" in schema else keys_table(schema)
     about = first_sentence(schema.get("description")).replace("``", "`")
-    return f"({anchor(name)})=\n## {name}\n\n{about}\n\n" + "\n".join(rows) + "\n\n"
+    return f"({anchor(name)})=\n## {schema.get('heading', name)}\n\n{about}\n\n" + "\n".join(rows) + "\n\n"
 
 
 def keys_table(schema: Mapping[str, Any]) -> list[str]:
@@ -164,6 +165,54 @@ def schema_page(schema: Mapping[str, Any]) -> str:
     return "".join(model_section(name, model) for name, model in models.items())
 
 
+def example_comments(text: str) -> dict[tuple[str, str], str]:
+    """Return what the commented example of a campaign file says of its keys, by table and key."""
+    comments, table = {}, ""
+    for line in "\n".join(re.findall(r"^```(?:toml|ini)\n(.*?)^```", text, re.M | re.S)).splitlines():
+        head = re.match(r"(?:# )?\[+([\w.]+)\]+", line)
+        pair = re.match(r"(?:# )?(\w+) = .*?\s# (.*)", line)
+        if head:
+            table = head[1]
+        elif pair:
+            comments.setdefault((table, pair[1]), pair[2].removeprefix("... "))
+    return comments
+
+
+def campaign_page(schema: Mapping[str, Any], example: str) -> str:
+    """Return the tables of the campaign file as a user writes them: their names in brackets, meanings from the commented example."""
+    comments = example_comments(example)
+    models = {}
+    for name, model in schema["$defs"].items():
+        heading, _, about = first_sentence(model.get("description")).replace("`", "").partition(": ")
+        table = re.fullmatch(r"\[+([\w.]+)\]+", heading)
+        properties = {
+            key: written(value) | {"description": meaning(key, comments.get((table[1] if table else "", key), ""))}
+            for key, value in model.get("properties", {}).items()
+        }
+        described = {"heading": heading, "description": f"{about[:1].upper()}{about[1:]}"} if table else {}
+        models[name] = model | {"properties": properties} | described
+    tables = {key: written(value) for key, value in schema["properties"].items()}
+    return schema_page(
+        schema | {"properties": tables, "$defs": models, "title": "Tables of the file", "description": ""}
+    )
+
+
+def meaning(key: str, comment: str) -> str:
+    """Return the meaning of a key: what the example says, or of which key it is the standard uncertainty."""
+    if comment.startswith("or "):  # another way to write the value, not its meaning
+        comment = ""
+    return comment or (f"standard uncertainty of {key.removesuffix('_u')}" if key.endswith("_u") else "")
+
+
+def written(value: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a property without what TOML has no word for: null, and tables that stand for themselves where they are left out."""
+    kept = [choice for choice in value.get("anyOf", []) if choice.get("type") != "null"]
+    rest = {key: part for key, part in value.items() if key != "anyOf"}
+    if isinstance(rest.get("default"), dict):
+        del rest["default"]
+    return rest | ({"anyOf": kept} if kept else {})
+
+
 def command_page() -> str:
     """Return what `thermofuse --help` and the help of every command say."""
     command = typer.main.get_command(cli.app)
@@ -189,7 +238,9 @@ def write_pages(app: Sphinx) -> None:
     pages |= {generated / f"names_{package}.md": table for package, table in public_names()}
     pages |= {
         generated / "command.md": command_page(),
-        generated / "campaign.md": schema_page(campaign_schema()),
+        generated / "campaign.md": campaign_page(
+            campaign_schema(), (reference / "campaign-file.md").read_text(encoding="utf-8")
+        ),
         generated / "recipe.md": schema_page(recipe_schema()),
         generated / "results.md": schema_page(results_schema()),
     }

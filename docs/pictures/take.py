@@ -1,49 +1,80 @@
-"""Take the pictures of the report for README and documentation: ``python docs/pictures/take.py RESULTS FOLDER`` (`make screenshots`)."""
+"""Take the pictures of README and site: ``python docs/pictures/take.py RESULTS CAMPAIGN_FOLDER PICTURES`` (`make screenshots`)."""
 
 from __future__ import annotations
 
 import io
 import shutil
+import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from PIL import Image
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 
 #: A README loads its pictures for every reader.
 _MOST_BYTES = 150_000
 #: Name of the picture -> what of the report is brought to the top of the window, and the window's height in px.
-_PARTS = {"report": ("body", 860), "thermal-map": ("#fields", 760)}
+_PARTS = {"report": ("body", 735), "thermal-map": ("#fields", 705)}
+_WIDTH = 1200
+_LOADING_MS = 120_000
 
 
 def compact(picture: bytes) -> bytes:
-    """Return a PNG with a palette of its own colours; fewer of them until it is small enough."""
+    """Return a small PNG: with all colours, or with a palette of its own where that is too large."""
     image = Image.open(io.BytesIO(picture)).convert("RGB")
-    for colours in (256, 128, 64):
+    for kept in (image, image.quantize(256, dither=Image.Dither.NONE)):
         small = io.BytesIO()
-        image.quantize(colours, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
+        kept.save(small, "PNG", optimize=True)
         if small.tell() < _MOST_BYTES:
             return small.getvalue()
-    raise SystemExit(
-        f"a picture of {image.size} px is larger than {_MOST_BYTES} bytes with 64 colours; take less of the page"
-    )
+    raise SystemExit(f"a picture of {image.size} px is larger than {_MOST_BYTES} bytes; take less of the page")
 
 
-def take(report: Path, folder: Path) -> None:
+@contextmanager
+def open_page(browser: Browser, address: str, height: int) -> Iterator[Page]:
+    """Open an address in a light window of the pictures' width."""
+    page = browser.new_page(viewport={"width": _WIDTH, "height": height}, color_scheme="light")
+    page.goto(address)
+    yield page
+    page.close()
+
+
+def take_report(browser: Browser, report: Path, folder: Path) -> None:
     """Write a picture of every part of a report."""
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
-        for name, (place, height) in _PARTS.items():
-            page = browser.new_page(viewport={"width": 1200, "height": height}, color_scheme="light")
-            page.goto(report.resolve().as_uri())
+    for name, (place, height) in _PARTS.items():
+        with open_page(browser, report.resolve().as_uri(), height) as page:
             page.wait_for_load_state("networkidle")
             page.locator(place).first.evaluate("element => element.scrollIntoView({block: 'start'})")
             page.wait_for_timeout(2000)
             (folder / f"{name}.png").write_bytes(compact(page.screenshot()))
-            page.close()
-        browser.close()
+
+
+def take_app(browser: Browser, campaign: Path, folder: Path) -> None:
+    """Write a picture of the application that has looked into the folder of a campaign."""
+    copy = Path(tempfile.mkdtemp()) / "measurement"
+    shutil.copytree(campaign, copy)
+    command = [sys.executable, "-m", "thermofuse", "app", "."]
+    with subprocess.Popen(command, cwd=copy, stdout=subprocess.PIPE, text=True) as app:
+        try:
+            assert app.stdout is not None
+            address = app.stdout.readline().removeprefix("app:").strip()
+            with open_page(browser, address, 900) as page:
+                page.get_by_text("Looking into the files").wait_for(timeout=_LOADING_MS)
+                page.get_by_text("Looking into the files").wait_for(state="hidden", timeout=_LOADING_MS)
+                page.wait_for_timeout(5000)
+                (folder / "app.png").write_bytes(compact(page.screenshot()))
+        finally:
+            app.terminate()
+            shutil.rmtree(copy.parent)
 
 
 if __name__ == "__main__":
-    results, pictures = map(Path, sys.argv[1:3])
-    take(results / "report.html", pictures)
+    results, campaign, pictures = map(Path, sys.argv[1:4])
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        take_report(browser, results / "report.html", pictures)
+        take_app(browser, campaign, pictures)
+        browser.close()
