@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import os
 import sys
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 
+import jupyter_cache.executors.utils
 import mathjax
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE / "_extensions"))
 # What tutorials run: the command of this environment, in lines that fit the page.
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-os.environ["COLUMNS"] = "100"
+os.environ["COLUMNS"] = "90"
 os.environ["TTY_COMPATIBLE"] = "0"
+# What a command prints in pieces is joined as it came; myst-nb would begin a line at every piece.
+jupyter_cache.executors.utils.executenb = partial(jupyter_cache.executors.utils.executenb, coalesce_streams=True)
 # A progress bar of another library misses its widgets; nothing on these pages would show them.
 os.environ["PYTHONWARNINGS"] = "ignore:IProgress not found"
 
