@@ -8,8 +8,8 @@ from functools import partial
 from importlib import metadata
 from pathlib import Path
 
-import jupyter_cache.executors.utils
 import mathjax
+from jupyter_cache.executors import utils as notebook_runs
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE / "_extensions"))
@@ -18,7 +18,7 @@ os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.envir
 os.environ["COLUMNS"] = "90"
 os.environ["TTY_COMPATIBLE"] = "0"
 # What a command prints in pieces is joined as it came; myst-nb would begin a line at every piece.
-jupyter_cache.executors.utils.executenb = partial(jupyter_cache.executors.utils.executenb, coalesce_streams=True)
+notebook_runs.executenb = partial(notebook_runs.executenb, coalesce_streams=True)
 # A progress bar of another library misses its widgets; nothing on these pages would show them.
 os.environ["PYTHONWARNINGS"] = "ignore:IProgress not found"
 
