@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -170,9 +170,9 @@ class Checkpoint:
         path = self.folder / _KNOCKS
         return list(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else []
 
-    def load(self) -> list[StoredCycle]:
-        """Finished cycles in the order of time."""
-        return [_load(path) for path in sorted(self.folder.glob("frames_*.sums"))]
+    def load(self) -> Iterator[StoredCycle]:
+        """Yield the finished cycles in the order of time."""
+        return map(_load, sorted(self.folder.glob("frames_*.sums")))
 
     def load_open(self) -> StoredCycle | None:
         """Stored state of the last open cycle, if there is one."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any, overload
 
 import numpy as np
 import xarray as xr
@@ -14,6 +16,7 @@ from scipy import ndimage
 from thermography._constants import MAD_TO_SIGMA
 from thermography._typing import Array
 from thermography.fields.resampling import PlanWeights
+from thermography.fields.tasks.spool import IN_MEMORY_BYTES, Spool, empty_array
 from thermography.radiometry.averaging import AVERAGING_LIMIT_K, MeanTemperature
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration
@@ -120,6 +123,10 @@ _ATTRIBUTES: dict[str, dict[str, Any]] = {
 }
 
 
+#: Arrays of a finished part.
+_CELLS = ("mean", "spread", "noise_variance", "fell_back", "count")
+
+
 @dataclass
 class CyclePart:
     """The frames of one cycle under one registration: means over pixels while it is open, cells of the plan once it is finished.
@@ -189,6 +196,52 @@ class CyclePart:
         )
         self.count = np.where(np.isfinite(self.mean), self.frames, 0)
         self.pixels = None
+
+
+class FinishedParts(Sequence[CyclePart]):
+    """Finished parts of cycles, in the order of time, their cells in spools.
+
+    Parameters
+    ----------
+    folder : Path or None
+        For their files; None for that of the system.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self._parts: list[CyclePart] = []
+        self._cells = {name: Spool(folder) for name in _CELLS}
+
+    def append(self, part: CyclePart) -> None:
+        """Add a finished part."""
+        for name, spool in self._cells.items():
+            spool.append(getattr(part, name))
+        self._parts.append(_with_cells(part, dict.fromkeys(_CELLS, np.empty(0))))
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+    def __iter__(self) -> Iterator[CyclePart]:
+        return (self[k] for k in range(len(self)))
+
+    @overload
+    def __getitem__(self, place: int) -> CyclePart: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> Sequence[CyclePart]: ...
+
+    def __getitem__(self, place: int | slice) -> CyclePart | Sequence[CyclePart]:
+        if isinstance(place, slice):
+            return [self[k] for k in range(*place.indices(len(self)))]
+        place = range(len(self))[place]
+        return _with_cells(self._parts[place], {name: spool[place] for name, spool in self._cells.items()})
+
+
+def _with_cells(part: CyclePart, cells: dict[str, Array]) -> CyclePart:
+    """Copy of a part with other arrays of cells."""
+    copy = replace(part)
+    for name, array in cells.items():
+        setattr(copy, name, array)
+    return copy
 
 
 def pixel_noise(image: Array, used: NDArray[np.bool_]) -> float:
@@ -267,6 +320,7 @@ def assemble_fields(
     *,
     frames: Mapping[str, Any] | None = None,
     frame_coordinates: Mapping[str, Any] | None = None,
+    folder: Path | None = None,
 ) -> xr.Dataset:
     """Assemble the cycles to one Dataset: mean, rise, rate, spread, count, uncertainties and flags on the plan.
 
@@ -284,6 +338,8 @@ def assemble_fields(
         Share of every cell that is seen unmasked, of every registration span.
     frames, frame_coordinates : mapping of str to variable, or None
         Variables and coordinates per frame or block of frames to add, as xarray takes them.
+    folder : Path or None
+        For the temporary files in which very many cycles are kept; None for that of the system.
 
     Returns
     -------
@@ -296,13 +352,13 @@ def assemble_fields(
     The uncertainty of a cell combines pixel noise with the position uncertainty of the registration through the gradient of the field
     (law of propagation, JCGM 100:2008, 5.1.2); see ``docs/method/fields.md``.
     """
-    fields = {name: np.full((cycles, *grid.shape), np.nan) for name in ("mean", "spread", "noise")}
+    shape = (cycles, *grid.shape)
+    fields = {name: _filled(shape, np.float64, np.nan, folder) for name in ("mean", "spread", "noise")}
     span_of = np.zeros(cycles, int)
-    count = np.zeros((cycles, *grid.shape), np.int32)
-    flags = np.full((cycles, *grid.shape), _FLAGS["no_frame"], np.uint8)
+    count, flags = _filled(shape, np.int32, 0, folder), _filled(shape, np.uint8, _FLAGS["no_frame"], folder)
     time = np.full(cycles, np.datetime64("NaT"), "datetime64[ns]")
-    for cycle in sorted({part.cycle for part in parts}):
-        of_cycle = [part for part in parts if part.cycle == cycle]
+    for cycle, group in groupby(parts, lambda part: part.cycle):
+        of_cycle = list(group)
         time[cycle] = of_cycle[0].first_time + np.timedelta64(_mean_nanoseconds(of_cycle), "ns")
         merged = _merge(of_cycle)
         for name, values in zip(fields, merged, strict=True):
@@ -311,16 +367,15 @@ def assemble_fields(
         count[cycle] = sum(part.count for part in of_cycle)
         flags[cycle] = _flags(of_cycle, merged[0], np.max([coverages[part.span] for part in of_cycle], axis=0))
     plan = ("cycle", "y", "x")
-    first = min(parts, key=lambda part: part.cycle)
-    position = np.full(count.shape, np.nan)
-    for span, covariance in enumerate(covariances):
-        position[span_of == span] = _gradient_variance(fields["mean"][span_of == span], covariance, grid)
-    rise_position = _gradient_variance(fields["mean"] - fields["mean"][first.cycle], covariances[first.span], grid)
-    temperatures = _temperatures(
-        **fields, position=position, rise_position=rise_position, time=time, reference=first.cycle
-    )
+    temperatures = {name: empty_array(shape, np.float32, folder) for name in _TEMPERATURES}
+    for some in _stretches_of(cycles, grid):
+        evaluated = _temperatures(
+            **fields, some=some, time=time, reference=parts[0], spans=span_of, covariances=covariances, grid=grid
+        )
+        for name, array in evaluated.items():
+            temperatures[name][some] = array
     dataset = xr.Dataset(
-        {name: (plan, array.astype(np.float32)) for name, array in temperatures.items()}
+        {name: (plan, array) for name, array in temperatures.items()}
         | {
             "count": (plan, count),
             "quality_flag": (plan, flags),
@@ -353,23 +408,64 @@ def _flags(parts: Sequence[CyclePart], mean: Array, coverage: Array) -> NDArray[
     return np.sum([np.where(where, _FLAGS[name], 0) for name, where in limits.items()], axis=0, dtype=np.uint8)
 
 
-def _temperatures(
-    mean: Array, spread: Array, noise: Array, position: Array, *, rise_position: Array, time: Array, reference: int
-) -> dict[str, Array]:
-    """Temperature, rise since the reference cycle, rate, spread and their noise, (cycle, y, x).
+def _filled(shape: tuple[int, ...], kind: Any, value: float, folder: Path | None) -> Array:
+    """Array of one value, see `empty_array`."""
+    array = empty_array(shape, kind, folder)
+    array[...] = value
+    return array
 
-    `noise`, `position` and `rise_position` are variances of the mean and the rise from pixel noise and registration, K2.
+
+def _stretches_of(cycles: int, grid: PlanGrid) -> Iterator[slice]:
+    """Stretches of cycles that are evaluated at a time: all of most campaigns, some of very many."""
+    step = max(IN_MEMORY_BYTES // (8 * int(np.prod(grid.shape))), 1)
+    return (slice(first, min(first + step, cycles)) for first in range(0, cycles, step))
+
+
+_TEMPERATURES = (
+    "temperature", "temperature_noise_u", "temperature_rise", "temperature_rise_noise_u", "temperature_rate", "temperature_spread"
+)  # fmt: skip
+
+
+def _temperatures(
+    mean: Array,
+    spread: Array,
+    noise: Array,
+    *,
+    some: slice,
+    time: Array,
+    reference: CyclePart,
+    spans: NDArray[np.int64],
+    covariances: Sequence[Array],
+    grid: PlanGrid,
+) -> dict[str, Array]:
+    """Temperature, rise since the reference cycle, rate, spread and their noise of some cycles, (cycle, y, x).
+
+    `mean`, `spread` and `noise`, the variance of the mean from pixel noise in K2, are those of all cycles; `reference` is the first part.
     """
+    first, numbers = reference.cycle, np.arange(some.start, some.stop)
+    means, noises = mean[some], noise[some]
+    position = np.full(means.shape, np.nan)
+    for span, covariance in enumerate(covariances):
+        chosen = spans[some] == span
+        if chosen.any():
+            position[chosen] = _gradient_variance(means[chosen], covariance, grid)
+    rise = means - mean[first]
+    rise_position = _gradient_variance(rise, covariances[reference.span], grid)
     # The noise of the reference cycle enters every rise but its own, which is zero by definition.
-    rise_noise = np.where(np.arange(len(mean))[:, None, None] == reference, 0.0, noise + noise[reference])
-    return {
-        "temperature": mean,
-        "temperature_noise_u": np.sqrt(noise + position),
-        "temperature_rise": mean - mean[reference],
-        "temperature_rise_noise_u": np.sqrt(rise_noise + rise_position),
-        "temperature_rate": rate(mean, time),
-        "temperature_spread": spread,
-    }
+    rise_noise = np.where(numbers[:, None, None] == first, 0.0, noises + noise[first])
+    values = (
+        means, np.sqrt(noises + position), rise, np.sqrt(rise_noise + rise_position), _rate_of(mean, time, some), spread[some]
+    )  # fmt: skip
+    return dict(zip(_TEMPERATURES, values, strict=True))
+
+
+def _rate_of(mean: Array, time: Array, some: slice) -> Array:
+    """`rate` of some cycles of all, from them and the nearest ones on either side that have a time."""
+    timed = np.flatnonzero(~np.isnat(time))
+    first, stop = np.searchsorted(timed, (some.start, some.stop)).tolist()
+    near = timed[max(first - 1, 0) : stop + 1]
+    start, end = min([some.start, *near]), max([some.stop - 1, *near]) + 1
+    return rate(mean[start:end], time[start:end], since=time[timed[0]])[some.start - start : some.stop - start]
 
 
 def in_pixels(fields: xr.Dataset) -> xr.Dataset:
@@ -482,7 +578,7 @@ def reference_cycle(temperature: Array) -> int:
     return int(np.flatnonzero(np.isfinite(temperature).any(axis=(1, 2)))[0])
 
 
-def rate(mean: Array, time: Array) -> Array:
+def rate(mean: Array, time: Array, *, since: np.datetime64 | None = None) -> Array:
     """Rate of the temperature as central difference over the cycles that have a time.
 
     Parameters
@@ -491,6 +587,9 @@ def rate(mean: Array, time: Array) -> Array:
         Mean temperature of every cycle.
     time : (cycle,) ndarray of datetime64
         NaT for a cycle without frames.
+    since : datetime64 or None
+        From which the time is counted, so that some cycles of a series have the rates that they have in it, bit for bit; None for the
+        first time.
 
     Returns
     -------
@@ -500,6 +599,6 @@ def rate(mean: Array, time: Array) -> Array:
     rates = np.full(mean.shape, np.nan)
     timed = np.flatnonzero(~np.isnat(time))
     if timed.size >= 2:
-        hours = (time[timed] - time[timed[0]]) / np.timedelta64(1, "s") / 3600
+        hours = (time[timed] - (time[timed[0]] if since is None else since)) / np.timedelta64(1, "s") / 3600
         rates[timed] = np.gradient(mean[timed], hours, axis=0)
     return rates

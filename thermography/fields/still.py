@@ -15,15 +15,16 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from thermography._typing import Array
 from thermography.fields.blocks import Block, cut_blocks
 from thermography.fields.checkpoint import Checkpoint, ParameterGroup, StoredCycle, describe_reduction
-from thermography.fields.cycle_fields import CyclePart, assemble_fields
+from thermography.fields.cycle_fields import CyclePart, FinishedParts, assemble_fields
 from thermography.fields.following import Displacements, Knock, Obstructions, Registrations
 from thermography.fields.inputs import NO_CYCLE, FrameSeries, Override, ReductionError, make_frame_series
 from thermography.fields.scheduling import Pool, in_order, open_pool
+from thermography.fields.tasks.spool import Spool
 from thermography.fields.tasks.stretches import (
     Portion,
     PortionResult,
@@ -174,15 +175,15 @@ def _reduce_until_knock(
 class _FrameStack:
     """Blocks in the order of time, and the field of each, (y, x) degC."""
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path | None) -> None:
         self.blocks: list[Block] = []
-        self.fields: list[NDArray[np.float32]] = []
+        self.fields = Spool(folder)
 
     def variables(self, size_px: Array, kept: Callable[[Block], Array]) -> dict[str, Any]:
         """Variables along ``time``, from the displacement of every frame, (frames,) px, and the frames of each block that are used."""
         shifts = np.array([_largest(size_px[kept(b)]) for b in self.blocks], np.float32)
         return {
-            "frame_temperature": (("time", "y", "x"), np.stack(self.fields)),
+            "frame_temperature": (("time", "y", "x"), self.fields.array()),
             "frame_cycle": ("time", np.array([b.cycle + 1 for b in self.blocks], np.int32)),
             "frame_count": ("time", np.array([len(kept(b)) for b in self.blocks], np.int32)),
             "frame_shift": ("time", shifts),
@@ -195,24 +196,22 @@ def _largest(values: Array) -> float:
 
 
 class _Cycles:
-    """Finished cycles, and the open one: the last part, as long as it has pixels, with its sums of counts.
+    """Finished cycles, and the open one with its sums of counts.
 
     Attributes
     ----------
-    parts : list of CyclePart
+    finished : FinishedParts
         In the order of time.
+    open : CyclePart or None
+        The last one, as long as it has pixels.
     sums : list of ParameterGroup
-        Of the open cycle.
+        Of the open cycle, or of the one that was finished last.
     """
 
-    def __init__(self) -> None:
-        self.parts: list[CyclePart] = []
+    def __init__(self, folder: Path | None) -> None:
+        self.finished = FinishedParts(folder)
+        self.open: CyclePart | None = None
         self.sums: list[ParameterGroup] = []
-
-    @property
-    def open(self) -> CyclePart | None:
-        """The open cycle, if there is one."""
-        return self.parts[-1] if self.parts and self.parts[-1].pixels is not None else None
 
     @property
     def begun(self) -> tuple[int, int] | None:
@@ -221,10 +220,12 @@ class _Cycles:
 
     def add(self, part: CyclePart, sums: Sequence[ParameterGroup]) -> None:
         """Add a portion to the open cycle, or begin its cycle; one that is finished already has no other portion."""
-        if self.open is not None:
-            self.open.join(part)
+        if part.pixels is None:
+            self.finished.append(part)
+        elif self.open is None:
+            self.open = part
         else:
-            self.parts.append(part)
+            self.open.join(part)
         for group in sums:
             add_sums(self.sums, group)
 
@@ -259,8 +260,9 @@ class StillReduction:
         self.registrations = Registrations(spans, grid)
         self.displacement = Displacements(frames, self.registrations)
         self.obstructions = Obstructions(frames, self.registrations)
-        self.stack = _FrameStack()
-        self.cycles = _Cycles()
+        folder = None if checkpoint is None else checkpoint.folder
+        self.stack = _FrameStack(folder)
+        self.cycles = _Cycles(folder)
         self.stored_blocks = 0
         self.stored_frames = 0
         self.finished_frames = 0
@@ -289,8 +291,9 @@ class StillReduction:
         for first, stop, number, span in cycle.blocks.tolist():
             parameters = self.frames.override(self.frames.references[first])
             self.stack.blocks.append(Block(first, stop, number, span, parameters))
-        self.stack.fields.extend(cycle.stack)
-        self.cycles.parts.append(cycle.part)
+        for field in cycle.stack:
+            self.stack.fields.append(field)
+        self.cycles.add(cycle.part, ())
         self.displacement.size_px[cycle.first_frame : cycle.stop_frame] = cycle.shift_px
         self.displacement.shaken.update(cycle.shaken)
         self.obstructions.found.update(cycle.obstructed)
@@ -348,37 +351,40 @@ class StillReduction:
         if self.cycles.begun not in (None, (first.cycle, first.span)):
             self.close()
         self.stack.blocks.extend(blocks)
-        self.stack.fields.extend(view.cells for view in result.views)
+        for view in result.views:
+            self.stack.fields.append(view.cells)
         if result.part is None:
             return
         self.cycles.add(result.part, result.sums)
         if result.part.pixels is None:
-            self._store_finished()
+            self._store_finished(result.part)
         elif self.checkpoint is not None and blocks[-1].stop - self.stored_frames >= STORED_FRAMES:
-            self._store(self.checkpoint)
+            self._store(self.checkpoint, self.cycles.open or result.part)
 
     def close(self) -> None:
         """Finish the open cycle, if there is one, and store it."""
         part = self.cycles.open
         if part is not None:
             part.finish(self.registrations.sensors[part.span].weights)
-            self._store_finished()
+            self.cycles.open = None
+            self.cycles.add(part, ())
+            self._store_finished(part)
 
-    def _store_finished(self) -> None:
+    def _store_finished(self, part: CyclePart) -> None:
         """Store the last cycle, which is finished."""
         if self.checkpoint is not None:
-            self._store(self.checkpoint)
+            self._store(self.checkpoint, part)
             self.stored_blocks, self.finished_frames = len(self.stack.blocks), self.stored_frames
         self.cycles.sums = []
 
-    def _store(self, checkpoint: Checkpoint) -> None:
-        """Store the last cycle with all blocks since the previous one."""
+    def _store(self, checkpoint: Checkpoint, part: CyclePart) -> None:
+        """Store the last cycle, finished or open, with all blocks since the previous one."""
         blocks = self.stack.blocks[self.stored_blocks :]
         first, stop = self.finished_frames, blocks[-1].stop
         column, row, growth, turn = self.displacement.baseline_px.tolist()
         checkpoint.save(
             StoredCycle(
-                part=self.cycles.parts[-1],
+                part=part,
                 first_frame=first,
                 stop_frame=stop,
                 blocks=np.array([(b.first, b.stop, b.cycle, b.span) for b in blocks]),
@@ -397,19 +403,20 @@ class StillReduction:
         self.close()
         frames, displacement = self.frames, self.displacement
         left_out = np.isin(np.arange(len(frames)), [*self.left_out])
-        if not self.cycles.parts:
+        if not self.cycles.finished:
             raise ReductionError(
                 "no frame within a cycle shows the table where it is registered; check that nothing stands before the table"
             )
         times = np.array([frames.mean_time(self.kept(block)) for block in self.stack.blocks])
         fields = assemble_fields(
-            self.cycles.parts,
+            self.cycles.finished,
             len(frames.bounds),
             self.grid,
             self.registrations.covariances,
             [sensor.weights.coverage for sensor in self.registrations.sensors],
             frames=self.stack.variables(displacement.size_px, self.kept),
             frame_coordinates={"time": times},
+            folder=None if self.checkpoint is None else self.checkpoint.folder,
         )
         remarks = {
             "frames_outside_cycles": frames.names(frames.cycles == NO_CYCLE),

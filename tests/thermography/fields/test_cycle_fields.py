@@ -1,15 +1,24 @@
 """Cycles assembled from known parts, the noise of images, and the conventions of the written fields by the official checker."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import xarray as xr
 
 from tests.thermography.plan_scene import DISCS, GRID, START, Scene, record
-from thermography.fields.cycle_fields import CyclePart, assemble_fields, noise_of_differences, pixel_noise
+from thermography.fields import cycle_fields
+from thermography.fields.cycle_fields import (
+    CyclePart,
+    FinishedParts,
+    assemble_fields,
+    noise_of_differences,
+    pixel_noise,
+)
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
+from thermography.fields.tasks import spool
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import register
 
@@ -93,6 +102,27 @@ def test_rise_rate_and_noise_of_three_cycles():
     np.testing.assert_allclose(middle["temperature_rise_noise_u"], [0.0, 0.05, np.nan, 0.03], rtol=1e-6)
     assert middle["count"].values.tolist() == [4, 4, 0, 4]
     assert middle["quality_flag"].values.tolist() == [0, 0, 16, 0]
+
+
+def test_very_many_cycles_are_evaluated_some_at_a_time_with_the_same_bits(monkeypatch, rng, tmp_path):
+    covariance = np.zeros((4, 6, 2, 2))
+    covariance[..., 0, 0], covariance[..., 1, 1] = 0.2**2, 0.5**2
+    finished = FinishedParts(tmp_path)
+    cycles = [*range(5), 8, 9, 12]
+    parts = [part(c, rng.normal(20, 1, (4, 6)), start_s=600 * c + 7 * (c % 3), noise_K=0.01 * (c + 1)) for c in cycles]
+    # The last two parts are one cycle before and after a knock.
+    parts.append(replace(part(12, rng.normal(20, 1, (4, 6)), start_s=7300), span=1))
+    for one in parts:
+        finished.append(one)
+    assert [one.cycle for one in finished] == [one.cycle for one in parts]
+    assert finished[-1].span == 1 and len(finished[2:4]) == 2
+    at_once = assemble_fields(parts, 14, PLAN, [covariance] * 2, [WHOLE] * 2)
+    for limit in (1, 4 * 6 * 8 * 3):
+        monkeypatch.setattr(cycle_fields, "IN_MEMORY_BYTES", limit)
+        monkeypatch.setattr(spool, "IN_MEMORY_BYTES", limit)
+        in_turns = assemble_fields(finished, 14, PLAN, [covariance] * 2, [WHOLE] * 2, folder=tmp_path)
+        for name in at_once.variables:
+            assert at_once[name].values.tobytes() == in_turns[name].values.tobytes(), (limit, name)
 
 
 def test_position_uncertainty_enters_through_the_gradient():
