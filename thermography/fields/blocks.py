@@ -208,18 +208,15 @@ def reduce_block(
     weights = sensor.weights
     sums = Accumulator(weights.used.shape)
     displacements, samples, noise = [], [], np.nan
-    # One buffer for all chunks: allocating memory for each costs more than reading into it.
-    buffer = np.empty((min(CHUNK_FRAMES, len(frames)), *weights.used.shape), np.uint16)
     with WindowReader(weights.window) as reader:
-        for start in range(0, len(frames), CHUNK_FRAMES):
-            counts = reader.read(frames[start : start + CHUNK_FRAMES], buffer)
+        for counts in reader.read_in_chunks(frames, CHUNK_FRAMES):
             sums.add(counts)
-            noise = noise_of_differences(counts[0], weights.interior) if start == 0 else noise
+            noise = noise_of_differences(counts[0], weights.interior) if np.isnan(noise) else noise
             displacements.append(sensor.monitor.displacements(counts, noise))
             samples.append(counts.reshape(len(counts), -1)[:, sensor.sampled])
     statistics = sums.statistics()
     if len(frames) == 1:
-        temperature = calibrate(buffer[0], parameters).astype(float)
+        temperature = calibrate(counts[0], parameters).astype(float)
         mean = MeanTemperature(1, temperature, np.zeros_like(temperature), np.zeros_like(temperature))
     else:
         mean = mean_temperature(statistics, parameters, used=weights.used)
@@ -260,10 +257,8 @@ def _calibrate_per_frame(
     pixels = int(varying.sum())
     total, squares, count = np.zeros(pixels), np.zeros(pixels), np.zeros(pixels)
     reference = np.nan_to_num(mean.mean[varying])
-    buffer = np.empty((min(CHUNK_FRAMES, len(frames)), *varying.shape), np.uint16)
     with WindowReader(window) as reader:
-        for start in range(0, len(frames), CHUNK_FRAMES):
-            counts = reader.read(frames[start : start + CHUNK_FRAMES], buffer)
+        for counts in reader.read_in_chunks(frames, CHUNK_FRAMES):
             deviation = calibrate(counts[:, varying], parameters).astype(float) - reference
             total += np.nansum(deviation, axis=0)
             squares += np.nansum(deviation**2, axis=0)

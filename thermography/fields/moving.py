@@ -255,7 +255,6 @@ def _reduce_block(
     """Locate the table in every frame of a block and add the frame to the cells."""
     tracker, samples = prepared
     rows, columns = tracker.registration.shape
-    buffer = np.empty((min(CHUNK_FRAMES, len(frames)), rows, columns), np.uint16)
     calibration = temperature_from_counts(np.arange(65536.0), parameters)
     cells = len(samples.valid)
     sums = CellSums(np.zeros(cells, np.int64), np.zeros(cells), np.zeros(cells))
@@ -263,8 +262,10 @@ def _reduce_block(
     discs = np.zeros(len(frames), np.int64)
     previous = None
     with WindowReader((slice(0, rows), slice(0, columns))) as reader:
-        for start in range(0, len(frames), CHUNK_FRAMES):
-            for i, counts in enumerate(reader.read(frames[start : start + CHUNK_FRAMES], buffer), start):
+        for start, chunk in zip(
+            range(0, len(frames), CHUNK_FRAMES), reader.read_in_chunks(frames, CHUNK_FRAMES), strict=True
+        ):
+            for i, counts in enumerate(chunk, start):
                 position = locate_table(counts, tracker, previous)
                 previous = None if position is None else position.shift_mm
                 if position is None:

@@ -6,7 +6,8 @@ import ctypes
 import mmap
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
@@ -18,6 +19,8 @@ from thermography.io.frame import StoredPixels
 
 #: Offsets, lengths and buffers of direct disk reads must be multiples of this, bytes.
 _PAGE = mmap.PAGESIZE
+#: Windows of consecutive frames are read from a disk in one piece if no more than this stands between them, bytes.
+_GAP = 1 << 16
 #: Bit of the result of mincore(2) that is set for a page in memory.
 _IN_MEMORY = 1
 
@@ -27,7 +30,8 @@ class WindowReader:
 
     Of plain samples only the rows of the window are read; packed samples are decoded as whole frames. A file in the page cache of the
     system is copied from there. Any other file is read directly from disk (O_DIRECT), which is half as fast again as through the cache
-    and does not evict the data of other programs; where the system has no direct reads, the cache is used.
+    and does not evict the data of other programs, neighbouring windows in one piece; where the system has no direct reads, the cache is
+    used.
 
     Parameters
     ----------
@@ -38,6 +42,7 @@ class WindowReader:
     def __init__(self, window: tuple[slice, slice]) -> None:
         self.window = window
         self._file: _File | None = None
+        self._ahead: ThreadPoolExecutor | None = None
 
     def __enter__(self) -> WindowReader:
         return self
@@ -45,6 +50,8 @@ class WindowReader:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._ahead is not None:
+            self._ahead.shutdown()
         if self._file is not None:
             self._file.close()
 
@@ -73,7 +80,7 @@ class WindowReader:
         rows, columns = self.window
         counts = counts[: len(frames)]
         checked = None
-        for target, frame in zip(counts, frames, strict=True):
+        for number, (target, frame) in enumerate(zip(counts, frames, strict=True)):
             samples = frame.plain_samples
             if samples is None:
                 target[...] = frame.read_counts()[self.window]
@@ -86,6 +93,8 @@ class WindowReader:
             if file is not checked:
                 # Once per call: the few frames of a call are neighbours in the file and are cached or evicted together.
                 file.check(place, rows_read.nbytes)
+                if not file.in_memory:
+                    file.read_together(place, self._end_of_neighbours(frames[number:], rows_read.nbytes))
                 checked = file
             if file.read(place, rows_read.view(np.uint8)) < rows_read.nbytes:
                 raise OSError(
@@ -96,6 +105,54 @@ class WindowReader:
             if not whole:
                 target[...] = rows_read.reshape(-1, width)[:, columns]
         return counts
+
+    def read_in_chunks(self, frames: Sequence[StoredPixels], size: int) -> Iterator[NDArray[np.uint16]]:
+        """Read the window of every frame, some frames at a time; from a disk, the next ones while the caller uses these.
+
+        Parameters
+        ----------
+        frames : sequence of StoredPixels
+        size : int
+            Largest number of frames at a time.
+
+        Yields
+        ------
+        (n, row, column) ndarray of uint16
+            In native byte order; overwritten two chunks later.
+
+        Raises
+        ------
+        OSError, ThermographyError
+            As `read`.
+        """
+        shape = (min(size, len(frames)), *(side.stop - side.start for side in self.window))
+        # Two buffers for all chunks: allocating memory for each costs more than reading into it.
+        buffers = [np.empty(shape, np.uint16)]
+        ahead: Future[NDArray[np.uint16]] | None = None
+        for start in range(0, len(frames), size):
+            counts = self.read(frames[start : start + size], buffers[0]) if ahead is None else ahead.result()
+            ahead, following = None, frames[start + size : start + 2 * size]
+            if len(following) and self._file is not None and not self._file.in_memory:
+                if self._ahead is None:
+                    self._ahead = ThreadPoolExecutor(1, "read ahead")
+                if len(buffers) == 1:
+                    buffers.append(np.empty(shape, np.uint16))
+                buffers.reverse()
+                ahead = self._ahead.submit(self.read, following, buffers[0])
+            yield counts
+
+    def _end_of_neighbours(self, frames: Sequence[StoredPixels], length: int) -> int:
+        """Where the windows of the first frames end that follow one another closely in one file, bytes."""
+        end = 0
+        for frame in frames:
+            samples = frame.plain_samples
+            if samples is None or frame.path != frames[0].path:
+                break
+            place = samples.offset + self.window[0].start * frame.shape[1] * 2
+            if end and not 0 <= place - end <= _GAP:
+                break
+            end = place + length
+        return end
 
     def _open(self, path: Path) -> _File:
         if self._file is None or self._file.path != path:
@@ -113,6 +170,8 @@ class _File:
         self.cached: BinaryIO = path.open("rb", buffering=0)
         self.direct: BinaryIO | None = None
         self.buffer = mmap.mmap(-1, _PAGE)
+        # First and last byte of the file that the buffer holds.
+        self.held = (0, 0)
         # Never accessed: the mapping only serves to ask which pages are in memory. An empty file cannot be mapped.
         size = os.fstat(self.cached.fileno()).st_size
         self.pages = mmap.mmap(self.cached.fileno(), 0, access=mmap.ACCESS_READ) if size else None
@@ -121,6 +180,7 @@ class _File:
     def check(self, place: int, length: int) -> None:
         """Determine whether these bytes are in the page cache, and open the file for direct reads if they are not."""
         self.in_memory = self.pages is None or _resident(self.pages, place, length)
+        self.held = (0, 0)
         if self.in_memory or self.direct is not None or not hasattr(os, "O_DIRECT"):
             return
         try:
@@ -129,20 +189,30 @@ class _File:
             # Some file systems have no direct reads; `read` uses the cache then.
             self.direct = None
 
-    def read(self, place: int, target: NDArray[np.uint8]) -> int:
-        """Read bytes from `place` on into `target`; return their number, which is smaller at the end of the file."""
-        if self.in_memory or self.direct is None:
-            self.cached.seek(place)
-            return self.cached.readinto(target)  # type: ignore[attr-defined]
+    def read_together(self, place: int, end: int) -> None:
+        """Read bytes directly in one piece, from which `read` takes them; nothing where there are no direct reads."""
+        if self.direct is None:
+            return
         first = place // _PAGE * _PAGE
-        length = -(-(place + target.size - first) // _PAGE) * _PAGE
+        length = -(-(end - first) // _PAGE) * _PAGE
         if len(self.buffer) < length:
             self.buffer.close()
             self.buffer = mmap.mmap(-1, length)
         self.direct.seek(first)
         with memoryview(self.buffer) as pages:
-            read = self.direct.readinto(pages[:length])  # type: ignore[attr-defined]
-            available = max(min(read - (place - first), target.size), 0)
+            self.held = (first, first + self.direct.readinto(pages[:length]))  # type: ignore[attr-defined]
+
+    def read(self, place: int, target: NDArray[np.uint8]) -> int:
+        """Read bytes from `place` on into `target`; return their number, which is smaller at the end of the file."""
+        if self.in_memory or self.direct is None:
+            self.cached.seek(place)
+            return self.cached.readinto(target)  # type: ignore[attr-defined]
+        first, end = self.held
+        if not first <= place <= place + target.size <= end:
+            self.read_together(place, place + target.size)
+            first, end = self.held
+        available = max(min(end - place, target.size), 0)
+        with memoryview(self.buffer) as pages:
             target[:available] = np.frombuffer(pages, np.uint8, available, place - first)
         return int(available)
 

@@ -81,3 +81,30 @@ def test_file_that_became_shorter_is_named(tmp_path, length):
         pytest.raises(OSError, match=r"a\.seq: frame \d+ ends early; the file has become shorter since it was indexed"),
     ):
         reader.read(references, np.empty((12, 164, 320), np.uint16))
+
+
+@pytest.mark.parametrize("encoding", ["raw", "png"])
+@pytest.mark.parametrize("size", [1, 5, 12, 40])
+def test_chunks_read_ahead_are_those_read_one_by_one(tmp_path, encoding, size):
+    references, counts = film(tmp_path / "a.seq", encoding=encoding)
+    other, other_counts = film(tmp_path / "b.seq", encoding=encoding)
+    frames, expected = [*references, *other[4:]], np.concatenate([counts, other_counts[4:]])[(slice(None), *WINDOW)]
+    for prepare in (lambda path: path.read_bytes(), forget):
+        prepare(references[0].path)
+        prepare(other[0].path)
+        with WindowReader(WINDOW) as reader:
+            chunks = [chunk.copy() for chunk in reader.read_in_chunks(frames, size)]
+        assert [len(chunk) for chunk in chunks[:-1]] == [size] * (len(chunks) - 1)
+        assert (np.concatenate(chunks) == expected).all()
+
+
+def test_an_error_ends_the_reading_ahead(tmp_path):
+    references, _ = film(tmp_path / "a.seq")
+    forget(references[0].path)
+    with pytest.raises(ZeroDivisionError), WindowReader(WINDOW) as reader:
+        for _ in reader.read_in_chunks(references, 2):
+            raise ZeroDivisionError
+    os.truncate(references[0].path, 700_000)
+    forget(references[0].path)
+    with pytest.raises(OSError, match="ends early"), WindowReader(WINDOW) as reader:
+        list(reader.read_in_chunks(references, 2))
