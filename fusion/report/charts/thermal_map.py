@@ -119,7 +119,7 @@ def plot_thermal_map(
     if "target_x" in fields:
         draw_line(drawn, fields, position)
     draw_hotspots(drawn, hotspots, unit)
-    _draw_sensors(drawn, sensors)
+    draw_sensors(drawn, sensors)
     flat = {name: values.reshape(len(values), -1) for name, values in steps.items()}
     more = {name: np.diff(values, axis=0, prepend=np.int16(0)).ravel() for name, values in flat.items()}
     drawn.tags = [ColumnDataSource(more), {"scales": scales, "cycles": kept["cycle"].values.tolist()}]
@@ -290,8 +290,16 @@ def draw_hotspots(drawn: figure, hotspots: Sequence[HotspotPart], unit: str) -> 
     )  # fmt: skip
 
 
-def _draw_sensors(drawn: figure, sensors: Sequence[ContactSensorPart]) -> None:
-    """Mark the places of the contact sensors by squares with their names; faulty ones are crossed."""
+def draw_sensors(drawn: figure, sensors: Sequence[ContactSensorPart]) -> None:
+    """Mark the places of the contact sensors by squares with their names; faulty ones are crossed.
+
+    Parameters
+    ----------
+    drawn : figure
+        From `draw_map`.
+    sensors : sequence of ContactSensorPart
+        Those of the results.
+    """
     for marker, used in (("square", True), ("square_x", False)):
         shown = [sensor for sensor in sensors if sensor.used is used]
         if not shown:
