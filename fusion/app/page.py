@@ -62,7 +62,10 @@ def build_page(root: Path) -> Any:
     def show(name: str) -> None:
         if name not in shown:
             shown[name] = SCREENS[name](state)
-        content[:] = [shown[name]]
+            content.append(shown[name])
+        # A chart that is taken out of a page no longer hears clicks when it comes back: the other screens are hidden.
+        for other, screen in shown.items():
+            screen.visible = other == name
 
     def choose(name: str) -> None:
         bar.value = state.screen = name

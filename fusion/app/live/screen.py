@@ -13,6 +13,7 @@ from fusion.app.places import PlaceError, place_within
 from fusion.app.results.charts import shown
 from fusion.app.state import State
 from fusion.errors import FusionError
+from fusion.products.notices import counted
 from fusion.report.wording import number
 
 _INTERVAL_MS = 1000
@@ -117,8 +118,10 @@ def standing(course: Course, wanted_u_um: float, *, runs: bool) -> str:
     runs : bool
         Whether it is still followed.
     """
-    cycles = len(course.cycle)
-    head = f"{'Following' if runs else 'No longer followed'}: {cycles} finished cycles, {course.frames} frames, {course.readings} readings."
+    seen = ((len(course.cycle), "finished cycle"), (course.frames, "frame"), (course.readings, "reading"))
+    head = (
+        f"{'Following' if runs else 'No longer followed'}: {', '.join(counted(count, noun) for count, noun in seen)}."
+    )
     return f'<p role="status">{escape(head)} {escape(enough_words(course, wanted_u_um))}</p>'
 
 

@@ -105,14 +105,17 @@ class ResultsScreen:
         def choose(name: str) -> None:
             if name not in built:
                 built[name] = pn.Column(*builders[name](), sizing_mode="stretch_width")
-            part[:] = [built[name]]
+                part.append(built[name])
+            # A chart that is taken out of a page no longer hears clicks when it comes back: the other parts are hidden.
+            for other, column in built.items():
+                column.visible = other == name
 
-        chooser.param.watch(lambda event: choose(event.new), "value")
-        choose(
+        first = (
             _PARTS[0] if products.fields is not None else _PARTS[1] if products.deviations is not None else _PARTS[3]
         )
-        if products.fields is None:
-            chooser.value = _PARTS[1] if products.deviations is not None else _PARTS[3]
+        chooser.value = first
+        choose(first)
+        chooser.param.watch(lambda event: choose(event.new), "value")
         lead = [paragraph(products.results.campaign), paragraph(headline(products.results))]
         if (products.folder / "report.html").is_file():
             lead.append(link("Open the report", report_link(self._state.root, products.folder)))

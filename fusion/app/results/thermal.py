@@ -16,7 +16,7 @@ from fusion.app.results.products import Products
 from fusion.app.results.selection import HOURS, Linker, Place, Selection, change_charts
 from fusion.report.charts.plan import extent_of
 from fusion.report.charts.style import CATEGORIES, DASHES, add_series, new_figure, palette
-from fusion.report.charts.thermal_map import Layer, draw_hotspots, draw_line, draw_map
+from fusion.report.charts.thermal_map import Layer, draw_hotspots, draw_line, draw_map, draw_sensors
 from fusion.report.wording import moment, number, place
 from interferometry.figures import INK
 from thermography.fields.cycle_fields import plan_unit
@@ -127,6 +127,7 @@ class ThermalView:
             read = self._products.deviations
             draw_line(drawn, fields, None if read is None else read["position"])
         draw_hotspots(drawn, results.hotspots or (), self._unit)
+        draw_sensors(drawn, results.sensors or ())
         to_scale(drawn, drawn.select_one("cells"), downwards=self._unit == "px")
         return drawn
 
