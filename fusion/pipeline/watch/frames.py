@@ -75,13 +75,12 @@ class ArrivingFrames:
             size = path.stat().st_size
             if sequence is not None:
                 return self._go_on(path, sequence, size), []
-            if size == 0 or self._sizes.get(path) != size:
-                self._sizes[path] = size
-                return [], []
-            if _starts_as_sequence(path):
+            if path not in self._sizes and size >= len(MAGIC) and _starts_as_sequence(path):
                 sequence = self._sequences[path] = _Sequence()
-                del self._sizes[path]
                 return self._go_on(path, sequence, size), []
+            if size < len(MAGIC) or self._sizes.get(path) != size:
+                self._sizes |= {path: size} if size >= len(MAGIC) else {}
+                return [], []
             found, rejected = index_recordings([path], self._options)
             frames = list(found)
         except (OSError, ThermographyError) as error:

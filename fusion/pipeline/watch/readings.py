@@ -102,6 +102,10 @@ class ArrivingReadings:
 
     def _poll_lines(self, *, final: bool) -> Arrived:
         """Read the lines that are new."""
+        if self._size < self._offset:
+            return Arrived(
+                faults=self._new([f"{self.path}: has become shorter; watch the test anew if it was begun anew"])
+            )
         with self.path.open("rb") as file:
             file.seek(self._offset)
             content = file.read()

@@ -58,13 +58,23 @@ def test_frames_of_a_growing_sequence_read_their_pixels(tmp_path: Path) -> None:
     (tmp_path / "whole.seq").unlink()
     (tmp_path / "a.seq").write_bytes(content[: len(content) // 2])
     camera = arriving(tmp_path)
-    camera.poll()
-    first, _ = camera.poll()
+    first = camera.poll()[0] + camera.poll()[0]
     (tmp_path / "a.seq").write_bytes(content)
     rest = camera.poll()[0] + camera.poll()[0]
     expected = np.random.default_rng(1).integers(17_000, 18_000, (4, 12, 16)).astype(np.uint16)
     np.testing.assert_array_equal([frame.read_counts() for frame in [*first, *rest]], expected)
     assert [frame.index for frame in [*first, *rest]] == [0, 1, 2, 3]
+
+
+def test_a_sequence_that_never_rests_is_read_while_it_grows(tmp_path: Path) -> None:
+    content = recording(tmp_path / "whole.seq", 10)
+    (tmp_path / "whole.seq").unlink()
+    camera, step, counts = arriving(tmp_path), len(content) // 10, []
+    for end in range(3, len(content) + 1, step):
+        (tmp_path / "a.seq").write_bytes(content[:end])
+        counts.append(len(camera.poll()[0]))
+    # A frame is given when the next one has begun.
+    assert sum(counts) == 8
 
 
 def test_only_the_new_part_of_a_sequence_is_read(tmp_path: Path) -> None:

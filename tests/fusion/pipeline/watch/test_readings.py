@@ -141,3 +141,12 @@ def test_a_line_that_cannot_be_used_is_told_once(tmp_path: Path) -> None:
         write(path, rows[:stop])
         faults += laser.poll().faults
     assert len(faults) == 1 and faults[0].startswith("laser.csv, line 7:")
+
+
+def test_a_file_that_is_begun_anew_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "laser.csv"
+    laser = ArrivingReadings(path)
+    write(path, lines(range(4)))
+    laser.poll()
+    write(path, lines(range(1)))
+    assert laser.poll().faults == (f"{path}: has become shorter; watch the test anew if it was begun anew",)
