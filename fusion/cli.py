@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from fusion.endings import ExitCode, answering, failed_code, interrupt_ends_step
+from fusion.endings import ExitCode, answering, failed_code, interrupt_ends_step, leave
 
 if TYPE_CHECKING:
     from fusion.products.progress import Report
@@ -668,7 +668,10 @@ def plan(
 
 def main() -> None:
     """Run the command line, as the script ``thermofuse`` or as a module; the exit code is that of the process."""
-    app(prog_name="thermofuse")
+    try:
+        app(prog_name="thermofuse")
+    except SystemExit as ended:
+        leave(ended.code if isinstance(ended.code, int) else ExitCode.DONE)
 
 
 if __name__ == "__main__":

@@ -32,6 +32,8 @@ _SKIPPED = re.compile(r"Skipping line (\d+): expected (\d+) fields, saw (\d+)")
 _HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
 
 
+#: Seconds beyond these are damaged numbers: a century.
+_LONGEST_RECORD_S = 3.2e9
 #: Where seconds count from in a table whose start is not stated.
 NO_START = np.datetime64("1970-01-01", "ns")
 
@@ -251,7 +253,7 @@ def _numbers(column: pd.Series) -> np.ndarray:
     """
     if pd.api.types.is_numeric_dtype(column):
         return column.to_numpy(dtype="f8", na_value=np.nan)
-    texts = column.astype(str).tolist()
+    texts = [str(value) for value in column]
     numerals = Numerals.of(texts)
 
     def number(text: str) -> float:
@@ -274,6 +276,7 @@ def _times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarr
         start, zone = (NO_START, "+0000") if record.start is None else _parse(path, record.start)
         zones[zone] = 0
         elapsed = seconds.to_numpy(dtype="f8") * (factor[1] - factor[0])
+        elapsed[~(np.abs(elapsed) < _LONGEST_RECORD_S)] = np.nan
         time = start + np.where(np.isfinite(elapsed), np.round(elapsed * 1e9), 0).astype("m8[ns]")
         time[~np.isfinite(elapsed)] = np.datetime64("NaT")
     else:

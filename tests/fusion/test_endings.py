@@ -91,6 +91,33 @@ def test_a_signal_ends_a_run_within_two_seconds(number: signal.Signals, busy: st
     assert (run.returncode, told) == (128 + number, f"thermofuse: stopped by {number.name}; out keeps fields\n")
 
 
+def test_an_error_that_a_library_makes_of_the_signal_is_no_fault_of_the_program(tmp_path: Path) -> None:
+    told = io.StringIO()
+    with pytest.raises(typer.Exit) as exit, answering(Console(file=told, soft_wrap=True)):
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:
+            raise SystemError("returned a result with an exception set") from None
+    assert (exit.value.exit_code, told.getvalue()) == (ExitCode.TERMINATED, "thermofuse: stopped by SIGTERM\n")
+
+
+def test_a_stopped_command_does_not_wait_for_its_threads() -> None:
+    """The interpreter would join a thread that is at work for a minute."""
+    code = (
+        "import signal, threading, time; from rich.console import Console; from fusion import cli\n"
+        "def busy():\n"
+        "    threading.Thread(target=time.sleep, args=(60.0,)).start()\n"
+        "    with cli.answering(Console(stderr=True)):\n"
+        "        signal.raise_signal(signal.SIGTERM)\n"
+        "cli.app.command('busy')(busy)\n"
+        "import sys; sys.argv = ['thermofuse', 'busy']; cli.main()"
+    )
+    begun = time.monotonic()
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=50, check=False)
+    assert (ended.returncode, ended.stderr) == (143, "thermofuse: stopped by SIGTERM\n")
+    assert time.monotonic() - begun < 40.0
+
+
 def _indented(code: str) -> str:
     return "\n".join(f"    {line}" for line in code.splitlines())
 

@@ -64,7 +64,7 @@ class TiffReader(TemperatureReader):
                 stamp = str(first.tags["DateTime"].value) if "DateTime" in first.tags else ""
         except Exception as error:
             raise ThermographyError(f"{path}: damaged TIFF ({error}); export it again") from None
-        if len(shape) != 2 or kind is None:
+        if len(shape) != 2 or not all(isinstance(side, int) for side in shape) or kind is None:
             raise ThermographyError(
                 f"{path}: pixels of shape {shape}: a picture in colours holds no temperatures; export the radiometric TIFF"
             )
@@ -111,7 +111,8 @@ class NumpyReader(TemperatureReader):
     def _open(self, path: Path) -> NDArray[np.floating]:
         try:
             array = np.load(path, mmap_mode="r", allow_pickle=False)
-        except (ValueError, EOFError, OSError, SyntaxError) as error:
+        # The header is text that NumPy parses as Python: a damaged one raises errors of many kinds.
+        except Exception as error:
             raise ThermographyError(f"{path}: damaged NumPy file ({error}); save it again with numpy.save") from None
         if array.ndim not in (2, 3) or array.dtype.kind not in "fiu":
             raise ThermographyError(

@@ -207,12 +207,15 @@ class TemperatureFrame(FrameReference):
 
     def read_temperature(self) -> NDArray[np.float64]:
         """Read the temperatures, (row, column) degC; raise a ThermographyError where the frame has another size than the first."""
-        values = np.asarray(self.reader.read_values(self.path, self.index, self.options), np.float64)
+        with np.errstate(over="ignore", invalid="ignore"):
+            values = np.asarray(self.reader.read_values(self.path, self.index, self.options), np.float64)
         if values.shape != self.size:
             raise ThermographyError(
                 f"{self.path}: frame {self.index} has {values.shape[::-1]} pixels and not {self.size[::-1]}; the file is damaged"
             )
-        return values * self.options.scale + self.options.offset - (_ZERO_CELSIUS_K if self.unit == "K" else 0.0)
+        # A damaged value may be beyond any temperature, or none; its counts say so.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return values * self.options.scale + self.options.offset - (_ZERO_CELSIUS_K if self.unit == "K" else 0.0)
 
     def read_counts(self) -> NDArray[np.uint16]:
         """Read the temperatures as counts of the black-body scale, (row, column) uint16; 0 where there is none."""

@@ -16,6 +16,8 @@ _MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "K")
 _COEFFICIENT_NAMES = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "D")
 #: Largest relative difference of the focal lengths along columns and rows: the pixels of a sensor are square.
 _SQUARE = 0.01
+#: A calibration is a few pages of text: OpenCV's parser overruns its memory on longer lines.
+_MOST_BYTES, _MOST_COLUMNS = 1_000_000, 20_000
 
 
 class LensError(ThermographyError):
@@ -69,6 +71,7 @@ def read_lens(path: str | Path) -> Lens:
     OpenCV documentation, "Camera calibration with OpenCV" (the entries), "Camera Calibration and 3D Reconstruction" (the model).
     """
     path = Path(path)
+    _refuse_what_is_no_text(path)
     try:
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     except (cv2.error, SystemError) as error:
@@ -79,11 +82,14 @@ def read_lens(path: str | Path) -> Lens:
         raise LensError(
             f"{path}: cannot be opened as a file of cv2.FileStorage; write it as OpenCV's YAML, XML or JSON"
         )
-    matrix = _entry(storage, path, _MATRIX_NAMES, 9).reshape(3, 3)
-    coefficients = _entry(storage, path, _COEFFICIENT_NAMES, None).ravel()
-    width, height = (storage.getNode(name) for name in ("image_width", "image_height"))
-    size = None if width.empty() or height.empty() else (int(width.real()), int(height.real()))
-    storage.release()
+    try:
+        matrix = _entry(storage, path, _MATRIX_NAMES, 9).reshape(3, 3)
+        coefficients = _entry(storage, path, _COEFFICIENT_NAMES, None).ravel()
+        size = _size(storage)
+    except (cv2.error, OverflowError, ValueError, RecursionError) as error:
+        raise LensError(f"{path}: an entry is damaged ({error}); write the calibration again") from None
+    finally:
+        storage.release()
     along, across = float(matrix[0, 0]), float(matrix[1, 1])
     if not (np.isfinite(matrix).all() and min(along, across) > 0 and abs(along / across - 1) < _SQUARE):
         raise LensError(
@@ -97,6 +103,22 @@ def read_lens(path: str | Path) -> Lens:
         )
     k1, k2, p1, p2 = coefficients[:4].tolist()
     return Lens(float(np.sqrt(along * across)), (float(matrix[0, 2]), float(matrix[1, 2])), (k1, k2, p1, p2), size)
+
+
+def _refuse_what_is_no_text(path: Path) -> None:
+    """Refuse what no calibration looks like: OpenCV's parser does not survive every file."""
+    content = path.read_bytes() if path.stat().st_size <= _MOST_BYTES else b""
+    if not content or max(map(len, content.splitlines())) > _MOST_COLUMNS or b"\0" in content:
+        raise LensError(
+            f"{path}: no calibration: plain text is expected, at most {_MOST_BYTES} bytes in lines of {_MOST_COLUMNS} characters; "
+            "write it as OpenCV's YAML, XML or JSON"
+        )
+
+
+def _size(storage: cv2.FileStorage) -> tuple[int, int] | None:
+    """Width and height of the frames of the calibration, px; None where they are not given."""
+    width, height = (storage.getNode(name) for name in ("image_width", "image_height"))
+    return None if width.empty() or height.empty() else (int(width.real()), int(height.real()))
 
 
 def _entry(storage: cv2.FileStorage, path: Path, names: tuple[str, ...], count: int | None) -> Array:

@@ -5,6 +5,7 @@ Input `index` of a kind depends on the seed and its index alone: a finding is re
 
 from __future__ import annotations
 
+import faulthandler
 import mmap
 import os
 import resource
@@ -147,8 +148,7 @@ def _watch(child: int, shared: mmap.mmap) -> bool:
     """Wait for a process; end it where one input takes too long. The time is the processor's: the machine may be loaded."""
     known, since = -1, 0.0
     while True:
-        pid, _ = os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) and (child, 0) or (0, 0)
-        if pid:
+        if os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None:
             return False
         used, done = _seconds(child), _STATE.unpack_from(shared)[0]
         if done != known:
@@ -173,6 +173,7 @@ def _read_inputs(kind: Kind, folder: Path, shared: mmap.mmap, tell: int, seed: i
     path = folder / f"{os.getpid()}-{kind.name}"
     read = refused = 0
     slowest = 0.0
+    faulthandler.disable()
     devnull = os.open(os.devnull, os.O_WRONLY)
     os.dup2(devnull, 2)
     for index in range(first, stop):

@@ -47,7 +47,13 @@ def test_faults_are_named(tmp_path, changed, message):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("hello", "not a file of cv2.FileStorage|cannot be opened"), ('{"a": 1}', "no entry camera_matrix")],
+    [
+        ("hello", "not a file of cv2.FileStorage|cannot be opened"),
+        ('{"a": 1}', "no entry camera_matrix"),
+        ("", "no calibration: plain text is expected"),
+        ('{"K": "' + "A" * 30_000 + '"}', "no calibration: plain text is expected"),
+        ("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   data: [ 1. ]\n", "an entry is damaged"),
+    ],
 )
 def test_other_files_are_refused(tmp_path, text, message):
     path = tmp_path / "lens.json"
