@@ -198,10 +198,11 @@ def read_results(folder: Path) -> Results:
         raise ResultsError(f"{folder}: there is no results.json in it; name the results folder of a finished run")
     try:
         return Results.model_validate(json.loads(path.read_text(encoding="utf-8")))
-    except json.JSONDecodeError as error:
-        fault = f"not JSON: {error}"
     except ValidationError as error:
         fault = _first_fault(error)
+    # Also bytes that are no text, numbers of thousands of digits, and brackets without end.
+    except (ValueError, RecursionError) as error:
+        fault = f"not JSON: {error}"
     raise ResultsError(f"{path}: not the results of this version of thermofuse ({fault}); run the campaign again")
 
 

@@ -124,7 +124,12 @@ def report_of(folder: Path) -> str:
     origin = folder / "provenance.json"
     if not origin.is_file():
         raise ProductsError(f"{origin} is missing; run the campaign again, with --resume to keep what is finished")
-    provenance = json.loads(origin.read_text(encoding="utf-8"))
+    try:
+        provenance = json.loads(origin.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ProductsError(
+            f"{origin}: not JSON ({error}); run the campaign again, with --resume to keep what is finished"
+        ) from None
     there = {name: folder / f"{name}.nc" for name in _READERS if (folder / f"{name}.nc").is_file()}
     if isinstance(results.loop, RecordLoop):
         return render_report(results, provenance, {"record": read_dataset(there["fusion"])})
