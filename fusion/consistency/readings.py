@@ -186,6 +186,13 @@ def _copied_cycles(deviations: xr.Dataset) -> Check:
     )
 
 
+def _means(values: Array) -> Array:
+    """Return the mean of every column, NaN where it holds no value."""
+    known = np.isfinite(values)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(known, values, 0.0).sum(axis=0) / known.sum(axis=0))
+
+
 def _exchanged_approaches(deviations: xr.Dataset, noise_um: float) -> Check:
     """A reversal error that changes its sign and keeps its size at one cycle shows exchanged labels of approach."""
     code, endangered = (
@@ -201,8 +208,10 @@ def _exchanged_approaches(deviations: xr.Dataset, noise_um: float) -> Check:
     reversal, cycles = reversal[known], deviations["cycle"].values[known]
     best, place = 0.0, 0
     for k in range(_LEAST_SIDE, reversal.shape[0] - _LEAST_SIDE + 1):
-        before, after = np.nanmean(reversal[:k], axis=0), np.nanmean(reversal[k:], axis=0)
+        before, after = _means(reversal[:k]), _means(reversal[k:])
         sigma = noise_um * np.sqrt(2.0) * np.sqrt(1.0 / k + 1.0 / (reversal.shape[0] - k))
+        if not np.isfinite(after - before).any():
+            continue
         shift = float(np.nanmean(after - before) / (sigma / np.sqrt(before.size)))
         if abs(shift) > abs(best):
             best, place = shift, k
