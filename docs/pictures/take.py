@@ -52,19 +52,22 @@ def take_report(browser: Browser, report: Path, folder: Path) -> None:
             (folder / f"{name}.png").write_bytes(compact(page.screenshot()))
 
 
-def take_app(browser: Browser, campaign: Path, folder: Path) -> None:
-    """Write a picture of the application that has looked into the folder of a campaign."""
+def take_app(browser: Browser, campaign: Path, results: Path, folder: Path) -> None:
+    """Write a picture of the application that shows the results of a campaign."""
     copy = Path(tempfile.mkdtemp()) / "measurement"
     shutil.copytree(campaign, copy)
+    shutil.copytree(results, copy / "results")
     command = [sys.executable, "-m", "thermofuse", "app", "."]
     with subprocess.Popen(command, cwd=copy, stdout=subprocess.PIPE, text=True) as app:
         try:
             assert app.stdout is not None
             address = app.stdout.readline().removeprefix("app:").strip()
             with open_page(browser, address, 900) as page:
-                page.get_by_text("Looking into the files").wait_for(timeout=_LOADING_MS)
-                page.get_by_text("Looking into the files").wait_for(state="hidden", timeout=_LOADING_MS)
-                page.wait_for_timeout(5000)
+                page.set_default_timeout(_LOADING_MS)
+                page.get_by_text("Results", exact=True).first.click()
+                page.get_by_text("Open", exact=True).first.click()
+                page.locator("canvas").first.wait_for()
+                page.wait_for_timeout(8000)
                 (folder / "app.png").write_bytes(compact(page.screenshot()))
         finally:
             app.terminate()
@@ -76,5 +79,5 @@ if __name__ == "__main__":
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
         take_report(browser, results / "report.html", pictures)
-        take_app(browser, campaign, pictures)
+        take_app(browser, campaign, results, pictures)
         browser.close()
