@@ -77,6 +77,7 @@ def build_page(root: Path) -> Any:
         choose(next(iter(SCREENS)))
     page = pn.Template((_TEMPLATES / "page.html.j2").read_text(encoding="utf-8"), design=Look)
     page.add_variable("style", (_TEMPLATES / "page.css").read_text(encoding="utf-8"))
+    page.add_variable("names", (_TEMPLATES / "names.js").read_text(encoding="utf-8"))
     page.add_panel("bar", bar)
     page.add_panel("place", paragraph(f"Folder {state.root}", kind="note"))
     page.add_panel("content", content)

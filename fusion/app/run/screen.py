@@ -111,7 +111,8 @@ class RunScreen:
         self._shown = new
         runs = run is not None and run.runs
         self._start.disabled, self._cancel.disabled = runs, not runs
-        self._start.label = "Resume" if begun else "Run"
+        finished = (results / "report.html").is_file()
+        self._start.label = "Run again" if finished else "Resume" if begun else "Run"
         self._stages.object = "" if run is None else stages_markup(run)
         told = [] if not begun else [f"{one['message']} {one['remedy']}".strip() for one in noted_messages(results)]
         self._messages[:] = [heading("Messages", level=3), bullets(dict.fromkeys(told))] if told else []

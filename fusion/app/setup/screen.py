@@ -163,9 +163,10 @@ class SetUpScreen:
         )
         self._look = pn.widgets.Button(label="Look into it", align="end")
         self._drop = pn.widgets.FileDropper(
-            multiple=True, previews=[], max_file_size=f"{LARGEST_MB}MB", sizing_mode="stretch_width", height=90
+            multiple=True, previews=[], max_file_size=f"{LARGEST_MB}MB", sizing_mode="stretch_width"
         )
         self._dropped = pn.Column(sizing_mode="stretch_width")
+        self._taken: set[str] = set()
         self._found = pn.Column(sizing_mode="stretch_width")
         self._form = Form(self._on_field)
         self._frame = FrameView(self._draw_plan)
@@ -214,6 +215,7 @@ class SetUpScreen:
             self._found[:] = [paragraph(str(error), kind="fault")]
             return
         self._look.disabled = True
+        self._dropped[:] = []
         self._work.visible = False
         self._found[:] = [paragraph("Looking into the files ...", kind="note")]
         try:
@@ -301,17 +303,18 @@ class SetUpScreen:
         )
 
     def _on_drop(self, event: Any) -> None:
-        """Write what was dropped into the folder."""
-        told = []
-        for name, content in dict(event.new).items():
+        """Write what was dropped into the folder; its content is not kept in memory, its line in the list of the page stays."""
+        dropped: dict[str, Any] = event.new
+        self._taken &= set(dropped)
+        for name in [name for name in dropped if name not in self._taken]:
             try:
-                path = store_upload(self._state.root, Path(self._folder.value), name, content)
-                told.append(paragraph(f"{path.name} is in the folder now; look into it.", kind="done"))
+                path = store_upload(self._state.root, Path(self._folder.value), name, dropped[name])
+                told = paragraph(f"{path.name} is in the folder now; look into it.", kind="done")
             except _BAD_INPUT as error:
-                told.append(paragraph(str(error), kind="fault"))
-        if told:
-            self._dropped[:] = told
-            self._drop.value = {}
+                told = paragraph(str(error), kind="fault")
+            self._taken.add(name)
+            dropped[name] = b""
+            self._dropped.append(told)
 
     async def _on_save(self, event: object) -> None:
         """Write the campaign file and the list of fiducials, and check both."""

@@ -24,7 +24,7 @@ def store_upload(root: Path, folder: Path, name: str, content: bytes | str) -> P
     root : Path
         Folder for which the application was started.
     folder : Path
-        Folder of the measurement, inside it.
+        Folder of the measurement, absolute or from `root` on.
     name : str
         Name as the browser sent it.
     content : bytes or str
@@ -42,12 +42,13 @@ def store_upload(root: Path, folder: Path, name: str, content: bytes | str) -> P
     PlaceError
         If the name is none, or leads out of the folder.
     """
+    inside = folder_within(root, folder)
     data = content.encode("utf-8") if isinstance(content, str) else content
     if len(data) > LARGEST_MB * 1_000_000:
-        raise UploadError(f"{name} is larger than {LARGEST_MB} MB; copy it into {folder} with the file manager")
-    path = place_within(root, folder_within(root, folder) / name_of_file(name))
-    if path.parent != folder.resolve():
-        raise PlaceError(f"{name} leads out of {folder}; give the file a name without folders")
+        raise UploadError(f"{name} is larger than {LARGEST_MB} MB; copy it into {inside} with the file manager")
+    path = place_within(root, inside / name_of_file(name))
+    if path.parent != inside:
+        raise PlaceError(f"{name} leads out of {inside}; give the file a name without folders")
     if path.exists():
         raise UploadError(f"{path} exists already and is not replaced; give the file another name")
     return write_atomically(path, lambda part: part.write_bytes(data))

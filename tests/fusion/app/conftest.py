@@ -92,9 +92,9 @@ def new_page() -> Iterator[Callable[..., object]]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
 
-        def open_page(address: str, *, width: int = 1280) -> Page:
+        def open_page(address: str, *, width: int = 1280, **options: object) -> Page:
             host = address.split("?")[0]
-            page = browser.new_context(viewport={"width": width, "height": 900}).new_page()
+            page = browser.new_context(viewport={"width": width, "height": 900}, **options).new_page()  # type: ignore[arg-type]
             page.set_default_timeout(60_000)
             page.on("pageerror", lambda error: faults.append(f"page error: {error}"))
             page.on(

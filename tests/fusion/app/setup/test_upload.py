@@ -14,6 +14,8 @@ from fusion.app.setup.upload import UploadError, store_upload
 def test_bytes_and_text_are_written_as_they_came(tmp_path: Path) -> None:
     assert store_upload(tmp_path, tmp_path, "a.bin", b"\x00\xff").read_bytes() == b"\x00\xff"
     assert store_upload(tmp_path, tmp_path, "ö.csv", "1,2\r\nµ").read_bytes() == "1,2\r\nµ".encode()
+    (tmp_path / "in").mkdir()
+    assert store_upload(tmp_path, Path("in"), "a.bin", b"").parent == tmp_path.resolve() / "in"
     with pytest.raises(UploadError, match="exists already and is not replaced; give the file another name"):
         store_upload(tmp_path, tmp_path, "a.bin", b"")
 
