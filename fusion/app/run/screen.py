@@ -30,6 +30,7 @@ class RunScreen:
     def __init__(self, state: State) -> None:
         self._state = state
         self._shown: tuple[object, ...] = ()
+        self._taken: Path | None = None
         self._campaign = pn.widgets.TextInput(label="Campaign file", sizing_mode="stretch_width")
         self._results = pn.widgets.TextInput(label="Results folder", sizing_mode="stretch_width")
         self._start = pn.widgets.Button(label="Run", button_type="primary")
@@ -59,7 +60,10 @@ class RunScreen:
         )
 
     def _take(self, campaign: Path | None) -> None:
-        """Show the campaign of the page, with its results beside it."""
+        """Show the campaign of the page, with its results beside it; the same again leaves what is typed."""
+        if campaign is not None and campaign == self._taken:
+            return
+        self._taken = campaign
         folder = self._state.folder or self._state.root
         chosen = campaign or folder / "campaign.toml"
         self._campaign.value, self._results.value = str(chosen), str(chosen.parent / "results")
@@ -80,8 +84,7 @@ class RunScreen:
         except (PlaceError, RunError) as error:
             self._outcome[:] = [paragraph(str(error), kind="fault")]
             return
-        self._state.campaign = campaign
-        self._results.value = str(results)
+        self._taken = self._state.campaign = campaign
         self.update()
 
     def _on_cancel(self, event: object) -> None:

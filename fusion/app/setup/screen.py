@@ -224,7 +224,6 @@ class SetUpScreen:
             opened = await asyncio.to_thread(open_folder, self._state.root, folder)
             # Drawings are changed in the document's own turn.
             pn.state.execute(lambda: self._show(opened), schedule=True)
-            self._state.folder = folder
         except _BAD_INPUT as error:
             self._found.append(paragraph(str(error), kind="fault"))
         finally:
@@ -245,8 +244,10 @@ class SetUpScreen:
         self._checked[:] = []
         self._go.visible = False
         self._work.visible = True
-        if opened.campaign.saved is not None:
-            self._state.campaign = opened.campaign.path
+        if self._state.folder != opened.folder:
+            # Looking again into the same folder leaves what was chosen on another screen meanwhile.
+            self._state.folder = opened.folder
+            self._state.campaign = None if opened.campaign.saved is None else opened.campaign.path
 
     def _offset_s(self) -> float:
         try:

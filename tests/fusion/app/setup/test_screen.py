@@ -81,7 +81,7 @@ def test_a_campaign_file_is_made_by_keyboard_and_opened_again(
     ):
         page.get_by_label(label).fill(text)
         page.get_by_label(label).press("Tab")
-    column = page.get_by_label("Column in the frame (px)")
+    column = page.get_by_role("textbox", name="Column in the frame (px)")
     column.fill("90")
     column.press("Tab")
     page.get_by_text("F1 lies").wait_for()
