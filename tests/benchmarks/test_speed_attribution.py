@@ -1,4 +1,4 @@
-"""Speed of the screen at full size, and as a ratio to nilearn (if installed) on one regressor measured in the same run.
+"""Speed of the screen at full size, and as a ratio to nilearn on one regressor measured in the same run.
 
 Reproduces the rows of docs/measured.md, "Speed and memory", on the screen.
 """
@@ -72,9 +72,10 @@ def test_full_size(rng: np.random.Generator) -> None:
 
 def test_against_nilearn(rng: np.random.Generator) -> None:
     """nilearn takes one drift series per call: one call is measured and counted 32 times."""
-    glm = pytest.importorskip("nilearn.glm.first_level", reason="nilearn is not installed")
-    mass_univariate = pytest.importorskip("nilearn.mass_univariate")
-    columns, permutations = 10_000, 50
+    from nilearn import mass_univariate
+    from nilearn.glm import first_level
+
+    columns, permutations = 10_000, 1000
     seen = film(columns, rng)
     values = drifts(rng)
     trend = np.linspace(-1, 1, CYCLES)
@@ -82,7 +83,7 @@ def test_against_nilearn(rng: np.random.Generator) -> None:
     pixels = np.asarray(seen.values, float)
     run(values, film(600, rng), 5, (0.0,))()
     _, ours = cost(run(values, seen, 0, (0.0,)))
-    _, theirs = cost(lambda: glm.run_glm(pixels, np.column_stack([values[0], confounds]), noise_model="ar1"))
+    _, theirs = cost(lambda: first_level.run_glm(pixels, np.column_stack([values[0], confounds]), noise_model="ar1"))
     print(f"\n{columns} pixels, {SERIES} series: nilearn run_glm(ar1) / screen = {SERIES * theirs / ours:.0f}")
     _, ours = cost(run(values, seen, permutations, (0.0,)))
     _, theirs = cost(
