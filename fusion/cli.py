@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -668,6 +669,8 @@ def plan(
 
 def main() -> None:
     """Run the command line, as the script ``thermofuse`` or as a module; the exit code is that of the process."""
+    # Loading libraries and drawing charts make very many small objects, which are not garbage: looking for some takes a tenth of a run.
+    gc.set_threshold(50_000)
     try:
         app(prog_name="thermofuse")
     except SystemExit as ended:

@@ -43,6 +43,8 @@ _CONTRADICTED = 0.5
 _FIVE_SIGMA = 2.9e-7
 #: Share of the cycles from which the later ones are predicted.
 _EARLY_SHARE = 0.5
+#: Values of candidates' columns that are looked at together, 80 MB of them.
+_VALUES_AT_ONCE = 10_000_000
 
 
 def prior_rows(model: ModelFit, rng: np.random.Generator, *, draws: int = DRAWS) -> PriorRows:
@@ -106,15 +108,25 @@ class CandidateScorer:
     def gains(self, candidates: Sequence[Candidate], *, simulated: bool = True) -> Gains:
         """Gain of every candidate for the measured response and, where asked for, for every simulated one."""
         draws = self.draws if simulated else np.empty((self.fit.response.size, 0))
-        gains = profile_gains(
-            self.systems(),
-            np.column_stack([self.fit.response, draws]),
-            self.fit.design,
-            by_width(candidates, self.used),
-            priors=self.priors,
-        )
+        responses, systems = np.column_stack([self.fit.response, draws]), self.systems()
         widths = np.array([candidate.columns.shape[1] for candidate in candidates])
-        return Gains(gains.gain - (widths - 1.0)[:, None], gains.drift_place, gains.separable)
+        # Of a long test some candidates at a time: their columns are held three times while their gains are computed.
+        batch = (np.cumsum(widths) * self.fit.response.size) // _VALUES_AT_ONCE
+        gains = [
+            profile_gains(
+                systems,
+                responses,
+                self.fit.design,
+                by_width([candidates[k] for k in np.flatnonzero(batch == one)], self.used),
+                priors=self.priors,
+            )
+            for one in np.unique(batch)
+        ]
+        return Gains(
+            np.concatenate([some.gain for some in gains]) - (widths - 1.0)[:, None],
+            np.concatenate([some.drift_place for some in gains]),
+            np.concatenate([some.separable for some in gains]),
+        )
 
     def confirm(self, scores: Sequence[Score], families: Families) -> list[Score]:
         """The same scores, each with its confirmation.

@@ -107,6 +107,18 @@ def test_every_coefficient_beyond_the_first_costs_one_unit(rng):
     np.testing.assert_allclose(gains.gain, bare.gain - np.array([[0.0], [1.0]]), rtol=1e-9)
 
 
+def test_a_few_candidates_at_a_time_gain_what_all_together_gain(monkeypatch, rng):
+    scorer = CandidateScorer.of(model_of(measured(), used=TRAINING), rng)
+    candidates = [candidate(rng.standard_normal((BARE.seconds.size, width))) for width in (1, 2, 1, 3, 2)]
+    whole = scorer.gains(candidates)
+    monkeypatch.setattr("fusion.loop.confirmation._VALUES_AT_ONCE", 2 * BARE.seconds.size)
+    parts = scorer.gains(candidates)
+    # Products of other shapes are rounded otherwise.
+    np.testing.assert_allclose(parts.gain, whole.gain, atol=1e-8)
+    np.testing.assert_array_equal(parts.drift_place, whole.drift_place)
+    np.testing.assert_array_equal(parts.separable, whole.separable)
+
+
 def test_an_effect_that_lasts_is_confirmed_and_one_that_is_absent_is_not(rng):
     model = model_of(measured(WAVE), used=TRAINING)
     absent = np.cos(BARE.seconds / 37.0)
