@@ -53,11 +53,14 @@ class ResultsScreen:
     def _open(self) -> None:
         """Take the folder that was typed."""
         try:
-            self._state.results = folder_within(self._state.root, self._folder.value)
+            folder = folder_within(self._state.root, self._folder.value)
         except PlaceError as error:
             self._content[:] = [paragraph(str(error), kind="fault")]
             return
-        self._show(self._state.results)
+        if folder == self._state.results:
+            self._show(folder)
+        else:
+            self._state.results = folder
 
     def _take(self, results: Path | None) -> None:
         if results is not None:

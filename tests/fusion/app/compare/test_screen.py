@@ -60,4 +60,4 @@ def test_two_campaigns_are_chosen_and_compared_by_keyboard(app: tuple[str, Path]
     page.get_by_role("button", name="Compare", exact=True).last.press("Enter")
     page.get_by_text("No change of the machine is shown").wait_for()
     page.get_by_role("heading", name="Side by side").wait_for()
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.wait_for_function("document.documentElement.scrollWidth <= 390")
