@@ -655,7 +655,7 @@ def load_campaign(path: str | Path, *, effects: Mapping[str, Effect] | None = No
         details = [item for item in ordered if not (faults and item["type"] == "missing" and len(item["loc"]) == 1)]
         faults += [describe(_as_written(item, content), Campaign, place) for item in details]
     if faults:
-        raise CampaignError("\n".join(faults))
+        raise CampaignError("\n".join(dict.fromkeys(faults)))
     return campaign
 
 

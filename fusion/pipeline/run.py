@@ -37,7 +37,7 @@ from fusion.pipeline.provenance import (
 )
 from fusion.pipeline.radiometry import describe_field
 from fusion.pipeline.sizes import choose_targets, lacks_for_correlation, lacks_for_model
-from fusion.products.folder import claim, open_folder
+from fusion.products.folder import claim, discard, open_folder, read_manifest
 from fusion.products.progress import Report, silent
 from fusion.products.results import Notice, Outcome, Results, assemble
 from fusion.products.store import (
@@ -421,10 +421,25 @@ def _run_record(run: Run, source: record_stage.RecordSource) -> Results:
     return _finish(run, {"record": record})
 
 
+def _discard_stale(run: Run, datasets: Mapping[str, Any]) -> None:
+    """Remove products of an earlier run of another campaign in this folder: of an instrument that is gone, of cycles that are not there."""
+    of_stages = {"fields": "fields.nc", "deviations": "deviations.nc", "sensors": _SENSORS}
+    stale = [name for dataset, name in of_stages.items() if dataset not in datasets]
+    if not {"fusion", "record"} & set(datasets):
+        stale.append("fusion.nc")
+    cycles = datasets["fields"]["cycle"].values if "fields" in datasets else ()
+    maps = {f"maps/{thermal.map_name(cycle)}" for cycle in cycles}
+    stale += [name for name in read_manifest(run.folder) if name.startswith("maps/") and name not in maps]
+    discard(run.folder, *stale)
+    for name in {"fields", "deviations"} - set(datasets):
+        run.stamps.forget(name)
+
+
 def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
     """Write results, provenance and report from what the stages found."""
     from fusion.report.html import render_report  # its charts take half a second to import, which a run needs last
 
+    _discard_stale(run, datasets)
     run.parts["plugins"] = [asdict(plugin) for plugin in plugins()]
     run.notices.extend(note_changes(run.seen, input_states(run.campaign)))
     results = assemble(run.campaign.campaign.title, run.parts, run.notices)

@@ -97,6 +97,30 @@ def claim(folder: Path, *names: str) -> None:
         write_json(folder / MANIFEST, {"software": "thermofuse", "written": dict(sorted(entries.items()))})
 
 
+def discard(folder: Path, *names: str) -> None:
+    """Remove files that an earlier run wrote and that the results do not hold any more, with their entries in the manifest.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder that thermofuse writes to.
+    *names : str
+        Paths relative to it; what is not in the manifest stays.
+    """
+    written = read_manifest(folder)
+    stale = [name for name in names if name in written]
+    if not stale:
+        return
+    for name in stale:
+        (folder / name).unlink(missing_ok=True)
+    kept = {name: version for name, version in written.items() if name not in stale}
+    write_json(folder / MANIFEST, {"software": "thermofuse", "written": kept})
+    for name in stale:
+        above = (folder / name).parent
+        if above != folder and above.is_dir() and not any(above.iterdir()):
+            above.rmdir()
+
+
 def read_manifest(folder: Path) -> dict[str, str]:
     """Return the files that thermofuse wrote in a folder, each with the version that wrote it; none where there is no manifest.
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from fusion.errors import FusionError
+from fusion.products.notices import counted
 from fusion.products.store import write_text
 from fusion.starting.folder import FolderContent, scan_folder
 from fusion.starting.kinds import Kind, Recognised, column_unit, is_displacement, is_temperature, is_time
@@ -128,7 +129,7 @@ def _time_zone(readings: Sequence[Recognised], asker: Asker) -> Iterator[str]:
 
 def _thermography(content: FolderContent, asker: Asker) -> Iterator[str]:
     yield from ("", "[thermography]")
-    yield f"frames = [{', '.join(_quoted(pattern) for pattern in content.frames)}]   # {len(content.frame_files)} files"
+    yield f"frames = [{', '.join(_quoted(pattern) for pattern in content.frames)}]   # {counted(len(content.frame_files), 'file')}"
     if content.of_temperatures:
         yield from _stack(content, asker)
         return

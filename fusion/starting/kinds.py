@@ -28,6 +28,12 @@ _LONGEST_REASON = 160
 _TABLES = ("thermography", "plan", "interferometry", "record", "drivers", "sensors")
 _RECIPE = ("test", "duty", "laser", "effect", "camera", "material")
 _HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
+_NUMBER = re.compile(r"[-+]?\d+(?:[.,]\d*)?(?:[eE][-+]?\d+)?")
+#: Reason of a table whose columns nobody can know.
+_BARE = (
+    "a table of numbers without headings; write a first line that names every column with its unit, such as "
+    "time [s],spindle [degC],nose [um]"
+)
 _TEMPERATURE_UNITS, _LENGTH_UNITS, _TIME_UNITS = ("degC", "K", "degF"), ("um", "nm", "mm"), ("s", "ms", "min", "h")
 
 
@@ -109,6 +115,8 @@ def recognise(path: Path) -> Recognised:
         # Text may be one frame of temperatures; what is neither is refused as the table that it is not.
         if isinstance(reader, TextReader) and reader.holds_a_frame(path):
             return Recognised(path, Kind.STACK)
+        if text is not None and _is_bare(_headings(text)):
+            return Recognised(path, Kind.UNKNOWN, _BARE)
         return Recognised(path, Kind.UNKNOWN, _shortened(str(error).removeprefix(f"{path}").lstrip(":, ")))
     return Recognised(path, kind, headings=headings)
 
@@ -212,6 +220,11 @@ def _headings(text: str) -> tuple[str, ...]:
     line = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
     delimiter = max(",;\t", key=line.count)
     return tuple(name.strip() for name in next(csv.reader([line], delimiter=delimiter), []))
+
+
+def _is_bare(first: tuple[str, ...]) -> bool:
+    """Whether the first line of a table holds numbers where the headings should be."""
+    return len(first) > 1 and all(_NUMBER.fullmatch(field.lstrip("\ufeff")) for field in first)
 
 
 def _by_headings(headings: tuple[str, ...]) -> Kind | None:

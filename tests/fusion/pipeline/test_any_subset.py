@@ -13,6 +13,7 @@ import pytest
 from fusion.alignment.align import AlignmentError
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.pipeline.run import run_campaign
+from fusion.products.folder import claim, read_manifest
 from fusion.products.results import Results, read_results
 from fusion.products.store import read_dataset, read_tree
 from fusion.report.exports.export import ExportError, export_results
@@ -349,6 +350,20 @@ def test_readings_without_times_are_evaluated_by_the_standard(untimed: Path) -> 
     # What only times can tell is not counted as passed.
     assert results.inputs is not None and "travel_order" not in [check.code for check in results.inputs.checks]
     assert not {"drift", "anomalies", "loop"} & set(sections(untimed))
+
+
+def test_products_of_an_instrument_that_is_gone_do_not_stay(untimed: Path, tmp_path: Path) -> None:
+    shutil.copytree(untimed.parent, tmp_path, dirs_exist_ok=True)
+    folder, campaign = tmp_path / "results", tmp_path / "campaign.toml"
+    (folder / "maps").mkdir()
+    claim(folder, "fields.nc", "maps/cycle_0001.exr")
+    for name in ("fields.nc", "maps/cycle_0001.exr", "notes.txt"):
+        (folder / name).write_text("of an earlier run, or of a person")
+    campaign.write_text(campaign.read_text(encoding="utf-8").replace('"wide"', '"the laser alone"'), encoding="utf-8")
+    run_campaign(campaign, folder, resume=True)
+    assert not (folder / "fields.nc").exists() and not (folder / "maps").exists()
+    assert (folder / "notes.txt").exists() and (folder / "deviations.nc").exists()
+    assert "fields.nc" not in read_manifest(folder)
 
 
 def test_readings_without_times_are_exported_without_drift(untimed: Path, tmp_path: Path) -> None:

@@ -109,6 +109,9 @@ def test_a_folder_without_measurements_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DraftError, match=r"in it \(notes.csv: "):
         write_campaign(tmp_path, Asker(None))
     assert not (tmp_path / "campaign.toml").exists()
+    (tmp_path / "notes.csv").write_text("\ufeff0,20.1,4.41E-05\n1,20.2,4.3E-05\n", encoding="utf-8")
+    with pytest.raises(DraftError, match=r"notes.csv: a table of numbers without headings; write a first line"):
+        write_campaign(tmp_path, Asker(None))
     with pytest.raises(DraftError, match="no such folder"):
         write_campaign(tmp_path / "absent", Asker(None))
 
