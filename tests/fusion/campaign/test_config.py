@@ -293,5 +293,5 @@ def test_a_region_that_tells_nothing_is_refused_at_its_line(folder: Path, lines:
 
 def test_a_fault_of_both_entries_of_a_list_is_told_once(folder: Path) -> None:
     with pytest.raises(CampaignError) as caught:
-        load(folder, TEXT.replace('size = ["700 mm", "180 mm"]', 'size = ["FILL IN", "FILL IN"]'))
+        load(folder, TEXT.replace('size = ["0.7 m", "180 mm"]', 'size = ["FILL IN", "FILL IN"]'))
     assert str(caught.value).count("FILL IN") == 1
