@@ -25,7 +25,7 @@ def plot_sensors(sensors: xr.Dataset) -> Chart:
     start = sensors["time"].values[0]
     if "camera_time" in sensors:
         start = min(start, sensors["camera_time"].values[0])
-    drawn = new_figure(x="time since the first temperature / h", y="rise / K", height=340)
+    drawn = new_figure(x="time since the first temperature / h", y="rise / K", height=340, legend_columns=5)
     add_zero_line(drawn)
     columns: dict[str, list[np.ndarray]] = {"sensor": [], "source": [], "time / h": [], "rise / K": []}
     said = []
