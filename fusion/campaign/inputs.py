@@ -406,7 +406,7 @@ def _raise_if_no_rise(
     """Raise if too few frames are left to show a rise."""
     if len(frames) < _LEAST_FRAMES:
         reasons = listed(_reason(item) for item in rejected) if rejected else "none rejected"
-        single = f", or look at it with thermofuse inspect {campaign.frame_paths()[0]}" if frames else ""
+        single = f", or look at it with thermofuse inspect {frames[0].path}" if frames else ""
         raise SourceError(
             f"{campaign.path}: {counted(len(frames), 'usable frame')}, at least {_LEAST_FRAMES} are needed, as a rise is the change since "
             f"the first ({reasons}); check thermography.frames{single}"

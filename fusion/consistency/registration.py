@@ -155,7 +155,10 @@ def check_picture(frames: Sequence[FrameReference]) -> list[Check]:
             largest,
             _LARGEST_SHIFT_PX,
             passed,
-            f"The picture shifts by up to {largest:.1f} px ({compared}{unlike}).",
+            f"The picture shifts by up to {largest:.1f} px ({compared}{unlike})."
+            if measured
+            else f"Whether the picture stays is not shown: {compared}, and in none of them is enough as in the first (too little contrast, "
+            "or another scene).",
             ""
             if passed
             else "Fasten camera and table: without fiducials a cell is a place in the picture, and shows something else when that moves.",

@@ -328,7 +328,7 @@ def _data_rows(
     if fields is not None:
         first, last = fields["time"].values[[0, -1]]
         clock = ", on the laser's clock" if results.alignment is not None else ""
-        rows.append(("Frames", f"{fields.sizes['time']}, {_span(first, last, results)}{clock}"))
+        rows.append(("Frames", f"{_frames(fields)}, {_span(first, last, results)}{clock}"))
         cell = float(np.median(np.diff(fields["x"])))
         unit = plan_unit(fields)
         of = ", the whole picture: nothing is known in mm" if unit == "px" else ""

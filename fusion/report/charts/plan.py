@@ -27,6 +27,8 @@ from thermography.fields.cycle_fields import plan_unit
 
 #: Temperatures of a picture are rounded to 1/32 K, far below its noise, so that it is small when it is compressed.
 _STEP_PER_K = 32
+#: Length of a recording from which its time is drawn in hours.
+_LEAST_HOURS = 0.1
 
 
 def extent_of(cells: xr.Dataset) -> tuple[float, float, float, float]:
@@ -192,19 +194,21 @@ def plot_rise_history(fields: xr.Dataset) -> Chart:
     shown = np.isfinite(flat).any(axis=1)
     low[shown], high[shown] = np.nanpercentile(flat[shown], [10, 90], axis=1)
     mean[shown], most[shown] = np.nanmean(flat[shown], axis=1), np.nanmax(flat[shown], axis=1)
-    drawn = new_figure(x="time since first cycle / h", y="rise / K")
+    unit, scale = ("h", 1.0) if hours[-1] >= _LEAST_HOURS else ("s", 3600.0)
+    hours = scale * hours
+    drawn = new_figure(x=f"time since first cycle / {unit}", y="rise / K")
     add_zero_line(drawn)
     add_band(drawn, hours, low, high, ACCENT, legend_label="middle 80 % of the cells")
     seen_part = "picture" if plan_unit(fields) == "px" else "table"
     add_series(drawn, hours, mean, name=f"mean of the {seen_part}", colour=ACCENT)
     add_series(drawn, hours, most, name="warmest cell", colour=INK, dash="dashed")
     seen = (
-        f"Rise of the {seen_part} over {number(float(hours[-1]), 2)} h: the mean of its cells is {span_words(mean, 'K')}, the warmest "
+        f"Rise of the {seen_part} over {number(float(hours[-1]), 2)} {unit}: the mean of its cells is {span_words(mean, 'K')}, the warmest "
         f"cell reaches {number(float(np.nanmax(most)))} K."
     )
     columns = {
-        "cycle": fields["cycle"].values, "time since first cycle / h": hours, "mean rise / K": mean, "10 % of the cells below / K": low,
-        "90 % of the cells below / K": high, "warmest cell / K": most,
+        "cycle": fields["cycle"].values, f"time since first cycle / {unit}": hours, "mean rise / K": mean,
+        "10 % of the cells below / K": low, "90 % of the cells below / K": high, "warmest cell / K": most,
     }  # fmt: skip
     return Chart(drawn, seen, columns)
 

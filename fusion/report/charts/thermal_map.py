@@ -23,6 +23,8 @@ _MAP_BUDGET = 3_000_000
 _MISSING = -32768
 #: A colour outside the scale, for values beyond its ends.
 _BEYOND = "#7fe3ff"
+#: Usual width of the map on a page, and largest height of a picture, CSS px.
+_WIDTH, _MOST_HEIGHT = 900, 720
 #: Room about the plan, as a share of its length, so that a ring at its rim is whole.
 _ROOM = 0.025
 
@@ -162,7 +164,9 @@ def draw_map(
     """
     left, right, bottom, top = extent
     room = _ROOM * (right - left)
-    drawn = new_plan((left - room, right + room, bottom - room, top + room), height=330, unit=unit)
+    # A table is longer than wide; a picture is drawn about as high as it is on a screen.
+    height = 330 if unit == "mm" else int(min(_MOST_HEIGHT, 60 + _WIDTH * values.shape[0] / values.shape[1]))
+    drawn = new_plan((left - room, right + room, bottom - room, top + room), height=height, unit=unit)
     mapper = LinearColorMapper(
         palette(layer.colours), low=scale["low"], high=scale["high"], nan_color="#e1e5e7", low_color=_BEYOND, high_color=_BEYOND,
         name="scale",

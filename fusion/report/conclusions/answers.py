@@ -143,8 +143,7 @@ def _rise(results: Results) -> list[str]:
         return []
     unit = "mm" if field.largest_x_px is None else "px"
     x, y = (getattr(field, f"largest_{axis}_{unit}") for axis in "xy")
-    last = field.largest_cycle == field.fields
-    when = "in the last field" if last else f"after {duration(field.largest_after_s)} (field {field.largest_cycle})"
+    when = f"after {duration(field.largest_after_s)} (window {field.largest_cycle})"
     sentences = [
         f"The largest rise of a cell, {measured_quantity(field.largest_rise_K, 'K')}, is at {place(x, y, unit)} {when}."
     ]
