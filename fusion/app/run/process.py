@@ -173,6 +173,9 @@ class Runs:
     def end(self) -> None:
         """End all of them: the application ends."""
         with self._lock:
+            # All are told before one is waited for: the application itself may be given a second only.
+            for run in self._runs.values():
+                run.cancel()
             for run in self._runs.values():
                 run.end()
 

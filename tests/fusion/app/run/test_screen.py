@@ -26,15 +26,15 @@ def test_a_run_is_cancelled_resumed_and_reported_by_keyboard_in_two_tabs(
         field = tab.get_by_label("Results folder")
         field.fill("run_here")
         field.press("Tab")
-    page.get_by_role("button", name="Run", exact=True).last.press("Enter")
+    main = page.locator("main")
+    main.get_by_role("button", name="Run", exact=True).press("Enter")
     other.get_by_text("under way; this page may be closed").wait_for()
     page.get_by_text("reading and checking").wait_for()
     other.get_by_role("button", name="Cancel").press("Enter")
     for tab in (page, other):
         tab.get_by_text("The run was cancelled").wait_for()
-    page.get_by_role("button", name="Run", exact=True).or_(page.get_by_role("button", name="Resume")).last.press(
-        "Enter"
-    )
+    again = main.get_by_role("button", name="Run", exact=True).or_(main.get_by_role("button", name="Resume"))
+    again.press("Enter")
     page.get_by_text("The run is finished.").wait_for(timeout=60_000)
     with page.context.expect_page() as opening:
         page.get_by_role("link", name="Open the report").press("Enter")
@@ -55,6 +55,6 @@ def test_a_wrong_file_and_a_path_outside_say_what_to_do(app: tuple[str, Path], n
         page.get_by_label("Campaign file").fill(written)
         page.get_by_label("Results folder").fill("wrong_results")
         page.get_by_label("Results folder").press("Tab")
-        page.get_by_role("button", name="Run", exact=True).last.press("Enter")
+        page.locator("main").get_by_role("button", name="Run", exact=True).press("Enter")
         page.get_by_role("alert").filter(has_text=told).first.wait_for()
     assert not (app[1] / "wrong_results").exists()
