@@ -35,7 +35,7 @@ def test_a_run_is_cancelled_resumed_and_reported_by_keyboard_in_two_tabs(
         tab.get_by_text("The run was cancelled").wait_for()
     again = main.get_by_role("button", name="Run", exact=True).or_(main.get_by_role("button", name="Resume"))
     again.press("Enter")
-    page.get_by_text("The run is finished.").wait_for(timeout=60_000)
+    page.get_by_text("The run is finished.").wait_for(timeout=240_000)
     with page.context.expect_page() as opening:
         page.get_by_role("link", name="Open the report").press("Enter")
     report = opening.value
