@@ -276,7 +276,7 @@ def place(x: float | None, y: float | None, unit: str = "mm") -> str:
     unit : str
         mm, or px where the picture is the plan.
     """
-    across, down = ("–" if value is None else f"{value:.0f}" for value in (x, y))
+    across, down = ("–" if value is None else f"{value:z.0f}" for value in (x, y))
     return f"x {across} {unit}, y {down} {unit}"
 
 
