@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test docs screenshots soak benchmarks lint mutants audit clean
+.PHONY: demo test docs screenshots soak benchmarks lint mutants audit lock kernels clean
 
 $(VENV)/.run: pyproject.toml constraints.txt
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" || { echo "thermofuse needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python3.12"; exit 1; }
@@ -75,6 +75,20 @@ audit:
 	build/audit/tools/bin/cyclonedx-py environment --pyproject pyproject.toml --output-format JSON --output-file build/audit/sbom.json build/audit/environment/bin/python
 	build/audit/environment/bin/pip freeze --exclude thermofuse > build/audit/pinned.txt
 	build/audit/tools/bin/pip-audit --strict --no-deps --disable-pip --requirement build/audit/pinned.txt
+
+# Name, version and SHA-256 of every file that this machine and this Python install, in build/requirements.lock; see CONTRIBUTING.md.
+lock: $(VENV)/.run
+	mkdir -p build
+	$(BIN)/pip install --quiet --dry-run --ignore-installed --report build/files.json --constraint constraints.txt .
+	$(BIN)/python -c "import json; \
+	  found = [one for one in json.load(open('build/files.json'))['install'] if 'archive_info' in one['download_info']]; \
+	  print(*sorted('{name}=={version} --hash=sha256:{sha256}'.format(**one['metadata'], **one['download_info']['archive_info']['hashes']) \
+	  for one in found), sep='\n')" > build/requirements.lock
+
+# Compiled kernels once as plain Python, where array bounds are checked and coverage counts their lines: those that are quick enough for it.
+kernels: $(VENV)/.test
+	NUMBA_DISABLE_JIT=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest tests/fusion/alignment/test_first_order_lag.py tests/thermography/io/test_png16.py \
+	  tests/interferometry/drift/test_kalman.py
 
 clean:
 	rm -rf build $(VENV)

@@ -307,17 +307,24 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
         scale = settling_noise_scale(searched.seconds, time_s, exponent)
         return _solve(replace(searched, ratios=10.0**log_ratio, process_noise_scale=scale), few)
 
+    def likelihood(log_ratio: Array, time_s: float, exponent: float) -> float:
+        # Far out in the search a column may vanish beside the noise: no model, and not the end of the search.
+        try:
+            return float(fitted(log_ratio, time_s, exponent).log_likelihood)
+        except DriftModelError:
+            return -np.inf
+
     def with_same_mean(exponent: float) -> Array:
         return np.log10(system.ratios / settling_noise_scale(searched.seconds, first_s, exponent).mean())
 
-    likely = max((1.0, 2.0), key=lambda exponent: fitted(with_same_mean(exponent), first_s, exponent).log_likelihood)
-    if fitted(with_same_mean(likely), first_s, likely).log_likelihood < constant:
+    likely = max((1.0, 2.0), key=lambda exponent: likelihood(with_same_mean(exponent), first_s, exponent))
+    if likelihood(with_same_mean(likely), first_s, likely) < constant:
         return fit
     components = system.ratios.size
     guess = np.r_[with_same_mean(likely), np.log10(first_s), likely]
     limits = np.log10(span * np.array(_SETTLING_LIMITS))
     optimum = optimize.minimize(
-        lambda x: -fitted(x[:components], 10.0 ** x[-2], x[-1]).log_likelihood,
+        lambda x: -likelihood(x[:components], 10.0 ** x[-2], x[-1]),
         guess,
         method="Nelder-Mead",
         bounds=[(None, None)] * components + [tuple(limits), (0.0, _FASTEST_SETTLING)],
@@ -328,9 +335,9 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
             "maxfev": 80 * guess.size,
         },
     )
-    settled = fitted(optimum.x[:components], 10.0 ** optimum.x[-2], optimum.x[-1]).system
     if -optimum.fun < constant + _SETTLING_MARGIN:
         return fit
+    settled = fitted(optimum.x[:components], 10.0 ** optimum.x[-2], optimum.x[-1]).system
     start_scale = float(np.exp(np.log(settled.ratios / system.ratios).mean()))
     settling = settling_noise_scale(system.seconds, 10.0 ** optimum.x[-2], optimum.x[-1])
     scale = np.maximum(1.0, start_scale * settling)

@@ -87,12 +87,12 @@ def _recipe(rng: np.random.Generator) -> Recipe:
         laser={"noise_um": float(10.0 ** rng.uniform(-2.0, 0.5)), "tails": str(rng.choice(["normal", "t4"])),
                "file": str(rng.choice(["csv", "csv", "rtl"]))},
         camera={
-            "columns": 96, "rows": 72, "focal_px": 1530.0 * 96 / 640, "blur_px": 0.4,
+            "columns": 160, "rows": 120, "focal_px": 1530.0 * 160 / 640, "blur_px": 0.4,
             "frames_per_cycle": int(rng.integers(1, 4)), "file": str(rng.choice(["jpg", "seq"])),
             "clock_offset_s": float(rng.choice([0.0, 7.5])), "state_clock_offset": bool(rng.random() < 0.7),
             "knock_cycle": int(rng.choice([0, 0, 0, max(cycles // 2, 1)])), "bad_pixels": int(rng.choice([0, 3])),
         },
-        plan={"fiducial_diameter_mm": 50, "fiducials_x_mm": (60, 350, 640, 60, 350, 640), "fiducials_y_mm": (30, 32, 35, 145, 150, 148)},
+        plan={"fiducial_diameter_mm": 40, "fiducials_x_mm": (60, 350, 640, 60, 350, 640), "fiducials_y_mm": (30, 32, 35, 145, 150, 148)},
         effect=tuple(EffectRecipe(str(name), float(rng.uniform(0.2, 5.0))) for name in effects),
     )  # fmt: skip
 

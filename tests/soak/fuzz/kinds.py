@@ -280,7 +280,7 @@ def kinds_of_inputs(folder: Path) -> list[Kind]:
         For intact files while they are made.
     """
     made, text = _files(folder), damaged_text
-    frames_text = "\n".join(";".join(f"{20 + x / 10 + y:.1f}" for x in range(9)) for y in range(7))
+    frames_text = "\n".join(";".join(f"{20 + x / 10 + y:.1f}" for x in range(12)) for y in range(9))
     return [
         Kind("flir.seq", flir.seeds(folder), flir.mutate, read_flir, 3.0),
         Kind("long.csv", [laser.LONG.encode(), laser.LONG.replace(",", ";").encode("utf-16")], text, read_laser, 2.0),
