@@ -294,7 +294,7 @@ def init(
     Its files are looked at, what they cannot tell is asked, and the result is checked. An existing campaign.toml is never replaced.
     """
     from fusion.starting.check import check_campaign
-    from fusion.starting.draft import DraftError, write_campaign
+    from fusion.starting.draft import DraftError, unused_files, write_campaign
     from fusion.starting.questions import Asker
 
     with _answering():
@@ -309,7 +309,8 @@ def init(
             folder, Asker(ask, lambda text: errors.print(text, highlight=False, markup=False))
         )
         console.print(f"campaign: {path.resolve()}", soft_wrap=True, highlight=False, markup=False)
-        lines = [f"to fill in, {line}" for line in missing] or check_campaign(path).lines()
+        lines = [f"not used: {line}" for line in unused_files(path)]
+        lines += [f"to fill in, {line}" for line in missing] or check_campaign(path).lines()
         for line in lines:
             console.print(line, soft_wrap=True, highlight=False, markup=False)
 

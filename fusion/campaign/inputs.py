@@ -49,6 +49,8 @@ from thermography.registration.picture import picture_grid
 from thermography.registration.plan import PlanGrid, read_fiducials
 from thermography.registration.polygon import Polygon, PolygonError
 
+#: Words of the reason why a frame of another size is left out.
+_OTHER_SIZE = "pixels among frames"
 #: Smallest test that has a scatter and a drift, and smallest recording that has a rise.
 _LEAST_CYCLES, _LEAST_TARGETS, _LEAST_FRAMES = 2, 2, 2
 
@@ -257,7 +259,7 @@ def _of_one_size(frames: FrameList) -> tuple[FrameList, list[tuple[FrameReferenc
     most = sizes[counted == counted.max()]
     first = min(range(len(most)), key=lambda i: int(np.argmax((shapes == most[i]).all(axis=1))))
     fits = (shapes == most[first]).all(axis=1)
-    reason = "{1} x {0} pixels among frames of {3} x {2}"
+    reason = f"{{1}} x {{0}} {_OTHER_SIZE} of {{3}} x {{2}}"
     return frames.choose(fits), [
         (frame, reason.format(*frame.shape, *most[first].tolist())) for frame in frames.choose(~fits)
     ]
@@ -313,11 +315,17 @@ def _window_notice(source: CameraInputs) -> Notice:
     bounds, stated = source.cycles.bounds, source.thermography.window_s is not None
     seconds = float((bounds[0, 1] - bounds[0, 0]) / np.timedelta64(1, "s"))
     length = f"{seconds / 60.0:g} min" if seconds >= 60.0 else f"{seconds:g} s"
+    windows = int(source.cycles.number[-1])
+    empty = windows - len(bounds)
     return Notice(
         "cycles_from_windows",
-        f"No laser gives cycles: the frames are divided into {counted(len(bounds), 'window')} of {length}"
+        f"No laser gives cycles: the frames are divided into {counted(windows, 'window')} of {length}"
         f"{', as thermography.window states' if stated else ', a usual length here (thermography.window sets another)'}; "
-        "each counts as a cycle.",
+        + (
+            "each counts as a cycle."
+            if not empty
+            else f"each of the {len(bounds)} that hold a frame counts as a cycle."
+        ),
         "",
     )
 
@@ -475,11 +483,14 @@ def frames_notices(rejected: Sequence[Mapping[str, Any]], code: str = "frames_re
     if not rejected:
         return []
     named = [f"{item['file']} ({_reason(item)})" for item in rejected]
+    other_size = all(_OTHER_SIZE in _reason(item) for item in rejected)
     return [
         Notice(
             code,
             f"{counted(len(rejected), 'frame')} left out: {listed(named)}.",
-            "Copy damaged files again from the camera; a gap in the frames only widens the interpolation between its neighbours.",
+            "Name the frames of one camera and one size only in thermography.frames."
+            if other_size
+            else "Copy damaged files again from the camera; a gap in the frames only widens the interpolation between its neighbours.",
         )
     ]
 

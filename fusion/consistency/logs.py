@@ -52,7 +52,8 @@ def check_log(
         return []
     covered = _covered(log["time"].values, readings)
     passed = covered >= _LEAST_COVERED
-    late_s = None if passed else likely_zone_shift(readings, log["time"].values)
+    gaps = not passed and _reaches_both_ends(log["time"].values, readings)
+    late_s = None if passed or gaps else likely_zone_shift(readings, log["time"].values)
     clear = late_s is not None and covered < _COVERED_NOW and _same_ends(log["time"].values, readings, late_s)
     first, last = (np.datetime_as_string(log["time"].values[k], unit="s") for k in (0, -1))
     span = f"{np.datetime_as_string(readings.min(), unit='s')}Z to {np.datetime_as_string(readings.max(), unit='s')}Z"
@@ -63,13 +64,9 @@ def check_log(
             _LEAST_COVERED,
             passed,
             f"{file} ({first}Z to {last}Z) covers {100.0 * covered:.0f} % of the readings ({span})"
+            + ("; the others lie in gaps of the log" if gaps else "")
             + ("." if late_s is None else f", and nearly all of them if its clock is {_hours(late_s)}."),
-            ""
-            if passed
-            else (
-                f"Check the date, the clock and the time zone of {file} (write its times with their zone, or time_zone), or leave it out "
-                "of the campaign file."
-            ),
+            "" if passed else _remedy(file, gaps=gaps),
             endangers,
             Severity.CONTRADICTION if covered == 0.0 or clear else Severity.DOUBT,
         )
@@ -130,6 +127,20 @@ def _same_ends(logged: NDArray[np.datetime64], readings: NDArray[np.datetime64],
     """Whether a log begins and ends with the readings once its clock is put right."""
     ends = ((logged[[0, -1]] - [readings.min(), readings.max()]) / np.timedelta64(1, "s")) - late_s
     return bool(np.all(np.abs(ends) <= _SAME_END_S))
+
+
+def _reaches_both_ends(logged: NDArray[np.datetime64], readings: NDArray[np.datetime64]) -> bool:
+    """Whether a log begins before nearly all readings and ends after nearly all of them, so that what it lacks are gaps inside it."""
+    return bool(np.mean((readings >= logged[0]) & (readings <= logged[-1])) >= _LEAST_COVERED)
+
+
+def _remedy(file: str, *, gaps: bool) -> str:
+    if gaps:
+        return f"Log without a break in the next test; what happened in the gaps of {file} is not known."
+    return (
+        f"Check the date, the clock and the time zone of {file} (write its times with their zone, or time_zone), or leave it out "
+        "of the campaign file."
+    )
 
 
 def _hours(late_s: float) -> str:

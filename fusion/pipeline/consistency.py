@@ -26,6 +26,7 @@ from fusion.consistency.registration import check_picture, check_registration
 from fusion.consistency.signs import check_signs
 from fusion.consistency.temperature import check_material
 from fusion.pipeline.radiometry import overridden_parameters
+from thermography.io.temperature_frames import TemperatureFrame
 
 
 def check_source(source: Inputs) -> list[Check]:
@@ -61,7 +62,11 @@ def check_source(source: Inputs) -> list[Check]:
     if isinstance(source, CameraInputs):
         checks += check_order(source.frames)
         checks += _phase(source) if isinstance(source, Source) else []
-        checks += check_frames(source.frames, overridden=set(overridden_parameters(source.thermography)))
+        stated, stack = set(overridden_parameters(source.thermography)), source.thermography.stack
+        # Temperatures whose emissivity is not stated are taken as they are: a notice of its own, and no doubt about a stored value.
+        if isinstance(source.frames[0], TemperatureFrame) and (stack is None or stack.emissivity is None):
+            stated.add("emissivity")
+        checks += check_frames(source.frames, overridden=stated)
     return checks
 
 

@@ -13,7 +13,7 @@ from fusion.products.notices import counted, left_out_notices
 from fusion.report.wording import join, moment, print_unit
 from fusion.starting.kinds import Kind, Recognised, is_displacement, is_temperature, is_time
 from interferometry.inspection import describe_test
-from interferometry.io.delimited import read_grids
+from interferometry.io.delimited import read_grids, read_table
 from interferometry.io.readers import read_deviations, read_environment
 from thermography.inspection import describe_stack, inspect_file
 from thermography.registration.lens import read_lens
@@ -65,6 +65,8 @@ def describe_file(found: Recognised) -> list[str]:
 
         regions = read_regions(path)
         return [f"{path}: {counted(len(regions), 'region')} of the plan: {join([region.name for region in regions])}"]
+    if found.kind is Kind.PLACES:
+        return _describe_places(path)
     if found.kind is Kind.LENS:
         lens = read_lens(path)
         column, row = lens.principal_point_px
@@ -138,6 +140,15 @@ def _describe_fiducials(path: Path) -> list[str]:
     return [
         f"{path}: fiducials, {join(counts)}, x {min(columns):g} to {max(columns):g} mm, y {min(rows):g} to {max(rows):g} mm",
         f"  {hints} with a rough place in the frame",
+    ]
+
+
+def _describe_places(path: Path) -> list[str]:
+    """Return the names of contact sensors with a place on the plan as lines."""
+    names = [fields["name"].strip() for _, fields in read_table(path, ("name",)).records() if fields is not None]
+    return [
+        f"{path}: places of {counted(len(names), 'contact sensor')} on the plan: {join(names)}",
+        "  [sensors] of a campaign file names it as places, beside the file of their temperatures",
     ]
 
 

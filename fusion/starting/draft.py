@@ -26,6 +26,16 @@ from thermography.registration.plan import Fiducial, read_fiducials
 _FILE = "campaign.toml"
 #: How places of the frames can be given.
 _PLACES = ("pixels", "fiducials")
+#: Heading of the files that the campaign file does not name.
+_NOT_USED = "# Files in this folder that are not used:"
+#: Kinds that no campaign reads.
+_NO_INPUT = (Kind.CAMPAIGN, Kind.RECIPE)
+#: What can be done with a file that is not used.
+_HINTS = {
+    Kind.DEVIATIONS: "; one campaign takes one file of deviations: join the tables of one test",
+    Kind.STACK: ", not mixed with the frames of a FLIR camera",
+    Kind.PLACES: ", for [sensors] beside [plan]: docs/reference/campaign-file.md",
+}
 #: Values above this are kelvins and no temperatures of a machine table in degC.
 _WARMEST_DEGC = 150.0
 
@@ -72,7 +82,7 @@ def write_campaign(folder: Path, asker: Asker) -> tuple[Path, list[str]]:
 
 
 def draft_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
-    """Yield the lines of a campaign file.
+    """Yield the lines of a campaign file, last the files of the folder that it does not name.
 
     Parameters
     ----------
@@ -86,6 +96,13 @@ def draft_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
     DraftError
         If the folder holds neither frames nor readings nor a record.
     """
+    lines = list(_used_lines(content, asker))
+    yield from lines
+    yield from _not_used(content, lines)
+
+
+def _used_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
+    """Yield what names and asks for everything that the campaign uses."""
     readings, records = content.of(Kind.DEVIATIONS), content.of(Kind.RECORD)
     if not (content.frames or readings or records):
         unknown = "; ".join(f"{content.relative(one.path)}: {one.reason}" for one in content.unknown[:3])
@@ -111,8 +128,34 @@ def draft_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
         yield from _drivers(content)
     else:
         yield from _record(content, records, asker)
-    if content.unknown:
-        yield from ("", "# Files in this folder that were not understood and are not used:")
+
+
+def unused_files(path: Path) -> list[str]:
+    """Return what a campaign file of `write_campaign` says of the files beside it that it does not name.
+
+    Parameters
+    ----------
+    path : Path
+        The campaign file.
+
+    Returns
+    -------
+    list of str
+        Name, and kind or why it is not understood, of each.
+    """
+    lines = path.read_text(encoding="utf-8").splitlines()
+    start = lines.index(_NOT_USED) + 1 if _NOT_USED in lines else len(lines)
+    return [line.removeprefix("#   ") for line in lines[start:]]
+
+
+def _not_used(content: FolderContent, lines: Sequence[str]) -> Iterator[str]:
+    """Yield as comments every file with measurements that no line names, and what was not understood."""
+    active = "\n".join(line for line in lines if not line.startswith("#"))
+    measured = [one for kind, files in content.files.items() if kind not in _NO_INPUT for one in files]
+    left = [one for one in measured if _quoted(content.relative(one.path)) not in active]
+    if left or content.unknown:
+        yield from ("", _NOT_USED)
+        yield from (f"#   {_plain(content.relative(one.path))}: {one.kind}{_HINTS.get(one.kind, '')}" for one in left)
         yield from (f"#   {_plain(content.relative(one.path))}: {_plain(one.reason)}" for one in content.unknown)
 
 

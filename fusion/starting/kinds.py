@@ -14,7 +14,7 @@ from fusion.campaign.quantities import unit_name
 from interferometry.errors import InterferometryError
 from interferometry.io.encodings import decode_text
 from interferometry.io.faults import LaserFormatError
-from interferometry.io.headings import CHINESE_WORDS
+from interferometry.io.headings import CHINESE_WORDS, read_heading
 from thermography.inspection import is_flir_file
 from thermography.io.flir import index_frames
 from thermography.io.frame_readers import find_reader
@@ -48,6 +48,7 @@ class Kind(StrEnum):
     ENVIRONMENT = "environment log"
     FIDUCIALS = "fiducials"
     REGIONS = "regions of the plan"
+    PLACES = "places of contact sensors"
     LENS = "lens calibration"
     DRIVERS = "log of drivers"
     RECORD = "record of temperatures and displacements"
@@ -107,6 +108,8 @@ def recognise(path: Path) -> Recognised:
     try:
         headings = _headings(text) if text is not None else _sheet_headings(path)
         kind = _by_headings(headings)
+        if kind is Kind.REGIONS and _names_each_once(path):
+            kind = Kind.PLACES
         if kind is None:
             kind = Kind.ENVIRONMENT if is_environment_log(path) else Kind.DEVIATIONS
         if kind is Kind.DEVIATIONS and not _holds_deviations(path):
@@ -156,14 +159,14 @@ def is_displacement(heading: str) -> bool:
 
 
 def is_time(heading: str) -> bool:
-    """Return whether a heading is that of the time: ``time``, or a column in units of time.
+    """Return whether a heading is that of the time: ``time`` or ``date`` in a language that is read, or a column in units of time.
 
     Parameters
     ----------
     heading : str
         Heading of a column.
     """
-    return heading.strip().lower() == "time" or column_unit(heading) in _TIME_UNITS
+    return read_heading(heading).role in ("time", "date") or column_unit(heading) in _TIME_UNITS
 
 
 def _holds_deviations(path: Path) -> bool:
@@ -239,6 +242,14 @@ def _by_headings(headings: tuple[str, ...]) -> Kind | None:
     if "time" in names and len(headings) > 1 and all(column_unit(name) for name in headings if name != "time"):
         return Kind.DRIVERS
     return None
+
+
+def _names_each_once(path: Path) -> bool:
+    """Whether every name of a table has one place, as that of a sensor; a region has a line for each of its corners."""
+    from interferometry.io.delimited import read_table
+
+    names = [fields["name"].strip() for _, fields in read_table(path, ("name",)).records() if fields is not None]
+    return len(names) > 1 and len(set(names)) == len(names)
 
 
 def _is_record(headings: tuple[str, ...]) -> bool:

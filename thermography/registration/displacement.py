@@ -56,6 +56,9 @@ _LEAST_OVERLAP = 0.3
 _IMAGE_SHIFT_U_PX = 0.1
 #: A disc shows on the monitor if its sum exceeds this many standard deviations of its noise.
 _LEAST_SIGNIFICANCE = 10
+#: Least share of the table that two images must both show for a shift between them to be accepted: less of it may fit by chance,
+#: as a row of discs on another row.
+_LEAST_COMMON = 0.5
 #: Least correlation of two images for a shift between them to be accepted.
 _LEAST_CORRELATION = 0.8
 #: Images are compared between these two widths of a Gaussian, px.
@@ -409,7 +412,7 @@ def image_displacement(reference: Array, temperature: Array, registration: Regis
     Returns
     -------
     (4,) ndarray, px
-        (column, row, 0, 0); NaN where the images correlate by less than 0.8.
+        (column, row, 0, 0); NaN where the images correlate by less than 0.8, or where both show less than half of the table.
 
     Notes
     -----
@@ -429,9 +432,20 @@ def image_displacement(reference: Array, temperature: Array, registration: Regis
         except cv2.error:
             # The iteration diverged: from here, the images have nothing in common.
             continue
-        if correlation >= _LEAST_CORRELATION:
-            return np.array([*-np.asarray(warp)[:, 2], 0.0, 0.0])
+        shift = -np.asarray(warp)[:, 2]
+        if correlation >= _LEAST_CORRELATION and _common_share(mask, shift) >= _LEAST_COMMON:
+            return np.array([*shift, 0.0, 0.0])
     return np.array(UNMEASURED)
+
+
+def _common_share(mask: NDArray[np.uint8], shift_px: Array) -> float:
+    """Share of the masked pixels that a shift (column, row) leaves inside the image."""
+    row, column = np.nonzero(mask)
+    rows, columns = mask.shape
+    inside = (np.abs(column + shift_px[0] - (columns - 1) / 2) <= columns / 2) & (
+        np.abs(row + shift_px[1] - (rows - 1) / 2) <= rows / 2
+    )
+    return float(np.mean(inside)) if inside.size else 0.0
 
 
 def _table_mask(registration: Registration, grid: PlanGrid) -> NDArray[np.uint8]:

@@ -10,7 +10,7 @@ import pytest
 
 from fusion.alignment.align import AlignmentError
 from fusion.campaign.config import load_campaign
-from fusion.campaign.inputs import SourceError, read_source
+from fusion.campaign.inputs import SourceError, frames_notices, read_source
 from fusion.pipeline.interferometry import evaluate_interferometry
 from tests.fusion.campaign_parts import without
 
@@ -75,7 +75,7 @@ def test_recordings_of_two_days_are_refused(copied: Path) -> None:
 def test_a_single_frame_is_not_enough(copied: Path) -> None:
     for frame in sorted((copied / "thermal").glob("*.jpg"))[1:]:
         frame.unlink()
-    message = r"1 usable frame, at least 2 are needed \(none rejected\); check thermography.frames"
+    message = r"1 usable frame, at least 2 are needed, as a rise is the change since the first \(none rejected\); check thermography.frames"
     with pytest.raises(SourceError, match=message):
         read_source(load_campaign(copied / "campaign.toml"))
 
@@ -119,3 +119,11 @@ def test_a_region_that_cannot_be_used_is_refused_before_the_long_work(copied: Pa
     path.write_text(path.read_text() + f'\n[[thermography.region]]\nname = "chuck"\n{lines}\n')
     with pytest.raises(SourceError, match=message):
         read_source(load_campaign(path))
+
+
+def test_a_frame_of_another_size_is_not_called_damaged() -> None:
+    other = {"file": "b.seq", "index": 0, "reason": "b.seq: 640 x 480 pixels among frames of 640 x 512"}
+    (notice,) = frames_notices([other])
+    assert notice.remedy == "Name the frames of one camera and one size only in thermography.frames."
+    (notice,) = frames_notices([other, {"file": "c.seq", "index": 0, "reason": "c.seq: cut off"}])
+    assert notice.remedy.startswith("Copy damaged files again")

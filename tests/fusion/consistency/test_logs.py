@@ -64,7 +64,11 @@ def test_a_log_with_a_long_gap_is_doubted() -> None:
     holed = whole.sel(
         time=(whole["time"] < START + np.timedelta64(3600, "s")) | (whole["time"] > START + np.timedelta64(7200, "s"))
     )
-    assert check(holed).value == pytest.approx(0.75, abs=0.01)
+    found = check(holed)
+    assert found.value == pytest.approx(0.75, abs=0.01)
+    # Its clock is right, so that nobody is sent to look at it.
+    assert found.evidence.endswith("; the others lie in gaps of the log.")
+    assert found.remedy.startswith("Log without a break") and "clock" not in found.remedy
 
 
 def test_what_was_not_logged_is_not_checked() -> None:

@@ -73,3 +73,17 @@ def test_a_picture_that_stays_is_no_doubt_and_one_that_moves_is(monkeypatch):
     assert not moved.passed and moved.value == pytest.approx(5.0, abs=0.5)
     other = shifts(monkeypatch, scene, rng.normal(20.0, 1.0, scene.shape))
     assert not other.passed and "in none of them is enough as in the first" in other.evidence
+
+
+def test_discs_in_rows_are_not_taken_for_a_shift_by_a_row(monkeypatch):
+    row, column = np.mgrid[:120, :160]
+    scene = np.full((120, 160), 22.0)
+    for y in (15, 100):
+        for x in (20, 140):
+            scene[(row - y) ** 2 + (column - x) ** 2 < 16] -= 3.0
+    # What warms between the discs is unlike the first picture; a shift by 85 px would leave a third of it, with one row on the other.
+    warm = 4.0 * np.exp(-((column - 80) ** 2 + (row - 60) ** 2) / 800.0)
+    rng = np.random.default_rng(5)
+    pictures = [scene + share * warm + rng.normal(scale=0.05, size=scene.shape) for share in np.linspace(0.0, 1.0, 8)]
+    check = shifts(monkeypatch, *pictures)
+    assert check.passed and check.value < 1.0

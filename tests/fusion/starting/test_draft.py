@@ -10,7 +10,7 @@ import pytest
 
 from fusion.campaign.config import load_campaign
 from fusion.starting.check import check_campaign
-from fusion.starting.draft import DraftError, draft_lines, write_campaign
+from fusion.starting.draft import DraftError, draft_lines, unused_files, write_campaign
 from fusion.starting.folder import scan_folder
 from fusion.starting.questions import Asker
 from thermography.io.flir import index_frames
@@ -169,7 +169,11 @@ def test_frames_of_another_camera_are_ready_with_their_times_from_the_names(copi
         frame.path.unlink()
     (copied / "campaign.toml").unlink()
     path, missing = write_campaign(copied, Asker(answering))
-    assert missing == [] and check_campaign(path).faults == ()
+    checked = check_campaign(path)
+    assert missing == [] and checked.faults == ()
+    # The emissivity that nobody stated is a notice, not an implausible stored value of 1.
+    assert "stack_emissivity_unknown" in {notice.code for notice in checked.notices}
+    assert "camera_parameters" not in {doubt.code for doubt in checked.doubts}
     written = load_campaign(path).thermography
     assert written is not None and written.stack is not None
     assert (written.frames, written.stack.unit) == (("thermal/*.npy",), "degC")
@@ -181,3 +185,16 @@ def test_what_frames_of_another_camera_do_not_tell_is_marked(tmp_path: Path) -> 
     text = "\n".join(draft_lines(scan_folder(tmp_path), Asker(None)))
     for line in ('frames = ["*.npy"]', 'scale = "FILL IN"', 'unit = "K"', 'start = "FILL IN"', 'interval = "FILL IN"'):
         assert f"\n{line}" in text
+
+
+def test_measured_files_that_the_campaign_does_not_take_are_told(tmp_path: Path) -> None:
+    heading = "cycle,direction,target,position_mm,time,deviation_um\n"
+    for name in ("run_1.csv", "run_2.csv"):
+        (tmp_path / name).write_text(f"{heading}1,+,1,0,2026-03-09T06:30:00Z,0.1\n1,+,2,50,2026-03-09T06:31:00Z,0.2\n")
+    (tmp_path / "places.csv").write_text("name,x_mm,y_mm\nT1,50,50\nT2,150,50\n")
+    (tmp_path / "notes.md").write_text("# Notes\n")
+    path, _ = write_campaign(tmp_path, Asker(None))
+    told = unused_files(path)
+    assert sorted(line.split(":")[0] for line in told) == ["notes.md", "places.csv", "run_2.csv"]
+    assert "run_2.csv: deviations; one campaign takes one file of deviations: join the tables of one test" in told
+    assert load_campaign(path).interferometry is not None

@@ -92,3 +92,21 @@ def test_frames_of_temperatures_are_recognised_as_arrays_and_as_text(tmp_path: P
     (tmp_path / "b.csv").write_text("\n".join(";".join(["20,1"] * 9) for _ in range(8)))
     assert [recognise(tmp_path / name).kind for name in ("a.npy", "b.csv")] == [Kind.STACK, Kind.STACK]
     assert "NumPy array, 1 frame of 9 x 8" in describe_file(recognise(tmp_path / "a.npy"))[0]
+
+
+@pytest.mark.parametrize("time", ["Datum", "Zeit", "fecha y hora", "时间", "Date"])
+def test_a_record_is_known_by_the_time_column_of_any_language(tmp_path: Path, time: str) -> None:
+    rows = "09.03.2026 06:30;20,5;0,25\n09.03.2026 06:31;20,6;0,35\n"
+    (tmp_path / "a.csv").write_text(f"{time};Lager [°C];Z [µm]\n{rows}", encoding="utf-8")
+    found = recognise(tmp_path / "a.csv")
+    assert found.kind is Kind.RECORD and f"time in the column {time}" in describe_file(found)[0]
+
+
+def test_places_of_sensors_are_no_corners_of_regions(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("name,x_mm,y_mm\nT1,50,50\nT2,150,50\n")
+    found = recognise(path)
+    assert found.kind is Kind.PLACES
+    assert describe_file(found)[0].endswith("places of 2 contact sensors on the plan: T1 and T2")
+    path.write_text("name,x_mm,y_mm\nmotor,0,0\nmotor,9,0\nmotor,9,9\n")
+    assert recognise(path).kind is Kind.REGIONS
