@@ -11,7 +11,6 @@ import os
 import re
 import shutil
 import time
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -28,6 +27,7 @@ import pooch
 from fusion.errors import FusionError
 from fusion.products.progress import Report, silent
 from fusion.products.store import write_json
+from fusion.toml_file import TomlError, read_toml
 from interferometry.errors import InterferometryError
 from thermography.errors import ThermographyError
 from thermography.io.atomic import write_atomically
@@ -215,8 +215,8 @@ def _checked(address: str) -> str:
 def _file_names(campaign: Path, address: str) -> list[str]:
     """Return the names and patterns of files in a campaign file."""
     try:
-        content = tomllib.loads(campaign.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        content, _ = read_toml(campaign)
+    except (TomlError, UnicodeDecodeError) as error:
         raise RemoteError(f"{address}: this is not TOML: {error}; see the campaign file in the README") from None
     names: list[str] = []
     for table, keys in FILE_KEYS.items():

@@ -101,7 +101,7 @@ def _read_provenance(results: Path) -> dict[str, Any]:
         raise ResultsError(f"{results}: holds no finished run; name a folder with results.json and provenance.json")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ResultsError(f"{path}: is not JSON ({error}); run the campaign again") from None
     if not isinstance(content, dict) or not all(isinstance(content.get(key), dict) for key in ("inputs", "versions")):
         raise ResultsError(f"{path}: is not the provenance of a run; run the campaign again")

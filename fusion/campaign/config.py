@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,6 +47,7 @@ from fusion.effects.effect import Effect
 from fusion.effects.library import library
 from fusion.effects.thermal import QUASI_STATIC
 from fusion.errors import FusionError
+from fusion.toml_file import TomlError, read_toml
 
 #: What a record may be declared with: every displacement a linear function of the temperatures.
 RECORD_EFFECTS = (QUASI_STATIC,)
@@ -630,14 +630,12 @@ def load_campaign(path: str | Path, *, effects: Mapping[str, Effect] | None = No
     if path.is_dir():
         raise CampaignError(f"{path} is a folder; name the campaign file in it, for example {path / 'campaign.toml'}")
     try:
-        text = path.read_text(encoding="utf-8")
+        content, text = read_toml(path)
     except FileNotFoundError:
         raise CampaignError(f"{path}: no such campaign file; check the name or give its full path") from None
     except UnicodeDecodeError as error:
         raise CampaignError(f"{path}: byte {error.start} is not UTF-8; save the campaign file as UTF-8 text") from None
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except TomlError as error:
         raise CampaignError(f"{path}: this is not TOML: {error}; see the campaign file in the README") from None
     lines = key_lines(text)
 

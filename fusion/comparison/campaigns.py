@@ -18,6 +18,7 @@ from fusion.products.grouped import group, has
 from fusion.products.results import Results, read_results
 from fusion.products.results_loop import AxisLoop, Coefficient
 from fusion.products.results_part import Quantity
+from fusion.products.store import told_if_damaged
 
 #: Level at which something counts as changed, over everything that is compared.
 LEVEL = 0.05
@@ -193,7 +194,7 @@ def _axis(folder: Path) -> str:
     try:
         noted = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
         return str(noted["parameters"]["campaign"].get("axis") or "")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return ""
 
 
@@ -201,7 +202,7 @@ def _drift(path: Path) -> xr.Dataset | None:
     """Return the joint estimate of deviations.nc with its positions, without what belongs to single readings."""
     if not path.is_file():
         return None
-    with xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as stored:
+    with told_if_damaged(path), xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as stored:
         if not has(stored, "drift"):
             return None
         drift = group(stored, "drift").assign(position=stored["position"])

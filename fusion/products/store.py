@@ -9,8 +9,8 @@ import hashlib
 import json
 import math
 import shutil
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -29,6 +29,10 @@ Product = TypeVar("Product", "xr.Dataset", "xr.DataTree")
 
 class OutputError(FusionError):
     """A results folder that cannot be written to; the message says what to do."""
+
+
+class DamagedProductError(FusionError):
+    """A product that is not what a run wrote; the message names the file and says what to do."""
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
@@ -160,10 +164,17 @@ def read_dataset(path: Path) -> xr.Dataset:
     ----------
     path : Path
         Product.
+
+    Raises
+    ------
+    DamagedProductError
+        If the file is no NetCDF, or only a part of one.
+    FileNotFoundError
+        If there is none.
     """
     import xarray as xr
 
-    with xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as dataset:
+    with told_if_damaged(path), xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as dataset:
         return dataset.load()
 
 
@@ -174,11 +185,42 @@ def read_tree(path: Path) -> xr.DataTree:
     ----------
     path : Path
         Product.
+
+    Raises
+    ------
+    DamagedProductError
+        If the file is no NetCDF, or only a part of one.
+    FileNotFoundError
+        If there is none.
     """
     import xarray as xr
 
-    with xr.open_datatree(path, engine="h5netcdf", decode_timedelta=False) as tree:
+    with told_if_damaged(path), xr.open_datatree(path, engine="h5netcdf", decode_timedelta=False) as tree:
         return tree.load()
+
+
+@contextmanager
+def told_if_damaged(path: Path) -> Iterator[None]:
+    """Name the file where reading a product fails.
+
+    Parameters
+    ----------
+    path : Path
+        Product that is read within.
+
+    Raises
+    ------
+    DamagedProductError
+        If the library of NetCDF cannot read it: HDF5 answers to damaged bytes with errors of several kinds, none of which names the file.
+    """
+    try:
+        yield
+    except (FileNotFoundError, IsADirectoryError, PermissionError):
+        raise
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
+        raise DamagedProductError(
+            f"{path}: is damaged or no product of thermofuse ({type(error).__name__}); run the campaign again"
+        ) from error
 
 
 def plain(value: Any) -> Any:

@@ -130,10 +130,22 @@ def report_of(folder: Path) -> str:
         raise ProductsError(
             f"{origin}: not JSON ({error}); run the campaign again, with --resume to keep what is finished"
         ) from None
+    if not _is_provenance(provenance):
+        raise ProductsError(
+            f"{origin}: not the provenance of a run; run the campaign again, with --resume to keep what is finished"
+        )
     there = {name: folder / f"{name}.nc" for name in _READERS if (folder / f"{name}.nc").is_file()}
     if isinstance(results.loop, RecordLoop):
         return render_report(results, provenance, {"record": read_dataset(there["fusion"])})
     return render_report(results, provenance, {name: _READERS[name](path) for name, path in there.items()})
+
+
+def _is_provenance(content: Any) -> bool:
+    """Whether JSON holds what a report tells of a run's origin: its inputs, versions and parameters."""
+    if not isinstance(content, dict):
+        return False
+    parts = [content.get(key) for key in ("inputs", "versions", "parameters")]
+    return all(isinstance(part, dict) for part in parts) and isinstance(content["parameters"].get("campaign"), dict)
 
 
 def _draw_charts(results: Results, datasets: Mapping[str, Any]) -> dict[str, Chart]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +11,7 @@ import numpy as np
 from fusion.products.notices import counted, left_out_notices
 from fusion.report.wording import join, moment, print_unit
 from fusion.starting.kinds import Kind, Recognised, is_displacement, is_temperature, is_time
+from fusion.toml_file import read_toml
 from interferometry.inspection import describe_test
 from interferometry.io.delimited import read_grids, read_table
 from interferometry.io.readers import read_deviations, read_environment
@@ -75,7 +75,7 @@ def describe_file(found: Recognised) -> list[str]:
         from fusion.campaign.config import load_campaign
 
         return _describe_campaign(load_campaign(path))
-    content = tomllib.loads(path.read_text(encoding="utf-8"))
+    content, _ = read_toml(path)
     title = content.get("campaign", {}).get("title", "")
     return [f"{path}: recipe of a simulation, {title}".rstrip(", "), f"  thermofuse simulate {path} --out FOLDER"]
 

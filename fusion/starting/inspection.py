@@ -132,7 +132,7 @@ def _files(paths: Sequence[Path]) -> list[Path]:
 
 def _is_thermal(path: Path) -> bool:
     try:
-        return is_flir_file(path)
+        return path.is_file() and is_flir_file(path)
     except OSError:
         return False
 
@@ -140,6 +140,8 @@ def _is_thermal(path: Path) -> bool:
 def _inspect(path: Path, *, named: bool) -> Inspected:
     """Look into one file."""
     kind = Kind.UNKNOWN
+    if path.exists() and not path.is_file():
+        return Inspected(str(path), Kind.UNREADABLE, fault="is a pipe, a socket or a device; name a file", named=named)
     try:
         found = recognise(path)
         kind = found.kind

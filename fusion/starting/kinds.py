@@ -5,12 +5,12 @@ from __future__ import annotations
 import codecs
 import csv
 import re
-import tomllib
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
 from fusion.campaign.quantities import unit_name
+from fusion.toml_file import TomlError, read_toml
 from interferometry.errors import InterferometryError
 from interferometry.io.encodings import decode_text
 from interferometry.io.faults import LaserFormatError
@@ -191,8 +191,8 @@ def _shortened(reason: str) -> str:
 def _toml(path: Path) -> Recognised:
     """Tell campaign files from recipes by their tables."""
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        content, _ = read_toml(path)
+    except (TomlError, UnicodeDecodeError) as error:
         return Recognised(path, Kind.UNKNOWN, f"this is not TOML: {error}")
     if any(name in content for name in _RECIPE):
         return Recognised(path, Kind.RECIPE)

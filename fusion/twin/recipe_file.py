@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import json
 import math
-import tomllib
 from collections.abc import Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any, get_args, get_type_hints
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
+from fusion.toml_file import TomlError, read_toml
 from fusion.twin.machine.effects import EFFECTS
 from fusion.twin.machine.recipe import EffectRecipe, Recipe, RecipeError
 
@@ -51,12 +51,12 @@ def read_recipe(path: Path) -> Recipe:
         The file is missing, is not TOML, or holds an unknown key or a value that no machine can have.
     """
     try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        content, _ = read_toml(Path(path))
     except OSError as error:
         raise RecipeError(f"{path}: cannot be read ({error.strerror}); name an existing RECIPE.toml") from error
     except UnicodeDecodeError as error:
         raise RecipeError(f"{path}: byte {error.start} is not UTF-8; save the recipe as UTF-8 text") from error
-    except tomllib.TOMLDecodeError as error:
+    except TomlError as error:
         raise RecipeError(f"{path}: is not TOML ({error}); correct the line that the message names") from error
     try:
         # As JSON, in which strict types take a list for a tuple and a table for a dataclass, but no text for a number.

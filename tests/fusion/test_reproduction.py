@@ -86,6 +86,7 @@ def test_a_folder_without_a_run_or_its_campaign_is_refused(finished: Path, tmp_p
     elsewhere = shutil.copytree(finished, tmp_path / "elsewhere" / "results")
     with pytest.raises(ResultsError, match="name it with --campaign"):
         reproduce(elsewhere)
-    (elsewhere / "provenance.json").write_text("{")
-    with pytest.raises(ResultsError, match=r"provenance\.json: is not JSON"):
-        reproduce(elsewhere)
+    for text in ("{", "[" * 100_000):
+        (elsewhere / "provenance.json").write_text(text)
+        with pytest.raises(ResultsError, match=r"provenance\.json: is not JSON"):
+            reproduce(elsewhere)

@@ -73,6 +73,8 @@ def read_test(path: Path, cycles: str | None) -> StandardTest:
     """
     if path.is_dir():
         return _of_results(path, cycles)
+    if path.exists() and not path.is_file():
+        raise CampaignError(f"{path}: is a pipe, a socket or a device; name a file")
     if path.suffix == ".toml":
         campaign = load_campaign(path)
         if campaign.interferometry is None:

@@ -28,6 +28,8 @@ Rows = list[tuple[int, list[str]]]
 _CONTEXT_CYCLES = 2
 #: Beginnings of files that have no lines of bytes: spreadsheets, UTF-16.
 _NO_LINES = (b"PK", b"\xd0\xcf", b"\xff\xfe", b"\xfe\xff")
+#: End of what was read, by which a file that was begun anew is recognised, bytes.
+_COMPARED_BYTES = 4096
 #: A file that can only be read as a whole is read during at most this share of the time.
 _READING_SHARE = 0.1
 
@@ -73,6 +75,7 @@ class ArrivingReadings:
     _lines: int = 0
     _delimiter: str = ""
     _head: bytes = b""
+    _before: bytes = b""
     _header: Rows = field(default_factory=list)
     _context: Rows = field(default_factory=list)
     _context_cycles: set[int] = field(default_factory=set)
@@ -107,13 +110,20 @@ class ArrivingReadings:
                 faults=self._new([f"{self.path}: has become shorter; watch the test anew if it was begun anew"])
             )
         with self.path.open("rb") as file:
-            file.seek(self._offset)
-            content = file.read()
+            file.seek(self._offset - len(self._before))
+            before, content = file.read(len(self._before)), file.read()
+        if before != self._before:
+            return Arrived(
+                faults=self._new(
+                    [f"{self.path}: lines that were read stand there no more, it was begun anew; watch the test anew"]
+                )
+            )
         end = len(content) if final else content.rfind(b"\n") + 1
         if not self._header:
             return self._begin(content[:end], final=final)
         self._pending += self._rows(content[:end])
         self._offset += end
+        self._before = (self._before + content[:end])[-_COMPARED_BYTES:]
         return self._evaluate(final=final)
 
     def _begin(self, content: bytes, *, final: bool) -> Arrived:
@@ -131,6 +141,7 @@ class ArrivingReadings:
         # Marks of the encoding stand at the beginning.
         self._head = content[: content.find(b"\n") + 1]
         self._lines, self._offset = content.count(b"\n"), len(content)
+        self._before = content[-_COMPARED_BYTES:]
         return self._evaluate(final=final)
 
     def _find_table(self, content: bytes) -> LongTable | None:

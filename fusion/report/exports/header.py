@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fusion.products.results import Results
-from fusion.products.store import file_sha256
+from fusion.products.store import DamagedProductError, file_sha256
 from fusion.report.exports.thermal_state import ThermalState
 
 _NOT_STATED = "not stated"
@@ -127,7 +127,12 @@ def _parameters(path: Path) -> Mapping[str, Any]:
     """Return the campaign as the provenance of a run states it; empty where the file is absent."""
     if not path.is_file():
         return {}
-    return dict(json.loads(path.read_text(encoding="utf-8")).get("parameters", {}))
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")).get("parameters", {}))
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise DamagedProductError(
+            f"{path}: is damaged or no product of thermofuse ({type(error).__name__}); run the campaign again"
+        ) from None
 
 
 def _one_line(text: str) -> str:

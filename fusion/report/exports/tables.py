@@ -10,7 +10,7 @@ import xarray as xr
 
 from fusion.products.grouped import group, has
 from fusion.products.results import Results
-from fusion.products.store import read_dataset
+from fusion.products.store import read_dataset, told_if_damaged
 from fusion.report.findings import quoted_window
 from interferometry import iso230
 from thermography.fields.cycle_fields import plan_unit
@@ -135,7 +135,7 @@ def fields_megabytes(folder: Path) -> float | None:
     path = folder / "fields.nc"
     if not path.is_file():
         return None
-    with xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as fields:
+    with told_if_damaged(path), xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as fields:
         return fields["temperature"].size * _FIELD_ROW_BYTES / 1e6
 
 

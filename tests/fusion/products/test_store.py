@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,6 +13,7 @@ import pytest
 import xarray as xr
 
 from fusion.products.store import (
+    DamagedProductError,
     OutputError,
     StageStamps,
     digest,
@@ -20,6 +22,7 @@ from fusion.products.store import (
     noted_messages,
     plain,
     read_dataset,
+    read_tree,
     write_atomically,
     write_dataset,
     write_json,
@@ -89,6 +92,23 @@ def test_datasets_come_back_equal(tmp_path: Path, rng: np.random.Generator) -> N
         attrs={"title": "A"},
     )
     xr.testing.assert_identical(read_dataset(write_dataset(tmp_path / "x.nc", dataset)), dataset)
+
+
+@pytest.mark.parametrize("read", [read_dataset, read_tree])
+@pytest.mark.parametrize(
+    "damage", [lambda whole: b"", lambda whole: whole[: len(whole) // 2], lambda whole: b"[" * 5_000]
+)
+def test_a_damaged_product_is_named(
+    tmp_path: Path, read: Callable[[Path], object], damage: Callable[[bytes], bytes]
+) -> None:
+    path = write_dataset(tmp_path / "x.nc", xr.Dataset({"rise": ("x", np.arange(1_000.0))}))
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(
+        DamagedProductError, match=r"x\.nc: is damaged or no product of thermofuse .*run the campaign again"
+    ):
+        read(path)
+    with pytest.raises(FileNotFoundError):
+        read(tmp_path / "absent.nc")
 
 
 def test_a_stage_is_done_only_for_the_same_input_and_untouched_files(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 from fusion.starting.inspection import inspect_paths, write_thumbnails
@@ -50,3 +51,10 @@ def test_thumbnails_of_the_same_name_are_kept_apart(campaign_folder: Path, tmp_p
     (tmp_path / "a" / "damaged.jpg").write_bytes(frame.read_bytes()[:300])
     written = list(write_thumbnails([tmp_path / "a", tmp_path / "b"], tmp_path / "out"))
     assert [path.name for path in written] == ["x.jpg.png", "b_x.jpg.png"]
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    pipe = tmp_path / "x.jpg"
+    os.mkfifo(pipe)
+    (found,) = inspect_paths([pipe])
+    assert found.kind is Kind.UNREADABLE and found.fails and "name a file" in found.fault

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -81,3 +82,10 @@ def test_a_window_of_cycles_is_read() -> None:
         read_window("4-2", deviations)
     with pytest.raises(CampaignError, match="were not measured; there are 1 to 8"):
         read_window("7-9", deviations)
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    pipe = tmp_path / "laser.csv"
+    os.mkfifo(pipe)
+    with pytest.raises(CampaignError, match=r"laser\.csv: is a pipe, a socket or a device; name a file"):
+        read_test(pipe, None)

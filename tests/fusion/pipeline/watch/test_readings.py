@@ -150,3 +150,18 @@ def test_a_file_that_is_begun_anew_is_told(tmp_path: Path) -> None:
     laser.poll()
     write(path, lines(range(1)))
     assert laser.poll().faults == (f"{path}: has become shorter; watch the test anew if it was begun anew",)
+
+
+@pytest.mark.parametrize("cycles", [3, 4, 9], ids=["first shorter", "as long", "longer at once"])
+def test_readings_of_a_test_begun_anew_are_not_mixed_with_those_before(tmp_path: Path, cycles: int) -> None:
+    """Lines of the new test follow where the old one ended: without the check they would be shown as one test."""
+    path = tmp_path / "laser.csv"
+    laser = ArrivingReadings(path)
+    write(path, lines(range(4)))
+    assert laser.poll().cycles is not None
+    write(path, lines(range(cycles), zero=0.5))
+    arrived = [laser.poll()]
+    write(path, lines(range(12), zero=0.5))
+    arrived += [laser.poll(), laser.poll(final=True)]
+    assert all(one.cycles is None for one in arrived)
+    assert "was begun anew" in "".join(fault for one in arrived for fault in one.faults)

@@ -1,0 +1,42 @@
+"""TOML of others: a table, or one fault."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fusion.campaign.config import CampaignError, load_campaign
+from fusion.starting.kinds import Kind, recognise
+from fusion.toml_file import TomlError, read_toml
+from fusion.twin.recipe_file import RecipeError, read_recipe
+
+
+def test_the_tables_and_the_text(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_bytes(b"[campaign]\r\ntitle = 'X'\r\n")
+    assert read_toml(path) == ({"campaign": {"title": "X"}}, "[campaign]\ntitle = 'X'\n")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("x = ", "Invalid value"),
+        ("x = " + "[" * 100_000, "brackets stand in brackets too many times"),
+        ("x = " + "{a=" * 20_000, "brackets stand in brackets too many times"),
+        ("x = " + "9" * 6_000, "Exceeds the limit"),
+        ("#" * 2_000_000, "longer than 1 MB"),
+    ],
+    ids=["no value", "lists", "tables", "digits", "length"],
+)
+def test_whatever_stands_in_it_is_one_fault_with_the_file(tmp_path: Path, text: str, reason: str) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text(text)
+    with pytest.raises(TomlError, match=reason):
+        read_toml(path)
+    with pytest.raises(CampaignError, match=rf"a\.toml: this is not TOML: .*{reason}"):
+        load_campaign(path)
+    with pytest.raises(RecipeError, match=rf"a\.toml: is not TOML \(.*{reason}"):
+        read_recipe(path)
+    found = recognise(path)
+    assert found.kind is Kind.UNKNOWN and reason in found.reason
