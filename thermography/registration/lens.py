@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
-import cv2
 import numpy as np
+import yaml
 
 from thermography._typing import Array
 from thermography.errors import ThermographyError
@@ -16,8 +19,10 @@ _MATRIX_NAMES = ("camera_matrix", "cameraMatrix", "K")
 _COEFFICIENT_NAMES = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "D")
 #: Largest relative difference of the focal lengths along columns and rows: the pixels of a sensor are square.
 _SQUARE = 0.01
-#: A calibration is a few pages of text: OpenCV's parser overruns its memory on longer lines.
-_MOST_BYTES, _MOST_COLUMNS = 1_000_000, 20_000
+#: A calibration is a page of text, with the views that it was made from a hundred.
+_MOST_BYTES = 200_000
+#: Most numbers of an entry, and lists within lists: far more than a calibration has.
+_MOST_NUMBERS, _MOST_DEPTH = 1_000, 5
 
 
 class LensError(ThermographyError):
@@ -71,25 +76,10 @@ def read_lens(path: str | Path) -> Lens:
     OpenCV documentation, "Camera calibration with OpenCV" (the entries), "Camera Calibration and 3D Reconstruction" (the model).
     """
     path = Path(path)
-    _refuse_what_is_no_text(path)
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except (cv2.error, SystemError) as error:
-        raise LensError(
-            f"{path}: not a file of cv2.FileStorage; write the calibration as OpenCV's YAML, XML or JSON"
-        ) from error
-    if not storage.isOpened():
-        raise LensError(
-            f"{path}: cannot be opened as a file of cv2.FileStorage; write it as OpenCV's YAML, XML or JSON"
-        )
-    try:
-        matrix = _entry(storage, path, _MATRIX_NAMES, 9).reshape(3, 3)
-        coefficients = _entry(storage, path, _COEFFICIENT_NAMES, None).ravel()
-        size = _size(storage)
-    except (cv2.error, OverflowError, ValueError, RecursionError) as error:
-        raise LensError(f"{path}: an entry is damaged ({error}); write the calibration again") from None
-    finally:
-        storage.release()
+    entries = _read_entries(path)
+    matrix = _entry(entries, path, _MATRIX_NAMES, 9).reshape(3, 3)
+    coefficients = _entry(entries, path, _COEFFICIENT_NAMES, None)
+    size = _size(entries, path)
     along, across = float(matrix[0, 0]), float(matrix[1, 1])
     if not (np.isfinite(matrix).all() and min(along, across) > 0 and abs(along / across - 1) < _SQUARE):
         raise LensError(
@@ -105,40 +95,85 @@ def read_lens(path: str | Path) -> Lens:
     return Lens(float(np.sqrt(along * across)), (float(matrix[0, 2]), float(matrix[1, 2])), (k1, k2, p1, p2), size)
 
 
-def _refuse_what_is_no_text(path: Path) -> None:
-    """Refuse what no calibration looks like: OpenCV's parser does not survive every file."""
+class _MatrixLoader(yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader):  # type: ignore[misc]
+    """Builds plain values only; a matrix of OpenCV is a mapping."""
+
+
+_MatrixLoader.add_constructor(
+    "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
+)
+
+
+def _read_entries(path: Path) -> dict[str, Any]:
+    """Names and values of a file. OpenCV's own parser ends the process on some damaged files."""
     content = path.read_bytes() if path.stat().st_size <= _MOST_BYTES else b""
-    if not content or max(map(len, content.splitlines())) > _MOST_COLUMNS or b"\0" in content:
+    if not content or b"\0" in content or b"<!DOCTYPE" in content:
         raise LensError(
-            f"{path}: no calibration: plain text is expected, at most {_MOST_BYTES} bytes in lines of {_MOST_COLUMNS} characters; "
-            "write it as OpenCV's YAML, XML or JSON"
+            f"{path}: no calibration: plain text of at most {_MOST_BYTES} bytes is expected; write it as OpenCV's YAML, XML or JSON"
         )
+    try:
+        text = content.decode().lstrip()
+        if text.startswith("<"):
+            entries = {child.tag: _plain(child) for child in ElementTree.fromstring(text)}
+        elif text.startswith("{"):
+            entries = json.loads(text)
+        else:
+            # OpenCV writes the version of YAML as no other does.
+            entries = yaml.load(text.removeprefix("%YAML:1.0"), _MatrixLoader)
+    except (ValueError, TypeError, RecursionError, yaml.YAMLError, ElementTree.ParseError) as error:
+        raise LensError(
+            f"{path}: cannot be parsed ({error}); write the calibration as OpenCV's YAML, XML or JSON"
+        ) from None
+    if not isinstance(entries, dict):
+        raise LensError(f"{path}: holds no named entries; write the calibration as OpenCV's YAML, XML or JSON")
+    return entries
 
 
-def _size(storage: cv2.FileStorage) -> tuple[int, int] | None:
+def _plain(element: ElementTree.Element) -> Any:
+    """Value of an XML element: a mapping of its children, or the words of its text."""
+    if len(element):
+        return {child.tag: _plain(child) for child in element}
+    return (element.text or "").split()
+
+
+def _size(entries: dict[str, Any], path: Path) -> tuple[int, int] | None:
     """Width and height of the frames of the calibration, px; None where they are not given."""
-    width, height = (storage.getNode(name) for name in ("image_width", "image_height"))
-    return None if width.empty() or height.empty() else (int(width.real()), int(height.real()))
+    if not {"image_width", "image_height"} <= entries.keys():
+        return None
+    width, height = (_entry(entries, path, (name,), 1)[0] for name in ("image_width", "image_height"))
+    if not (1 <= width <= 1e6 and 1 <= height <= 1e6):
+        raise LensError(
+            f"{path}: image_width {width:g} and image_height {height:g} px are no size of a frame; correct them"
+        )
+    return int(width), int(height)
 
 
-def _entry(storage: cv2.FileStorage, path: Path, names: tuple[str, ...], count: int | None) -> Array:
-    """The first entry of these names that the file holds, as numbers."""
-    for name in names:
-        node = storage.getNode(name)
-        if node.empty():
-            continue
-        values = _numbers(node)
-        if count is None or values.size == count:
-            return values
+def _entry(entries: dict[str, Any], path: Path, names: tuple[str, ...], count: int | None) -> Array:
+    """The first entry of these names that the file holds, as numbers (n,)."""
+    name = next((name for name in names if name in entries), None)
+    if name is None:
+        raise LensError(f"{path}: no entry {names[0]}; write the calibration as OpenCV's samples do")
+    try:
+        values = np.array(_numbers(entries[name]), float)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise LensError(f"{path}: {name} is damaged ({error}); write the calibration again") from None
+    if count is not None and values.size != count:
         raise LensError(f"{path}: {name} holds {values.size} numbers instead of {count}")
-    raise LensError(f"{path}: no entry {names[0]}; write the calibration as OpenCV's samples do")
+    return values
 
 
-def _numbers(node: cv2.FileNode) -> Array:
-    """All numbers of a node: a matrix, or lists of lists."""
-    if node.isMap():
-        matrix = node.mat()
-        return np.asarray([] if matrix is None else matrix, float)
-    if node.isSeq():
-        return np.concatenate([_numbers(node.at(i)) for i in range(node.size())] or [np.empty(0)])
-    return np.array([node.real()])
+def _numbers(value: Any, depth: int = 0) -> list[float]:
+    """All numbers of a value: a matrix of OpenCV, lists of lists, or one number."""
+    if isinstance(value, dict):
+        rows, columns, numbers = (_numbers(value.get(key, []), depth + 1) for key in ("rows", "cols", "data"))
+        if len(rows) != 1 or len(columns) != 1 or rows[0] * columns[0] != len(numbers):
+            raise ValueError(f"{len(numbers)} numbers do not fill its rows and columns")
+        return numbers
+    if not isinstance(value, list):
+        return [float(value)]
+    numbers = []
+    for one in value if depth < _MOST_DEPTH else ():
+        numbers += _numbers(one, depth + 1)
+        if len(numbers) > _MOST_NUMBERS:
+            raise ValueError(f"more than {_MOST_NUMBERS} numbers")
+    return numbers

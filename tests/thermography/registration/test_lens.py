@@ -48,11 +48,18 @@ def test_faults_are_named(tmp_path, changed, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("hello", "not a file of cv2.FileStorage|cannot be opened"),
+        ("hello", "holds no named entries"),
+        ("%YAML:1.0\n---\nK: [1,\n", "cannot be parsed"),
+        ("<opencv_storage><K>1 2", "cannot be parsed"),
+        ('<!DOCTYPE x [<!ENTITY a "b">]><x/>', "no calibration: plain text"),
+        ("K: &a [1, *a]\n", "recursive|is damaged|holds"),
         ('{"a": 1}', "no entry camera_matrix"),
-        ("", "no calibration: plain text is expected"),
-        ('{"K": "' + "A" * 30_000 + '"}', "no calibration: plain text is expected"),
-        ("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   data: [ 1. ]\n", "an entry is damaged"),
+        ("", "no calibration: plain text of at most"),
+        ('{"K": "' + "A" * 600_000 + '"}', "no calibration: plain text of at most"),
+        (
+            "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   data: [ 1. ]\n",
+            "camera_matrix is damaged .1 numbers do not fill",
+        ),
     ],
 )
 def test_other_files_are_refused(tmp_path, text, message):

@@ -54,8 +54,8 @@ def test_a_cycle_and_a_position_are_shown_everywhere_by_keyboard(page: Any) -> N
 
 
 def test_places_are_added_by_keyboard_and_by_click(page: Any) -> None:
-    page.get_by_label("x / mm").fill("300")
-    page.get_by_label("x / mm").press("Enter")
+    page.get_by_role("textbox", name="x / mm").fill("300")
+    page.get_by_role("textbox", name="x / mm").press("Enter")
     page.get_by_role("button", name="Add place").press("Enter")
     page.get_by_text("over time. x 300 mm").wait_for()
     page.locator(".bk-Figure:visible").first.click(position={"x": 220, "y": 130})
