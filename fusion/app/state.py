@@ -6,6 +6,8 @@ from pathlib import Path
 
 import param
 
+from fusion.app.run.process import RUNS
+
 
 class State(param.Parameterized):
     """Choices of one page; a screen watches those that it shows.
@@ -42,13 +44,14 @@ def state_of(root: Path) -> State:
     Returns
     -------
     State
-        With the campaign file and the results that lie in the folder itself.
+        With the campaign file and the results of the run that was started last, from whatever page; before the first one with those that
+        lie in the folder itself.
     """
-    top = root.resolve()
-    campaign, results = top / "campaign.toml", top / "results"
+    top, run = root.resolve(), RUNS.latest
+    campaign, results = (run.campaign, run.results) if run else (top / "campaign.toml", top / "results")
     return State(
         root=top,
-        folder=top,
+        folder=campaign.parent,
         campaign=campaign if campaign.is_file() else None,
         results=results if (results / "results.json").is_file() else None,
     )

@@ -24,6 +24,8 @@ from thermography.io.temperature_frames import StackOptions, TemperatureReader
 from thermography.registration.plan import Fiducial, read_fiducials
 
 _FILE = "campaign.toml"
+#: Beginning of a drafted file, by which its examples in comments are told from comments that somebody wrote.
+DRAFTED = "# Written by thermofuse init."
 #: How places of the frames can be given.
 _PLACES = ("pixels", "fiducials")
 #: Heading of the files that the campaign file does not name.
@@ -110,7 +112,7 @@ def _used_lines(content: FolderContent, asker: Asker) -> Iterator[str]:
             f"{content.folder}: neither thermal frames nor deviations nor a record of temperatures and displacements in it"
             + (f" ({unknown})" if unknown else "; name the folder that holds the files of the measurement")
         )
-    yield "# Written by thermofuse init. Every quantity carries its unit in the value; paths start from the folder of this file."
+    yield f"{DRAFTED} Every quantity carries its unit in the value; paths start from the folder of this file."
     yield f'# A line with "{TO_FILL}" has to be completed; thermofuse check {_FILE} says what is still missing.'
     yield ""
     yield "[campaign]"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.products.grouped import group, has
-from fusion.products.results import RecordLoop, Results, read_results
+from fusion.products.results import RecordLoop, Results, ResultsError, read_results
 from fusion.products.store import read_dataset
 from fusion.report.charts.thermal_map import LAYERS, Layer, scale_of
 
@@ -55,20 +56,20 @@ class Products:
         path = self.folder / "provenance.json"
         try:
             return dict(json.loads(path.read_text(encoding="utf-8")))
-        except (OSError, ValueError):
+        except (OSError, ValueError, TypeError):
             return {}
 
     @cached_property
     def fields(self) -> xr.Dataset | None:
         """fields.nc, opened and not read; None without a camera."""
         path = self.folder / "fields.nc"
-        return xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False, cache=False) if path.is_file() else None
+        return _opened(path, lambda: xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False, cache=False))
 
     @cached_property
     def deviations(self) -> xr.Dataset | None:
         """Content of deviations.nc; None without a laser."""
         path = self.folder / "deviations.nc"
-        return read_dataset(path) if path.is_file() else None
+        return _opened(path, lambda: read_dataset(path))
 
     @cached_property
     def drift(self) -> xr.Dataset | None:
@@ -80,7 +81,7 @@ class Products:
     def fusion(self) -> xr.Dataset | None:
         """Root of fusion.nc; None where a run has none."""
         path = self.folder / "fusion.nc"
-        return read_dataset(path) if path.is_file() else None
+        return _opened(path, lambda: read_dataset(path))
 
     @cached_property
     def loop(self) -> xr.Dataset | None:
@@ -154,6 +155,16 @@ class Products:
             read = self.deviations["time"].values
             start = read[~np.isnat(read)].min() if not np.isnat(read).all() else start
         return np.asarray((self.fields["cycle_time"].values - start) / np.timedelta64(1, "h"), float)
+
+
+def _opened(path: Path, read: Callable[[], xr.Dataset]) -> xr.Dataset | None:
+    """Return a product, None where the run has none; a damaged one is refused with its name."""
+    if not path.is_file():
+        return None
+    try:
+        return read()
+    except (OSError, ValueError, KeyError) as error:
+        raise ResultsError(f"{path}: it cannot be read ({error}); run the campaign again") from None
 
 
 def _within(cells: np.ndarray, at: float, size: float) -> slice:

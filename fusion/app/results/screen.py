@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import panel as pn
@@ -74,11 +75,9 @@ class ResultsScreen:
             ]
             return
         try:
-            products = Products(folder)
+            self._content[:] = self._parts(Products(folder))
         except FusionError as error:
             self._content[:] = [paragraph(str(error), kind="fault")]
-            return
-        self._content[:] = self._parts(products)
 
     def _parts(self, products: Products) -> list[pn.viewable.Viewable]:
         """The title, what is chosen, and the parts of the screen."""
@@ -107,7 +106,7 @@ class ResultsScreen:
 
         def choose(name: str) -> None:
             if name not in built:
-                built[name] = pn.Column(*builders[name](), sizing_mode="stretch_width")
+                built[name] = pn.Column(*_or_fault(builders[name]), sizing_mode="stretch_width")
                 part.append(built[name])
             # A chart that is taken out of a page no longer hears clicks when it comes back: the other parts are hidden.
             for other, column in built.items():
@@ -123,6 +122,14 @@ class ResultsScreen:
         if (products.folder / "report.html").is_file():
             lead.append(link("Open the report", report_link(self._state.root, products.folder)))
         return [*lead, *_chosen(selection, targets), chooser, part]
+
+
+def _or_fault(build: Callable[[], list[pn.viewable.Viewable]]) -> list[pn.viewable.Viewable]:
+    """Return a part of the screen; where its product is damaged, the reason: the other parts are shown all the same."""
+    try:
+        return build()
+    except FusionError as error:
+        return [paragraph(str(error), kind="fault")]
 
 
 def _chosen(selection: Selection, targets: list[tuple[int, float]]) -> list[pn.viewable.Viewable]:

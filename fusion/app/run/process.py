@@ -148,6 +148,11 @@ class Runs:
         """
         return self._runs.get(results)
 
+    @property
+    def latest(self) -> RunProcess | None:
+        """The run that was started last, None before the first: a page that opens shows it."""
+        return next(reversed(self._runs.values()), None)
+
     def start(self, campaign: Path, results: Path) -> RunProcess:
         """Start a run, or continue the one that is in the folder.
 
@@ -167,6 +172,7 @@ class Runs:
             known = self._runs.get(results)
             if known is not None and known.runs:
                 raise RunError(f"{results} is in use by a run of another page; wait until it ends, or cancel it")
+            self._runs.pop(results, None)
             self._runs[results] = RunProcess(campaign, results)
             return self._runs[results]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from html import escape
 from pathlib import Path
 
@@ -66,7 +67,9 @@ class RunScreen:
         self._taken = campaign
         folder = self._state.folder or self._state.root
         chosen = campaign or folder / "campaign.toml"
-        self._campaign.value, self._results.value = str(chosen), str(chosen.parent / "results")
+        run = RUNS.latest
+        beside = run.results if run is not None and run.campaign == chosen else chosen.parent / "results"
+        self._campaign.value, self._results.value = str(chosen), str(beside)
         self.update()
 
     def _places(self) -> tuple[Path, Path]:
@@ -75,6 +78,11 @@ class RunScreen:
         results = place_within(self._state.root, self._results.value)
         if not campaign.is_file():
             raise PlaceError(f"{campaign}: no such file; the screen Set up writes it")
+        other = campaign_of(results)
+        if other is not None and other.parent != campaign.parent:
+            raise PlaceError(
+                f"{results} holds the results of {other}; name another results folder, they would be replaced"
+            )
         return campaign, results
 
     def _on_start(self, event: object) -> None:
@@ -147,6 +155,22 @@ class RunScreen:
 
     def _report_of(self, results: Path) -> list[pn.viewable.Viewable]:
         return [link("Open the report", report_link(self._state.root, results))]
+
+
+def campaign_of(results: Path) -> Path | None:
+    """Return the campaign file of a finished run; None where it is not noted, or is no longer there.
+
+    Parameters
+    ----------
+    results : Path
+        Results folder; it may be absent.
+    """
+    try:
+        noted = json.loads((results / "provenance.json").read_text(encoding="utf-8"))["campaign_file"]
+        campaign = (results / noted).resolve()
+        return campaign if campaign.is_file() else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def stages_markup(run: RunProcess) -> str:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import Array
 
 from fusion.errors import FusionError
-from fusion.products.store import write_text
-from fusion.starting.draft import draft_lines
+from fusion.products.store import write_atomically
+from fusion.starting.draft import DRAFTED, draft_lines
 from fusion.starting.folder import scan_folder
 from fusion.starting.questions import TO_FILL, Asker
 
@@ -72,6 +73,11 @@ class CampaignText:
         ----------
         values : mapping
             New values by key; None takes the key away where it is written. A list of dict is an array of tables.
+
+        Raises
+        ------
+        CampaignTextError
+            If the file has a single value under the name of a table.
         """
         text = self.text
         for (*tables, name), value in values.items():
@@ -86,6 +92,10 @@ class CampaignText:
                         break
                     table[each] = tomlkit.table()
                 table = table[each]
+                if not isinstance(table, MutableMapping):
+                    raise CampaignTextError(
+                        f"{self.path}: {each} is no table; write [{'.'.join(tables)}] above its keys in an editor"
+                    )
             else:
                 _set(table, name, value)
         return CampaignText(self.path, tomlkit.dumps(document), self.saved)
@@ -98,7 +108,7 @@ class CampaignText:
         CampaignTextError
             If somebody else has changed the file since it was opened.
         """
-        present = self.path.read_text(encoding="utf-8") if self.path.exists() else None
+        present = _read(self.path) if self.path.exists() else None
         if present != self.saved:
             raise CampaignTextError(
                 f"{self.path} was changed by another page or program since it was opened here; look into the folder again to see its values"
@@ -106,9 +116,11 @@ class CampaignText:
         if present == self.text:
             return self
         if present is not None:
-            write_text(self.path.with_name(_BEFORE), present)
-        write_text(self.path, self.text)
-        return CampaignText(self.path, self.text, self.text)
+            _write(self.path.with_name(_BEFORE), present)
+        # New lines end as those of the file do.
+        text = self.text.replace("\r\n", "\n").replace("\n", "\r\n") if "\r\n" in (present or "") else self.text
+        _write(self.path, text)
+        return CampaignText(self.path, text, text)
 
 
 def open_campaign(folder: Path) -> CampaignText:
@@ -130,7 +142,7 @@ def open_campaign(folder: Path) -> CampaignText:
     if not path.exists():
         return CampaignText(path, "\n".join(draft_lines(scan_folder(folder), Asker(None))) + "\n", None)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = _read(path)
         tomllib.loads(text)
         tomlkit.parse(text)
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, TOMLKitError) as error:
@@ -140,8 +152,22 @@ def open_campaign(folder: Path) -> CampaignText:
     return CampaignText(path, text, text)
 
 
+def _read(path: Path) -> str:
+    """Return the text of a file with its line endings as they are."""
+    return path.read_bytes().decode("utf-8")
+
+
+def _write(path: Path, text: str) -> None:
+    write_atomically(path, lambda part: part.write_bytes(text.encode("utf-8")))
+
+
 def _uncommented(text: str, tables: Sequence[str], name: str) -> str:
-    """Return a text in which the example of a key in a comment of its table is written as the key itself."""
+    """Return a drafted text in which the example of a key in a comment of its table is written as the key itself.
+
+    Comments that somebody wrote are no examples: they stay.
+    """
+    if not text.startswith(DRAFTED):
+        return text
     header, example = f"[{'.'.join(tables)}]", f"# {name} = "
     lines, inside = text.splitlines(keepends=True), False
     for index, line in enumerate(lines):
@@ -149,9 +175,17 @@ def _uncommented(text: str, tables: Sequence[str], name: str) -> str:
             inside = line.startswith(header)
         if inside and line.startswith(f"{name} = "):
             return text
-        if inside and line.startswith(example):
+        if inside and line.startswith(example) and _is_toml(line.removeprefix("# ")):
             return "".join([*lines[:index], line.removeprefix("# "), *lines[index + 1 :]])
     return text
+
+
+def _is_toml(text: str) -> bool:
+    try:
+        tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        return False
+    return True
 
 
 def _set(table: Any, name: str, value: object) -> None:
@@ -167,6 +201,11 @@ def _set(table: Any, name: str, value: object) -> None:
             entry.add(tomlkit.nl())
             entries.append(entry)
         table[name] = entries
+    elif isinstance(value, list) and isinstance(table.get(name), Array) and len(table[name]) == len(value):
+        # Item by item: comments between them stay.
+        for index, item in enumerate(value):
+            if table[name][index] != item:
+                table[name][index] = item
     else:
         table[name] = value
 

@@ -140,7 +140,9 @@ def write_fields(campaign: CampaignText, texts: Mapping[str, str]) -> CampaignTe
         if field.item is None:
             values[key] = value
         else:
-            pair = values.get(key) or [one or TO_FILL for one in campaign.value(*key) or [None, None]]
+            stated = campaign.value(*key)
+            is_pair = isinstance(stated, list) and len(stated) == 2
+            pair = values.get(key) or [one or TO_FILL for one in (stated if is_pair else (None, None))]
             pair[field.item] = value
             values[key] = pair
     if faults:

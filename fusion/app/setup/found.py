@@ -8,6 +8,7 @@ import panel as pn
 
 from fusion.app.elements import heading, paragraph, table
 from fusion.starting.inspection import Inspected, inspect_paths
+from fusion.starting.kinds import Kind
 
 
 def found_in_folder(folder: Path) -> list[pn.viewable.Viewable]:
@@ -21,7 +22,7 @@ def found_in_folder(folder: Path) -> list[pn.viewable.Viewable]:
     Returns
     -------
     list of Viewable
-        A table of files and series, then a warning or a fault per file that has one.
+        A table of files and series, then a warning or a fault per file that has one, and per campaign file of a folder below.
     """
     looked_into = list(inspect_paths([folder]))
     if not looked_into:
@@ -33,6 +34,9 @@ def found_in_folder(folder: Path) -> list[pn.viewable.Viewable]:
         parts.append(table(("file or series", "kind", "content"), rows, caption=f"Files in {folder}", stacked=True))
     for one in looked_into:
         name = name_in(folder, one)
+        if one.kind is Kind.CAMPAIGN and Path(name).parent != Path():
+            told = f"{name} is the campaign file of a folder below; to open it, look into {folder / Path(name).parent}"
+            parts.append(paragraph(told, kind="warning"))
         parts += [paragraph(f"{name}: {line}", kind="warning") for line in warnings_of(one)]
         if one.fault:
             parts.append(paragraph(f"{name} is not used: {one.fault}", kind="fault" if one.fails else "warning"))

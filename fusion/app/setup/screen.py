@@ -125,7 +125,7 @@ def grid_of(campaign: CampaignText) -> PlanGrid | None:
         width, height = (read_quantity(side, "mm") for side in campaign.value("plan", "size") or [None, None])
         cell = campaign.value("plan", "cell_size")
         return PlanGrid(width, height, read_quantity(cell, "mm") if cell else width)
-    except (QuantityError, ThermographyError, ValueError):
+    except (QuantityError, ThermographyError, ValueError, TypeError):
         return None
 
 
@@ -234,7 +234,8 @@ class SetUpScreen:
         self._opened, self._listed = opened, opened.placed.fiducials
         self._found.extend(paragraph(remark, kind="warning") for remark in opened.remarks)
         self._form.show(opened.campaign)
-        self._regions.show(list(opened.campaign.value("thermography", "region") or []))
+        regions = opened.campaign.value("thermography", "region")
+        self._regions.show(list(regions) if isinstance(regions, list) else [])
         has_frame = opened.frame is not None
         self._frame.view.visible = has_frame
         self._plan.view.visible = self._regions.view.visible = has_frame
@@ -344,7 +345,8 @@ class SetUpScreen:
         """Write what the screen shows; the list of fiducials where it was changed here."""
         campaign = write_fields(opened.campaign, self._form.texts)
         regions = self._regions.regions
-        if regions != (campaign.value("thermography", "region") or []):
+        stated = campaign.value("thermography", "region")
+        if regions != (stated or []) and (regions or isinstance(stated, list)):
             campaign = campaign.with_values({("thermography", "region"): regions or None})
         if opened.frame is not None and self._frame.placed.fiducials != self._listed:
             written = places.write_picked(opened.folder, self._frame.placed)

@@ -57,3 +57,11 @@ def test_a_laser_alone_a_camera_alone_and_no_results(results_folder: Path, tmp_p
     assert seen.cycles.size == 24 and seen.field_hours[0] == 0.0
     with pytest.raises(ResultsError, match=r"there is no results\.json in it"):
         Products(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["fields", "deviations", "fusion"])
+def test_a_damaged_product_is_named(results_folder: Path, tmp_path: Path, name: str) -> None:
+    (tmp_path / "results.json").write_bytes((results_folder / "results.json").read_bytes())
+    (tmp_path / f"{name}.nc").write_bytes((results_folder / f"{name}.nc").read_bytes()[:5000])
+    with pytest.raises(ResultsError, match=rf"{name}\.nc: it cannot be read .*; run the campaign again"):
+        getattr(Products(tmp_path), name)

@@ -61,3 +61,42 @@ def test_what_is_no_toml_and_an_empty_folder_are_refused(tmp_path: Path) -> None
     (tmp_path / "campaign.toml").write_text("[campaign\n")
     with pytest.raises(CampaignTextError, match=r"this is not TOML .* correct it in an editor"):
         open_campaign(tmp_path)
+
+
+def test_nothing_that_somebody_wrote_is_lost(tmp_path: Path) -> None:
+    written = (
+        '# mine\r\n[thermography]\r\n# emissivity = measured in March\r\n# clock_offset = "2 s" by the old clock\r\n'
+        'operator = "unknown key"\r\n[plan.axis]\r\norigin = [ "1 mm", # from the drawing\r\n "2 mm" ] # y\r\n'
+    )
+    (tmp_path / "campaign.toml").write_bytes(written.encode())
+    changed = open_campaign(tmp_path).with_values(
+        {
+            ("thermography", "emissivity"): "0.9",
+            ("thermography", "clock_offset"): "3 s",
+            ("plan", "axis", "origin"): ["3 mm", "2 mm"],
+        }
+    )
+    changed.save()
+    assert (tmp_path / "campaign.toml.before").read_bytes() == written.encode()
+    saved = (tmp_path / "campaign.toml").read_bytes().decode()
+    assert saved.count("\n") == saved.count("\r\n"), "line endings stay"
+    for line in written.replace('"1 mm"', '"3 mm"').splitlines():
+        assert line in saved
+    assert tomllib.loads(saved)["thermography"] == {
+        "operator": "unknown key",
+        "emissivity": "0.9",
+        "clock_offset": "3 s",
+    }
+
+
+def test_a_remark_in_a_draft_that_is_no_value_stays(tmp_path: Path) -> None:
+    draft = "# Written by thermofuse init. Every\n[thermography]\n# emissivity = measured in March\n"
+    (tmp_path / "campaign.toml").write_text(draft)
+    changed = open_campaign(tmp_path).with_values({("thermography", "emissivity"): "0.9"})
+    assert changed.text == draft + 'emissivity = "0.9"\n'
+
+
+def test_a_value_under_the_name_of_a_table_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "campaign.toml").write_text("campaign = 5\n")
+    with pytest.raises(CampaignTextError, match=r"campaign is no table; write \[campaign\]"):
+        open_campaign(tmp_path).with_values({("campaign", "title"): "x"})

@@ -28,6 +28,12 @@ def test_a_wrong_file_is_named_with_its_reason_and_escaped(tmp_path: Path) -> No
     assert "&lt;b&gt;.csv is not used:" in shown and "<b>" not in shown
 
 
+def test_a_campaign_file_below_is_led_to(copied: Path) -> None:
+    shown = "".join(part.object for part in found_in_folder(copied.parent))
+    assert f"{copied.name}/campaign.toml is the campaign file of a folder below" in shown
+    assert "of a folder below" not in "".join(part.object for part in found_in_folder(copied))
+
+
 def test_an_empty_folder_says_what_to_do(tmp_path: Path) -> None:
     (only,) = found_in_folder(tmp_path)
     assert "holds no file; put the files of the measurement into it" in only.object
