@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,8 @@ import numpy as np
 import xarray as xr
 
 from fusion.products.grouped import group, has
-from fusion.products.results import RecordLoop, Results, ResultsError, read_results
-from fusion.products.store import read_dataset
+from fusion.products.results import RecordLoop, Results, read_results
+from fusion.products.store import read_dataset, told_if_damaged
 from fusion.report.charts.thermal_map import LAYERS, Layer, scale_of
 
 #: Cycles from which the one colour scale of all cycles is taken; of a longer test evenly spaced ones.
@@ -63,13 +62,16 @@ class Products:
     def fields(self) -> xr.Dataset | None:
         """fields.nc, opened and not read; None without a camera."""
         path = self.folder / "fields.nc"
-        return _opened(path, lambda: xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False, cache=False))
+        if not path.is_file():
+            return None
+        with told_if_damaged(path):
+            return xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False, cache=False)
 
     @cached_property
     def deviations(self) -> xr.Dataset | None:
         """Content of deviations.nc; None without a laser."""
         path = self.folder / "deviations.nc"
-        return _opened(path, lambda: read_dataset(path))
+        return read_dataset(path) if path.is_file() else None
 
     @cached_property
     def drift(self) -> xr.Dataset | None:
@@ -81,7 +83,7 @@ class Products:
     def fusion(self) -> xr.Dataset | None:
         """Root of fusion.nc; None where a run has none."""
         path = self.folder / "fusion.nc"
-        return _opened(path, lambda: read_dataset(path))
+        return read_dataset(path) if path.is_file() else None
 
     @cached_property
     def loop(self) -> xr.Dataset | None:
@@ -155,16 +157,6 @@ class Products:
             read = self.deviations["time"].values
             start = read[~np.isnat(read)].min() if not np.isnat(read).all() else start
         return np.asarray((self.fields["cycle_time"].values - start) / np.timedelta64(1, "h"), float)
-
-
-def _opened(path: Path, read: Callable[[], xr.Dataset]) -> xr.Dataset | None:
-    """Return a product, None where the run has none; a damaged one is refused with its name."""
-    if not path.is_file():
-        return None
-    try:
-        return read()
-    except (OSError, ValueError, KeyError) as error:
-        raise ResultsError(f"{path}: it cannot be read ({error}); run the campaign again") from None
 
 
 def _within(cells: np.ndarray, at: float, size: float) -> slice:
