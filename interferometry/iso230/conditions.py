@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from scipy.special import fdtrc
 
 from interferometry.drift.planning import Settling, spacing_warnings
 from interferometry.iso230.evaluation import STANDARD_CYCLES
@@ -15,6 +16,8 @@ from interferometry.iso230.evaluation import STANDARD_CYCLES
 LEAST_TARGETS, TARGETS_PER_METRE, LONGEST_TRAVEL_MM = 5, 5, 2000.0
 #: Spacings that differ by less than this share of their mean are equal.
 _EQUAL_SHARE = 1e-3
+#: A trend over the cycles with a smaller p-value is no scatter.
+_SIGNIFICANT = 0.01
 
 
 @dataclass(frozen=True)
@@ -131,6 +134,14 @@ def _settled(deviations: xr.Dataset, cycles: Sequence[int], settling: Sequence[S
         return ConditionCheck(name, None, "The readings have no times, or are too few, to see a warm-up.")
     start_s = float((here[~np.isnat(here)].min() - time[~np.isnat(time)].min()) / np.timedelta64(1, "s"))
     if not settling:
+        change_um, p_value = _change_within(deviations.sel(cycle=list(cycles)))
+        if p_value < _SIGNIFICANT:
+            return ConditionCheck(
+                name,
+                False,
+                f"The deviations still change within the cycles evaluated, by up to {change_um:.2g} µm (straight lines over the cycles, "
+                f"F test, p < {_SIGNIFICANT:g}), and no end of that is seen.",
+            )
         return ConditionCheck(name, True, "No part of the drift settles during the test: none looks like a warm-up.")
     last = max(settling, key=lambda part: part.t95_s)
     evidence = (
@@ -138,6 +149,26 @@ def _settled(deviations: xr.Dataset, cycles: Sequence[int], settling: Sequence[S
         f"(95 % confidence: {last.t95_low_s / 3600:.1f} to {_hours(last.t95_high_s)}); the window begins after {start_s / 3600:.1f} h."
     )
     return ConditionCheck(name, start_s >= last.t95_s, evidence)
+
+
+def _change_within(window: xr.Dataset) -> tuple[float, float]:
+    """Largest change of a position over the cycles, um, by straight lines, and the p-value of "no position changes".
+
+    The F test compares the lines of all positions and approaches that were read in every cycle with the scatter about them; a drift
+    that is no straight line widens that scatter, so that the test is rather too careful.
+    """
+    values = window["deviation"].transpose("cycle", "direction", "target").values.reshape(window.sizes["cycle"], -1)
+    values = values[:, np.isfinite(values).all(axis=0)]
+    cycles, series = values.shape
+    if cycles < 3 or series == 0:
+        return 0.0, 1.0
+    step = np.arange(cycles) - (cycles - 1) / 2.0
+    slope = step @ values / (step @ step)
+    about = values - values.mean(axis=0) - np.outer(step, slope)
+    explained, degrees = slope @ slope * (step @ step) / series, series * (cycles - 2)
+    scatter = float(np.sum(about**2)) / degrees
+    p_value = float(fdtrc(series, degrees, explained / scatter)) if scatter > 0.0 else 1.0
+    return float(np.abs(slope).max()) * (cycles - 1), p_value
 
 
 def _hours(seconds: float) -> str:

@@ -68,3 +68,30 @@ def test_the_window_must_begin_after_the_warm_up(t95_s: float, met: bool) -> Non
     # Cycle 3 begins 1200 s after the first reading.
     assert check.met is met
     assert "to longer than the test can show" in check.evidence and "begins after 0.3 h" in check.evidence
+
+
+def test_an_axis_that_drifts_without_an_end_is_not_called_warmed_up() -> None:
+    rng = np.random.default_rng(5)
+    deviations = test_at([0.0, 107.0, 195.0, 310.0, 402.0])
+    deviations["deviation"] = deviations["deviation"] + rng.normal(0.0, 0.3, deviations["deviation"].shape)
+    assert found(deviations, settling=[])["settled"].met
+    # 2 um at the far end over the five cycles, as a warm-up that has hardly begun; its end position shows it best.
+    drift_um = xr.DataArray(np.arange(5) / 2.0, dims="cycle") * deviations["position"] / 402.0
+    check = found(deviations.assign(deviation=deviations["deviation"] + drift_um), settling=[])["settled"]
+    # The slope of one series has a standard error of 0.3 um / sqrt(10), times four steps 0.4 um; three of them either side.
+    assert check.met is False and "p < 0.01" in check.evidence
+    assert 0.8 <= float(check.evidence.split("by up to ")[1].split()[0]) <= 3.2
+
+
+def test_scatter_alone_is_seldom_called_a_trend() -> None:
+    rng = np.random.default_rng(6)
+    deviations = test_at([0.0, 107.0, 195.0, 310.0, 402.0])
+    shape = deviations["deviation"].shape
+    called = [
+        not found(deviations.assign(deviation=deviations["deviation"] + rng.normal(0.0, 0.3, shape)), settling=[])[
+            "settled"
+        ].met
+        for _ in range(200)
+    ]
+    # 1 % of 200 is 2; seven or more would have a probability of 0.5 %.
+    assert sum(called) < 7
