@@ -577,9 +577,10 @@ def _uncertainty(results: Results, fields: xr.Dataset | None) -> list[str]:
         sentences.append(f"ISO 230-2 values: {contained_sentence(results.iso230.settled)}")
     if fields is not None:
         sentences.append(
-            "Temperatures hold for the emissivity with which they were calculated: of the campaign file, else of the camera. A "
-            "constant error of the camera cancels in the rise; an error of the emissivity by 1 % is one of every rise by about 1 %, and of every coefficient per kelvin, whose uncertainty contains "
-            "it. A surface with another emissivity (bare metal, oil) is right only where the campaign names it as a region."
+            "Temperatures hold for the emissivity with which they were calculated: of the campaign file, else of the camera. A constant "
+            "error of the camera cancels in the rise; an error of the emissivity by 1 % is one of every rise by about 1 %, and of every "
+            "coefficient per kelvin, whose uncertainty contains it. A surface with another emissivity (bare metal, oil) is right only "
+            "where the campaign names it as a region."
         )
     if results.loop is not None:
         sentences.append(
