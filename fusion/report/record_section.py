@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.alignment.sensor_health import describe_fault
+from fusion.products.notices import counted
 from fusion.products.results import Results
 from fusion.products.results_loop import RecordLoop, RecordScorePart
 from fusion.record.problem import ENTRY_LEVEL
@@ -105,8 +106,8 @@ def describe_record(results: Results, provenance: Mapping[str, Any], record: xr.
         "doubts": (),
         "untouched": "",
         "measured": (
-            f"Measured: {len(channels)} displacements and {record.sizes['sensor']} temperatures over {duration(span_s)}"
-            + (f", with {drivers} as driver." if drivers else ".")
+            f"Measured: {counted(len(channels), 'displacement')} and {counted(record.sizes['sensor'], 'temperature')} over "
+            f"{_measured_time(loop, span_s)}" + (f", with {drivers} as driver." if drivers else ".")
         ),
         "answers": conclude(results),
         "numbers": _numbers(loop),
@@ -284,6 +285,13 @@ def _candidates_table(loop: RecordLoop) -> Table:
                 ]
             )
     return table(columns, rows)
+
+
+def _measured_time(loop: RecordLoop, span_s: float) -> str:
+    """Return how long was measured; of several runs without the time between them."""
+    if not loop.runs:
+        return duration(span_s)
+    return f"{duration(3600.0 * sum(run.duration_h for run in loop.runs))} in {counted(len(loop.runs), 'run')}"
 
 
 def _runs_table(loop: RecordLoop) -> Table:

@@ -40,7 +40,7 @@ def record(channels: int = 1, drivers: int = 1) -> xr.Dataset:
 def test_a_record_is_told_with_its_channels_and_its_driver() -> None:
     assert isinstance(RESULTS.loop, RecordLoop)
     told = describe_record(RESULTS, {"inputs": {"record.csv": {}}}, record())
-    assert told["measured"] == "Measured: 1 displacements and 2 temperatures over 4 min, with speed as driver."
+    assert told["measured"] == "Measured: 1 displacement and 2 temperatures over 4 min, with speed as driver."
     assert told["channels"].rows[0].cells == ["X", "0.900", "0.600", "0.400", "10", "0.10", "0.300"]
     assert told["chained"].rows[-1].cells == ["mean", "", "0.900", "0.600", "0.400"]
     assert told["rejected"].rows == ()
