@@ -289,9 +289,10 @@ def _candidates_table(loop: RecordLoop) -> Table:
 
 def _measured_time(loop: RecordLoop, span_s: float) -> str:
     """Return how long was measured; of several runs without the time between them."""
-    if not loop.runs:
+    hours = [run.duration_h for run in loop.runs if run.duration_h is not None]
+    if not hours or len(hours) < len(loop.runs):
         return duration(span_s)
-    return f"{duration(3600.0 * sum(run.duration_h for run in loop.runs))} in {counted(len(loop.runs), 'run')}"
+    return f"{duration(3600.0 * sum(hours))} in {counted(len(hours), 'run')}"
 
 
 def _runs_table(loop: RecordLoop) -> Table:

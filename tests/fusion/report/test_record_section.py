@@ -88,3 +88,14 @@ def test_a_faulty_sensor_stands_with_the_error_with_and_without_it() -> None:
     assert first.cells == ["t5", told, "214", "10.6", "left out", "15.7", "4.30"]
     assert second.cells[1] == f"{told}; other sensors respond"
     assert describe_record(RESULTS, {"inputs": {}}, record())["sensor_faults"].rows == ()
+
+
+def test_the_time_of_several_runs_is_without_what_lies_between_them() -> None:
+    errors = dict.fromkeys(("rmse_persistence_um", "rmse_declared_um", "rmse_final_um"))
+    runs = [
+        {"file": f"{day}.csv", "held_out": False, "duration_h": 5.0, "blocks": 60, "verdict": "", **errors}
+        for day in ("monday", "tuesday")
+    ]
+    results = assemble("R", {"loop": {**RECORD_LOOP, "runs": runs}}, [])
+    told = describe_record(results, {"inputs": {"record.csv": {}}}, record())
+    assert "over 10.0 h in 2 runs" in told["measured"]
