@@ -177,7 +177,7 @@ def correction_variables(
 
 
 def gap_notices(readings: Readings) -> list[Notice]:
-    """Notices of gaps in the logged series.
+    """Notices of gaps in the logged series, one for all that have the same gaps.
 
     Parameters
     ----------
@@ -185,14 +185,19 @@ def gap_notices(readings: Readings) -> list[Notice]:
     """
     notices = []
     gaps = readings.gaps()
+    names_by_gaps: dict[tuple[tuple[float, float], ...], list[str]] = {}
     for name in dict.fromkeys(gap.series for gap in gaps):
-        own = [gap for gap in gaps if gap.series == name]
-        minutes = sum(gap.end_s - gap.start_s for gap in own) / 60.0
-        first = own[0].start_s / 60.0
+        own = tuple((gap.start_s, gap.end_s) for gap in gaps if gap.series == name)
+        names_by_gaps.setdefault(own, []).append(name)
+    for own, names in names_by_gaps.items():
+        # Columns of one log lack the same rows: one notice names them all.
+        name, have = ", ".join(names), "has" if len(names) == 1 else "each have"
+        minutes = sum(end_s - start_s for start_s, end_s in own) / 60.0
+        first = own[0][0] / 60.0
         notices.append(
             Notice(
                 "series_gap",
-                f"{name} has {counted(len(own), 'gap')}, {minutes:.0f} min together, the first {first:.0f} min after the first reading; "
+                f"{name} {have} {counted(len(own), 'gap')}, {minutes:.0f} min together, the first {first:.0f} min after the first reading; "
                 "taken as a straight line there, so that an effect that follows it is seen too weak.",
                 f"Log {name} without a break, at least once a minute.",
             )

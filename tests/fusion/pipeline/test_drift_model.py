@@ -48,6 +48,9 @@ def test_gaps_of_a_log_are_one_notice_for_every_series():
     assert duty.remedy == "Log duty without a break, at least once a minute."
     assert air.message.startswith("air_temperature has 1 gap, 5 min together, the first 10 min after ")
     assert gap_notices(campaign(series={"duty": logged(np.ones(60), "1")}, drivers=("duty",))) == []
+    same = {"T1": gapped(300.0), "T2": gapped(300.0)}
+    (both,) = gap_notices(campaign(series=same, drivers=("T1", "T2")))
+    assert both.message.startswith("T1, T2 each have 1 gap, 5 min together, ")
 
 
 def test_camera_errors_that_were_taken_out_are_noted():
