@@ -119,6 +119,11 @@ def answering(console: Console, *, kept: Callable[[], str] = lambda: "") -> Iter
             raise typer.Exit(ExitCode.FAULT) from None
         say(f"{error.filename}: {error.strerror}")
         raise typer.Exit(ExitCode.BAD_INPUT) from None
+    except MemoryError:
+        say(
+            "the memory of this machine does not hold the input; see which file is that large, or use a machine with more"
+        )
+        raise typer.Exit(ExitCode.BAD_INPUT) from None
     except Exception as error:
         _report_fault(error, say)
         raise typer.Exit(ExitCode.FAULT) from None

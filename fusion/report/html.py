@@ -145,7 +145,9 @@ def _is_provenance(content: Any) -> bool:
     if not isinstance(content, dict):
         return False
     parts = [content.get(key) for key in ("inputs", "versions", "parameters")]
-    return all(isinstance(part, dict) for part in parts) and isinstance(content["parameters"].get("campaign"), dict)
+    if not (all(isinstance(part, dict) for part in parts) and isinstance(content["parameters"].get("campaign"), dict)):
+        return False
+    return all(isinstance(one, dict) and {"bytes", "sha256"} <= one.keys() for one in content["inputs"].values())
 
 
 def _draw_charts(results: Results, datasets: Mapping[str, Any]) -> dict[str, Chart]:

@@ -75,7 +75,15 @@ def write_campaign(folder: Path, asker: Asker) -> tuple[Path, list[str]]:
         raise DraftError(f"{path} exists already and is not replaced; thermofuse check {path} says what it lacks")
     content = scan_folder(folder.resolve())
     lines = list(draft_lines(content, asker))
-    write_text(path, "\n".join(lines) + "\n")
+    text = "\n".join(lines) + "\n"
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        line = next(line for line in lines if any("\ud800" <= one <= "\udfff" for one in line))
+        raise DraftError(
+            f"{folder}: the name of a file in it is not UTF-8 ({line!a}); give that file another name"
+        ) from None
+    write_text(path, text)
     return path, [
         f"line {number}: {line}"
         for number, line in enumerate(lines, start=1)

@@ -108,13 +108,20 @@ def input_files(folder: Path) -> Iterator[Path]:
     Parameters
     ----------
     folder : Path
-        An existing folder.
+        An existing folder; one to which several links lead, or a link within itself, is looked into once.
     """
+    yield from _files_below(folder, set())
+
+
+def _files_below(folder: Path, seen: set[Path]) -> Iterator[Path]:
+    if folder.resolve() in seen:
+        return
+    seen.add(folder.resolve())
     for path in sorted(folder.iterdir()):
         if path.name.startswith("."):
             continue
         if path.is_dir():
             if not any((path / name).is_file() for name in _RESULTS):
-                yield from input_files(path)
+                yield from _files_below(path, seen)
         elif path.is_file():
             yield path

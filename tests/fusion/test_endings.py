@@ -29,6 +29,7 @@ def ending(fault: BaseException) -> tuple[int, str]:
 
 def test_faults_of_input_end_with_their_message() -> None:
     assert ending(FusionError("laser.csv, line 3: x")) == (ExitCode.BAD_INPUT, "thermofuse: laser.csv, line 3: x\n")
+    assert ending(MemoryError())[0] == ExitCode.BAD_INPUT and "memory of this machine" in ending(MemoryError())[1]
     missing = FileNotFoundError(errno.ENOENT, "No such file or directory", "IR_0007.jpg")
     assert ending(missing) == (ExitCode.BAD_INPUT, "thermofuse: IR_0007.jpg: No such file or directory\n")
 

@@ -185,7 +185,8 @@ def test_it_is_made_anew_from_its_products(report: Path, tmp_path: Path) -> None
     shutil.copy(report.parent / "results.json", tmp_path / "results.json")
     with pytest.raises(ProductsError, match=r"provenance\.json is missing; run the campaign again"):
         report_of(tmp_path)
-    for text in ("null", "[]", '{"inputs": {}, "versions": {}, "parameters": {"campaign": 5}}'):
+    no_input = '{"inputs": {"laser.csv": -1}, "versions": {}, "parameters": {"campaign": {}}}'
+    for text in ("null", "[]", '{"inputs": {}, "versions": {}, "parameters": {"campaign": 5}}', no_input):
         (tmp_path / "provenance.json").write_text(text)
         with pytest.raises(
             ProductsError, match=r"provenance\.json: not the provenance of a run; run the campaign again"

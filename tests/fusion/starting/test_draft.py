@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -198,3 +199,14 @@ def test_measured_files_that_the_campaign_does_not_take_are_told(tmp_path: Path)
     assert sorted(line.split(":")[0] for line in told) == ["notes.md", "places.csv", "run_2.csv"]
     assert "run_2.csv: deviations; one campaign takes one file of deviations: join the tables of one test" in told
     assert load_campaign(path).interferometry is not None
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names of files are bytes on POSIX systems only")
+def test_a_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    name = os.fsdecode(b"\xff.csv")
+    (tmp_path / name).write_text(
+        "cycle,direction,target,position_mm,deviation_um\n1,positive,1,0,1\n1,positive,2,9,1\n"
+    )
+    with pytest.raises(DraftError, match=r"is not UTF-8 .*\\udcff.*another name"):
+        write_campaign(tmp_path, Asker(None, print))
+    assert not (tmp_path / "campaign.toml").exists()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fusion.starting.folder import scan_folder
+from fusion.starting.folder import input_files, scan_folder
 from fusion.starting.kinds import Kind
 
 
@@ -33,3 +33,10 @@ def test_photos_results_and_hidden_files_are_no_input(copied: Path) -> None:
     content = scan_folder(copied)
     assert content.frames == ("thermal/*.jpg",)
     assert [content.relative(one.path) for one in content.unknown] == [f"photos/{name}.jpg" for name in "abcd"]
+
+
+def test_links_to_folders_above_are_not_followed_for_ever(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("x")
+    for name in ("self", "again", "more"):
+        (tmp_path / name).symlink_to(".")
+    assert list(input_files(tmp_path)) == [tmp_path / "a.csv"]
