@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
 from fusion.effects.effect import Effect
 from fusion.errors import FusionError
@@ -73,6 +76,34 @@ def load_plugin(plugin: Plugin, point: EntryPoint) -> Effect:
     if not isinstance(effect, Effect):
         raise _unusable(plugin, f"is a {type(effect).__name__}, not a fusion.Effect")
     return effect
+
+
+def describe_code(group: str) -> list[dict[str, Any]]:
+    """Return the plug-ins of an entry-point group with the files of their code, none of them imported.
+
+    Parameters
+    ----------
+    group : str
+        `GROUP`, or that of another kind of plug-in.
+
+    Returns
+    -------
+    list of dict
+        Attributes of `Plugin`, and as ``code`` the files of its package or module, sorted: they may change under one version while
+        it is being written.
+    """
+    return [asdict(_describe(point)) | {"code": _code_files(point)} for point in entry_points(group=group)]
+
+
+def _code_files(point: EntryPoint) -> list[Path]:
+    """Return the files of the package or module that brings an effect; none where it is not found."""
+    spec = find_spec(point.module.partition(".")[0])
+    if spec is None:
+        return []
+    if spec.submodule_search_locations:
+        inside = [path for folder in spec.submodule_search_locations for path in Path(folder).rglob("*")]
+        return sorted(path for path in inside if path.is_file() and "__pycache__" not in path.parts)
+    return [Path(spec.origin)] if spec.has_location and spec.origin else []
 
 
 def _unusable(plugin: Plugin, why: str) -> PluginError:

@@ -1,18 +1,16 @@
-"""Campaigns of a fleet: found in folders, each with a name of its own, and a key that tells whether it has changed since it was run."""
+"""Campaigns of a fleet: found in folders, each with a name of its own; and whether the results of one are still those of its files."""
 
 from __future__ import annotations
 
 import os
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from fusion.campaign.config import load_campaign
-from fusion.effects.plugins import plugins
 from fusion.errors import FusionError
-from fusion.pipeline.provenance import input_states, versions
-from fusion.products.store import digest, file_sha256
+from fusion.pipeline.provenance import kept_results
 
 #: Campaign files that are looked for in a folder and in all folders in it.
 CAMPAIGN_FILE = "campaign.toml"
@@ -96,22 +94,21 @@ def _refuse_nested(members: Sequence[Member]) -> None:
             )
 
 
-def input_key(member: Member) -> str:
-    """Return a digest of the campaign file, size and time of change of its inputs, and the versions that take part.
+def is_unchanged(member: Member, folder: Path) -> bool:
+    """Return whether a folder holds the whole results of a campaign as it is now, as ``thermofuse run --resume`` judges it.
 
     Parameters
     ----------
     member : Member
+    folder : Path
+        Its results folder.
 
     Returns
     -------
-    str
-        Empty where the campaign file cannot be read: its run says why.
+    bool
+        False also where the campaign file cannot be read: its run says why.
     """
     try:
-        campaign = load_campaign(member.campaign)
-        states = {name: asdict(state) for name, state in input_states(campaign).items()}
-        added = [asdict(plugin) for plugin in plugins()]
-        return digest(file_sha256(member.campaign), states, versions(), added)
+        return kept_results(load_campaign(member.campaign), folder) is not None
     except (FusionError, OSError):
-        return ""
+        return False

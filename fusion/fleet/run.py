@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import psutil
 
-from fusion.fleet.members import Member, input_key
+from fusion.fleet.members import Member, is_unchanged
 from fusion.fleet.page import render_fleet
 from fusion.fleet.summary import SUMMARY, Row, as_csv, as_json, read_rows, with_findings
 from fusion.products.folder import claim, open_folder
@@ -125,6 +126,8 @@ class _Fleet:
         self.largest = _USUAL_BYTES
         self.seen_largest = 0.0
         self.started = _now()
+        # Signals reach the main thread alone: a run that is being started when the fleet is stopped is known, and told to stop too.
+        self.starter = ThreadPoolExecutor(1, "start")
 
     def run(self) -> list[Row]:
         """Run what is not kept, and write the summary whatever happens."""
@@ -133,7 +136,7 @@ class _Fleet:
         try:
             while waiting or self.running:
                 while waiting and self._has_room():
-                    self._start(waiting.pop(0))
+                    self.starter.submit(self._start, waiting.pop(0)).result()
                 self._collect()
                 time.sleep(_POLL_S)
         finally:
@@ -142,12 +145,12 @@ class _Fleet:
         return list(self.rows.values())
 
     def _keep_unchanged(self) -> list[str]:
-        """Take over the rows of finished campaigns whose inputs are as they were; return the names of the others."""
+        """Take over the rows of finished campaigns whose files and products are as they were; return the names of the others."""
         waiting = []
         earlier = read_rows(self.out)
         for name, member in self.campaigns.items():
             row = earlier.get(name)
-            if row is not None and row.is_whole and row.key and row.key == input_key(member):
+            if row is not None and row.is_whole and is_unchanged(member, self.out / name):
                 kept = with_findings(replace(row, state="kept"), self.out / name)
                 if kept.is_whole:
                     self.rows[name] = kept
@@ -167,9 +170,9 @@ class _Fleet:
     def _start(self, name: str) -> None:
         """Start the run of a campaign; everything that it says goes to its log."""
         member, folder = self.campaigns[name], self.out / name
-        log = f"{_LOGS}/{name.replace('/', '_')}.log"
-        (self.out / _LOGS).mkdir(exist_ok=True)
-        row = replace(self.rows[name], log=log, key=input_key(member))
+        log = f"{_LOGS}/{name}.log"
+        (self.out / log).parent.mkdir(parents=True, exist_ok=True)
+        row = replace(self.rows[name], log=log)
         command = [sys.executable, "-m", "fusion.cli", "run", str(member.campaign), "--out", str(folder)]
         if self.resume and folder.is_dir():
             command.append("--resume")
@@ -219,6 +222,7 @@ class _Fleet:
 
     def _stop(self) -> None:
         """Tell runs that are left to stop, as when the fleet is; they keep their finished stages."""
+        self.starter.shutdown()
         for name, one in self.running.items():
             one.process.terminate()
             seconds = round(time.monotonic() - one.begun, 1)

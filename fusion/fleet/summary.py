@@ -53,8 +53,6 @@ class Row:
         Largest memory of its process, MB; 0 where it was not measured.
     log : str
         File with everything that its run said, as seen from the summary.
-    key : str
-        Digest of its inputs, by which a later fleet knows that it need not be run again.
     """
 
     name: str
@@ -72,7 +70,6 @@ class Row:
     seconds: float = 0.0
     peak_MB: float = 0.0
     log: str = ""
-    key: str = ""
 
     @property
     def is_whole(self) -> bool:
@@ -150,8 +147,8 @@ def read_rows(folder: Path) -> dict[str, Row]:
     return {row.name: row for row in rows}
 
 
-#: Columns of the CSV; the key of the inputs is of use to the program alone.
-_COLUMNS = tuple(field.name for field in fields(Row) if field.name != "key")
+#: Columns of the CSV.
+_COLUMNS = tuple(field.name for field in fields(Row))
 
 
 def as_csv(rows: Sequence[Row]) -> str:

@@ -6,17 +6,18 @@ import os
 import platform
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from fusion.campaign.config import Campaign
-from fusion.effects.plugins import plugins
+from fusion.effects.plugins import GROUP, describe_code, plugins
 from fusion.products.progress import Report, silent
 from fusion.products.results import Notice, Results, read_results
 from fusion.products.store import StageStamps, digest, file_sha256
+from thermography.io.frame_readers import ENTRY_POINT_GROUP
 
 #: Number of the products' layout: stages that were kept in another one are computed again.
 PRODUCT_LAYOUT = 5
@@ -65,8 +66,12 @@ def hash_inputs(files: Mapping[str, Path], *, report: Report = silent) -> dict[s
 
 
 def dependencies() -> tuple[int, dict[str, str], list[dict[str, Any]]]:
-    """Return what every product depends on beside campaign and files: its layout, the versions, and the effects of plug-ins."""
-    return PRODUCT_LAYOUT, versions(), [asdict(plugin) for plugin in plugins()]
+    """Return what every product depends on beside campaign and files: its layout, the versions, and the plug-ins with their code."""
+    groups = [*([GROUP] if plugins() else []), ENTRY_POINT_GROUP]
+    added = [plugin for group in groups for plugin in describe_code(group)]
+    for plugin in added:
+        plugin["code"] = [file_sha256(path) for path in plugin["code"]]
+    return PRODUCT_LAYOUT, versions(), added
 
 
 def stamp_run(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 
 from fusion.effects import plugins as module
 from fusion.effects.library import library
-from fusion.effects.plugins import Plugin, PluginError, leave_plugins_out, load_plugin, plugins
+from fusion.effects.plugins import Plugin, PluginError, describe_code, leave_plugins_out, load_plugin, plugins
 
 
 @pytest.fixture
@@ -33,6 +34,22 @@ def test_an_effect_of_another_distribution_is_listed_with_its_version_and_used(i
     (added,) = plugins()
     assert added == Plugin("bed_bending", "machine_effects:bed", "machine-effects", "1.4")
     assert "bed_bending" in library()
+
+
+def test_the_code_of_a_plug_in_is_found_without_importing_it(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "machine_effects", raising=False)
+    (described,) = describe_code(module.GROUP)
+    assert described["version"] == "1.4" and described["code"] == [installed / "machine_effects.py"]
+    assert "machine_effects" not in sys.modules
+    package = installed / "bed_effects"
+    (package / "__pycache__").mkdir(parents=True)
+    for name in ("__init__.py", "shapes.csv", "__pycache__/shapes.pyc"):
+        (package / name).write_text("raise RuntimeError\n")
+    points = [EntryPoint("bed", origin, module.GROUP) for origin in ("bed_effects.plates:bed", "absent_module:bed")]
+    monkeypatch.setattr(module, "entry_points", lambda group: points)
+    of_package, of_none = describe_code(module.GROUP)
+    assert of_package["code"] == [package / "__init__.py", package / "shapes.csv"]
+    assert of_none["code"] == [] and of_none["distribution"] == "unknown"
 
 
 def test_plugins_are_left_out_here_and_in_processes_started_from_here(

@@ -1,11 +1,8 @@
-"""Campaigns of a fleet: found, named apart, and known again when nothing has changed."""
-
-import os
-import shutil
+"""Campaigns of a fleet: found, and named apart."""
 
 import pytest
 
-from fusion.fleet.members import FleetError, Member, find_members, input_key
+from fusion.fleet.members import FleetError, find_members
 
 
 def touch(folder, *names):
@@ -40,17 +37,3 @@ def test_what_is_no_fleet_is_refused(tmp_path):
         FleetError, match=r"old/campaign.toml: lies in the folder of .*m1/campaign.toml, so their results"
     ):
         find_members([tmp_path / "n"])
-
-
-def test_a_changed_input_changes_the_key(copied):
-    member = Member("one", copied / "campaign.toml")
-    before = input_key(member)
-    assert before and before == input_key(member)
-    os.utime(copied / "laser.csv", ns=(1, 1))
-    changed = input_key(member)
-    assert changed != before
-    with member.campaign.open("a") as file:
-        file.write("# a remark\n")
-    assert input_key(member) != changed
-    shutil.rmtree(copied)
-    assert input_key(member) == ""

@@ -67,6 +67,27 @@ def test_one_that_fails_stops_no_other_and_the_next_fleet_keeps_what_is_finished
     assert ended == ["b"]
     assert [row.state for row in again] == ["kept", "finished", "kept"]
     assert again[0].drift_um == rows[0].drift_um
+    # A reading that differs in one digit, under the size and time of before, and a report that is gone are both seen.
+    readings = hall / "a" / "laser.csv"
+    before, content = readings.stat(), readings.read_text()
+    readings.write_text(f"{content[:-2]}{(int(content[-2]) + 1) % 10}\n")
+    os.utime(readings, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert readings.stat().st_size == before.st_size
+    (out / again[2].report).unlink()
+    third = run_fleet(members, out, resume=True)
+    assert [row.state for row in third] == ["finished", "kept", "finished"]
+    assert (out / third[2].report).is_file()
+
+
+def test_campaigns_whose_names_differ_by_a_slash_have_logs_of_their_own(hall, tmp_path):
+    nested = tmp_path / "halls"
+    shutil.copytree(hall / "b", nested / "m" / "X")
+    shutil.copytree(hall / "b", nested / "m_X")
+    (nested / "m_X" / "campaign.toml").write_text("")
+    rows = run_fleet(find_members([nested]), tmp_path / "out", jobs=2)
+    assert [row.name for row in rows] == ["m/X", "m_X"]
+    assert len({row.log for row in rows}) == 2 and all((tmp_path / "out" / row.log).is_file() for row in rows)
+    assert "there is no instrument" in rows[1].message and "there is no instrument" not in rows[0].message
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT that is sent to one process")
@@ -75,9 +96,9 @@ def test_a_fleet_that_is_stopped_ends_cleanly_with_what_was_kept(hall, tmp_path)
     command = [sys.executable, "-m", "fusion.cli", "fleet", str(hall), "--out", str(out), "--jobs", "1"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as fleet:
         deadline = time.monotonic() + 60
-        while not (out / "logs" / "a.log").exists() and time.monotonic() < deadline:
-            time.sleep(0.05)
-        [run] = psutil.Process(fleet.pid).children()
+        while not (runs := psutil.Process(fleet.pid).children()) and time.monotonic() < deadline:
+            time.sleep(0.002)
+        [run] = runs
         os.kill(fleet.pid, signal.SIGINT)
         _, said = fleet.communicate(timeout=30)
     assert fleet.returncode == 130

@@ -27,7 +27,7 @@ FAILED = Row("b", state="failed", exit_code=2, message='=HYPERLINK("x")', second
 
 @pytest.fixture(scope="module")
 def whole(results_folder):
-    return with_findings(Row("a", state="finished", exit_code=0, seconds=61.2, peak_MB=412.0, key="k"), results_folder)
+    return with_findings(Row("a", state="finished", exit_code=0, seconds=61.2, peak_MB=412.0), results_folder)
 
 
 def test_a_row_says_what_the_results_say(whole, results_folder):

@@ -14,6 +14,7 @@ import pytest
 from fusion.campaign.config import load_campaign
 from fusion.pipeline.provenance import (
     FileState,
+    dependencies,
     describe_run,
     hash_inputs,
     input_states,
@@ -153,6 +154,24 @@ def test_a_run_of_another_version_is_not_whole(
     assert kept_results(campaign, results_folder) is not None
     monkeypatch.setattr("fusion.pipeline.provenance.versions", lambda: {"thermofuse": "0.0.1"})
     assert kept_results(campaign, results_folder) is None
+
+
+@pytest.mark.parametrize("group", ["thermofuse.effects", "thermofuse.frame_readers"])
+def test_a_plug_in_whose_code_changes_under_one_version_ends_what_is_kept(
+    group: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info = tmp_path / "kept_plates-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: kept-plates\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[{group}]\nplates = kept_plates:plates\n")
+    code = tmp_path / "kept_plates.py"
+    code.write_text("plates = 1\n")
+    alone = dependencies()
+    monkeypatch.syspath_prepend(str(tmp_path))
+    before = dependencies()
+    assert alone != before == dependencies()
+    code.write_text("plates = 2\n")
+    assert dependencies() != before
 
 
 def test_a_folder_without_a_run_keeps_nothing(campaign_folder: Path, tmp_path: Path) -> None:

@@ -117,7 +117,7 @@ class FrameList(Sequence[FrameReference]):
     def _stored(self, place: int) -> FrameReference:
         """The frame at a place in the concatenated parts."""
         part = bisect_right(self._starts, place) - 1
-        return self._parts[part][place - self._starts[part]]
+        return self._parts[part][int(place) - self._starts[part]]
 
     def __eq__(self, other: object) -> bool:
         """Compare with any sequence, frame by frame."""
