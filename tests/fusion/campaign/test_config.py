@@ -155,6 +155,7 @@ BAD = [
     ('"X axis"', "X axis", ": this is not TOML: Invalid value (at line 2, column 9); see the campaign file in the README"),
     ('title = "X axis"', 'title = ""', ', line 2: campaign.title = "": this text is empty; fill it in'),
     ('title = "X axis"', "title = 5", ", line 2: campaign.title = 5: this is text; write it in quotes"),
+    ('"-2 min"', '"1e12 s"', ', line 11: thermography.clock_offset = "1e12 s": this time in s lies above -3e+09 and up to 3e+09'),
 ]  # fmt: skip
 
 
