@@ -675,11 +675,11 @@ def _as_written(item: ErrorDetails, content: Mapping[str, Any]) -> ErrorDetails:
 
 
 def _matches(folder: Path, pattern: str) -> list[Path]:
-    """Return the files that a glob pattern, relative or absolute, matches."""
+    """Return the files that a glob pattern, relative or absolute, matches; a link whose file is gone counts, so that it is missed."""
     given = Path(pattern)
-    if given.is_absolute():
-        return [path for path in Path(given.anchor).glob(str(given.relative_to(given.anchor))) if path.is_file()]
-    return [path.resolve() for path in folder.glob(pattern) if path.is_file()]
+    found = Path(given.anchor).glob(str(given.relative_to(given.anchor))) if given.anchor else folder.glob(pattern)
+    there = [path for path in found if path.is_file() or (path.is_symlink() and not path.exists())]
+    return [path.resolve() if path.exists() and not given.anchor else path for path in there]
 
 
 def _each_match(folder: Path, patterns: tuple[str, ...]) -> tuple[Path, ...]:

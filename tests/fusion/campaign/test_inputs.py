@@ -72,6 +72,12 @@ def test_recordings_of_two_days_are_refused(copied: Path) -> None:
         read_source(load_campaign(copied / "campaign.toml"))
 
 
+def test_a_link_whose_frame_is_gone_is_counted(copied: Path) -> None:
+    (copied / "thermal" / "IR_gone.jpg").symlink_to(copied / "nowhere.jpg")
+    source = read_source(load_campaign(copied / "campaign.toml"))
+    assert [one["file"] for one in source.frames_rejected] == ["thermal/IR_gone.jpg"]
+
+
 def test_a_single_frame_is_not_enough(copied: Path) -> None:
     for frame in sorted((copied / "thermal").glob("*.jpg"))[1:]:
         frame.unlink()
