@@ -89,9 +89,13 @@ def _existing(name: str, info: ValidationInfo) -> str:
 
 def _matching(pattern: str, info: ValidationInfo) -> str:
     """Accept a pattern that matches at least one file."""
-    if isinstance(info.context, _Surroundings) and not _matches(info.context.folder, pattern):
-        text = f"matches no file in {info.context.folder}; paths are relative to the campaign file"
-        raise PydanticCustomError("pattern", "{text}", {"text": text})
+    if isinstance(info.context, _Surroundings):
+        found = _matches(info.context.folder, pattern)
+        lost = [path for path in found if not path.exists()]
+        if lost or not found:
+            text = f"matches no file in {info.context.folder}; paths are relative to the campaign file"
+            text = f"{lost[0]} is a link to a file that is gone; bring it back or remove the link" if lost else text
+            raise PydanticCustomError("pattern", "{text}", {"text": text})
     return pattern
 
 
