@@ -128,10 +128,9 @@ class CompareScreen:
     def _offer(self) -> None:
         """Offer every folder but the reference."""
         chosen = [folder for folder in self._others.value or [] if folder != self._reference.value]
-        self._others.options = {
-            label: folder for label, folder in self._labels.items() if folder != self._reference.value
-        }
-        self._others.value = chosen
+        offered = {label: folder for label, folder in self._labels.items() if folder != self._reference.value}
+        # In one message: a box that is ticked between two of them would be emptied by the second.
+        self._others.param.update(options=offered, value=chosen)
 
     async def _show(self, event: object) -> None:
         others = list(self._others.value or [])

@@ -54,6 +54,7 @@ def test_two_campaigns_are_chosen_and_compared_by_keyboard(app: tuple[str, Path]
     page = new_page(app[0], width=390)
     page.get_by_role("button", name="Compare", exact=True).first.press("Enter")
     page.get_by_label("Reference").select_option("results: Small campaign, 2026-03-09")
+    page.get_by_role("checkbox", name="results: Small campaign").wait_for(state="detached")
     box = page.get_by_role("checkbox", name="later: Small campaign")
     box.focus()
     page.keyboard.press("Space")
