@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -214,20 +216,32 @@ class SetUpScreen:
         except PlaceError as error:
             self._found[:] = [paragraph(str(error), kind="fault")]
             return
+        # Everything is changed in the document's own turn: another screen may be changing at the same time.
+        in_turn = partial(pn.state.execute, schedule=True)
+        in_turn(self._begin_look)
+        try:
+            found = await asyncio.to_thread(found_in_folder, folder)
+            in_turn(lambda: self._tell(found))
+            opened = await asyncio.to_thread(open_folder, self._state.root, folder)
+            in_turn(lambda: self._show(opened))
+        except _BAD_INPUT as error:
+            told = paragraph(str(error), kind="fault")
+            in_turn(lambda: self._tell([*self._found, told]))
+        finally:
+            in_turn(self._end_look)
+
+    def _begin_look(self) -> None:
         self._look.disabled = True
         self._dropped[:] = []
         self._work.visible = False
-        self._found[:] = [paragraph("Looking into the files ...", kind="note")]
-        try:
-            found = await asyncio.to_thread(found_in_folder, folder)
-            self._found[:] = found
-            opened = await asyncio.to_thread(open_folder, self._state.root, folder)
-            # Drawings are changed in the document's own turn.
-            pn.state.execute(lambda: self._show(opened), schedule=True)
-        except _BAD_INPUT as error:
-            self._found.append(paragraph(str(error), kind="fault"))
-        finally:
-            self._look.disabled = False
+        self._tell([paragraph("Looking into the files ...", kind="note")])
+
+    def _end_look(self) -> None:
+        self._look.disabled = False
+
+    def _tell(self, parts: Sequence[Any]) -> None:
+        """Show what was found."""
+        self._found[:] = list(parts)
 
     def _show(self, opened: Opened) -> None:
         """Show what was read."""
