@@ -73,8 +73,7 @@ def build_page(root: Path) -> Any:
 
     bar.param.watch(lambda event: choose(event.new), "value")
     state.param.watch(lambda event: choose(event.new), "screen")
-    if SCREENS:
-        choose(next(iter(SCREENS)))
+    choose(next(iter(SCREENS)))
     page = pn.Template((_TEMPLATES / "page.html.j2").read_text(encoding="utf-8"), design=Look)
     page.add_variable("style", (_TEMPLATES / "page.css").read_text(encoding="utf-8"))
     page.add_variable("names", (_TEMPLATES / "names.js").read_text(encoding="utf-8"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from fusion.products.grouped import group, has
 from fusion.products.results import Results, read_results
 from fusion.products.results_loop import AxisLoop, Coefficient
 from fusion.products.results_part import Quantity
-from fusion.products.store import told_if_damaged
+from fusion.products.store import read_json_object, told_if_damaged
 
 #: Level at which something counts as changed, over everything that is compared.
 LEVEL = 0.05
@@ -192,9 +191,8 @@ def _compare(before: ComparedCampaign, after: ComparedCampaign, *, pairs: int) -
 def _axis(folder: Path) -> str:
     """Return the name of the axis as the run noted it."""
     try:
-        noted = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
-        return str(noted["parameters"]["campaign"].get("axis") or "")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return str(read_json_object(folder / "provenance.json")["parameters"]["campaign"].get("axis") or "")
+    except (KeyError, TypeError, AttributeError):
         return ""
 
 

@@ -309,6 +309,20 @@ class StageStamps:
         write_json(self._path, self._stamps)
 
 
+def read_json_object(path: Path) -> dict[str, Any]:
+    """Return what a JSON file holds by name, empty where it is absent, damaged, or holds no such thing.
+
+    Parameters
+    ----------
+    path : Path
+        File of a results folder that is looked into without claim to be whole.
+    """
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError, RecursionError):
+        return {}
+
+
 def finished_stages(folder: Path) -> list[str]:
     """Return the stages of a run that a results folder holds, in the order in which they were finished.
 
@@ -317,10 +331,7 @@ def finished_stages(folder: Path) -> list[str]:
     folder : Path
         Results folder.
     """
-    try:
-        return list(json.loads((folder / _STAMPS).read_text(encoding="utf-8")))
-    except (OSError, ValueError):
-        return []
+    return list(read_json_object(folder / _STAMPS))
 
 
 def noted_messages(folder: Path) -> list[dict[str, Any]]:
@@ -336,10 +347,7 @@ def noted_messages(folder: Path) -> list[dict[str, Any]]:
     list of dict
         As in ``warnings`` of results.json, in the order in which the stages were finished.
     """
-    try:
-        stamps = json.loads((folder / _STAMPS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return []
+    stamps = read_json_object(folder / _STAMPS)
     return [notice for stamp in stamps.values() for notice in (stamp.get("note") or {}).get("notices", [])]
 
 

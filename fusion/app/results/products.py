@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import xarray as xr
 
 from fusion.products.grouped import group, has
 from fusion.products.results import RecordLoop, Results, read_results
-from fusion.products.store import read_dataset, told_if_damaged
+from fusion.products.store import read_dataset, read_json_object, told_if_damaged
 from fusion.report.charts.thermal_map import LAYERS, Layer, scale_of
 
 #: Cycles from which the one colour scale of all cycles is taken; of a longer test evenly spaced ones.
@@ -52,11 +51,7 @@ class Products:
     @cached_property
     def provenance(self) -> dict[str, Any]:
         """Content of provenance.json; empty where it is missing."""
-        path = self.folder / "provenance.json"
-        try:
-            return dict(json.loads(path.read_text(encoding="utf-8")))
-        except (OSError, ValueError, TypeError):
-            return {}
+        return read_json_object(self.folder / "provenance.json")
 
     @cached_property
     def fields(self) -> xr.Dataset | None:

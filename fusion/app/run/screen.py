@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from html import escape
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from fusion.app.report import report_link
 from fusion.app.run.process import RUNS, RunError, RunProcess, is_begun
 from fusion.app.state import State
 from fusion.endings import ExitCode
-from fusion.products.store import finished_stages, noted_messages
+from fusion.products.store import finished_stages, noted_messages, read_json_object
 
 _INTERVAL_MS = 500
 
@@ -166,8 +165,7 @@ def campaign_of(results: Path) -> Path | None:
         Results folder; it may be absent.
     """
     try:
-        noted = json.loads((results / "provenance.json").read_text(encoding="utf-8"))["campaign_file"]
-        campaign = (results / noted).resolve()
+        campaign = (results / read_json_object(results / "provenance.json")["campaign_file"]).resolve()
         return campaign if campaign.is_file() else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -22,6 +22,7 @@ from fusion.products.store import (
     noted_messages,
     plain,
     read_dataset,
+    read_json_object,
     read_tree,
     write_atomically,
     write_dataset,
@@ -144,3 +145,13 @@ def test_notices_of_finished_stages_are_told_while_a_run_is_under_way(tmp_path: 
     stamps.record("fields", "key", [], {"parts": {}, "notices": [{"code": "a", "message": "M.", "remedy": "R."}]})
     stamps.record("model", "key", [], None)
     assert noted_messages(tmp_path) == [{"code": "a", "message": "M.", "remedy": "R."}]
+
+
+def test_what_is_no_json_object_holds_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "provenance.json"
+    assert read_json_object(path) == {}
+    for damaged in ("{", "null", "[1, 2]", "[" * 100_000, "\ud800".encode("utf-16", "surrogatepass").decode("latin-1")):
+        path.write_text(damaged, encoding="latin-1")
+        assert read_json_object(path) == {}
+    path.write_text('{"axis": "X"}', encoding="utf-8")
+    assert read_json_object(path) == {"axis": "X"}
