@@ -26,6 +26,8 @@ from thermography.errors import ThermographyError
 from thermography.io.frame import CameraParameters
 
 ZERO_CELSIUS_K = 273.15
+#: FLIR's model of the air may exceed 1 a little where its constants were fitted to another path.
+_MOST_TRANSMISSION = 1.01
 
 
 class RadiometryError(ThermographyError):
@@ -349,13 +351,15 @@ def air_transmission(
     """
     p = parameters
     celsius = atmospheric_temperature_K - ZERO_CELSIUS_K
-    water = relative_humidity * np.exp(
-        1.5587 + 0.06939 * celsius - 0.00027816 * celsius**2 + 0.00000068455 * celsius**3
-    )
-    root_distance, root_water = np.sqrt(object_distance_m), np.sqrt(water)
-    first = np.exp(-root_distance * (p.atmosphere_alpha1 + p.atmosphere_beta1 * root_water))
-    second = np.exp(-root_distance * (p.atmosphere_alpha2 + p.atmosphere_beta2 * root_water))
-    return np.asarray(p.atmosphere_x * first + (1 - p.atmosphere_x) * second)
+    # Damaged constants may lead anywhere; `check_parameters` judges the transmission that they give.
+    with np.errstate(over="ignore", invalid="ignore"):
+        water = relative_humidity * np.exp(
+            1.5587 + 0.06939 * celsius - 0.00027816 * celsius**2 + 0.00000068455 * celsius**3
+        )
+        root_distance, root_water = np.sqrt(object_distance_m), np.sqrt(water)
+        first = np.exp(-root_distance * (p.atmosphere_alpha1 + p.atmosphere_beta1 * root_water))
+        second = np.exp(-root_distance * (p.atmosphere_alpha2 + p.atmosphere_beta2 * root_water))
+        return np.asarray(p.atmosphere_x * first + (1 - p.atmosphere_x) * second)
 
 
 def override(parameters: CameraParameters, **changes: float) -> CameraParameters:
@@ -419,7 +423,8 @@ def _faults(parameters: CameraParameters) -> tuple[str, ...]:
         "atmospheric_temperature_K": (100, 3000, "kelvin between 100 and 3000"),
         "window_temperature_K": (100, 3000, "kelvin between 100 and 3000"),
         "planck_r1": (1e-9, np.inf, "a positive number (the file is not calibrated)"),
-        "planck_b": (1e-9, np.inf, "a positive number (the file is not calibrated)"),
+        # The second radiation constant over the wavelength: 50,000 K is 0.3 um, beyond every infrared band.
+        "planck_b": (1e-9, 50_000, "kelvin above 0 and up to 50000 (the file is not calibrated)"),
         "planck_r2": (1e-9, np.inf, "a positive number (the file is not calibrated)"),
     }
     if parameters.window_transmission == 1:
@@ -430,4 +435,14 @@ def _faults(parameters: CameraParameters) -> tuple[str, ...]:
         low, high, expected = ranges.get(name, (-np.inf, np.inf, "a finite number"))
         if not (np.isfinite(value) and low <= value <= high):
             faults.append(f"{name} = {value:g}: expected {expected}")
+    if (
+        not faults
+        and parameters.stored_transmission == 0
+        and not 1e-6 <= (tau := path_transmission(parameters)) <= _MOST_TRANSMISSION
+    ):
+        constants = ", ".join(f"{name} = {value:g}" for name, value in values.items() if name.startswith("atmosphere_"))
+        faults.append(
+            f"transmission of the air = {tau:g} over object_distance_m = {parameters.object_distance_m:g} ({constants}): "
+            "expected a fraction above 0 and up to 1"
+        )
     return tuple(faults)

@@ -204,6 +204,19 @@ def test_all_faults_come_in_one_message() -> None:
         check_parameters(replace(PARAMETERS, emissivity=2.0, relative_humidity=3.0))
 
 
+@pytest.mark.parametrize(
+    "change",
+    [{"atmosphere_alpha1": -1e5}, {"atmosphere_x": -3.0, "object_distance_m": 400.0}, {"atmosphere_beta2": -1e30}],
+)
+def test_constants_of_the_air_that_give_no_transmission_are_refused_unless_one_is_stored(
+    change: dict[str, float],
+) -> None:
+    broken = replace(PARAMETERS, stored_transmission=0.0, **change)
+    with pytest.raises(RadiometryError, match=r"transmission of the air = .*atmosphere_alpha1 = .*expected a fraction"):
+        calibrate(np.full(3, 18000, np.uint16), broken)
+    calibrate(np.full(3, 18000, np.uint16), replace(broken, stored_transmission=0.97))
+
+
 def test_a_window_that_is_not_there_needs_no_temperature() -> None:
     check_parameters(replace(PARAMETERS, window_temperature_K=0.0))
     with pytest.raises(RadiometryError, match="window_temperature_K = 0"):
