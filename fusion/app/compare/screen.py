@@ -13,6 +13,7 @@ from fusion.app.elements import bullets, heading, paragraph
 from fusion.app.results.charts import shown
 from fusion.app.results.closed_loop import table_of
 from fusion.app.state import State
+from fusion.app.turn import in_turn
 from fusion.comparison.campaigns import PairComparison, compare_campaigns
 from fusion.errors import FusionError
 from fusion.products.results import read_results
@@ -140,11 +141,15 @@ class CompareScreen:
         self._compare.disabled = True
         try:
             pairs = await asyncio.to_thread(compare_campaigns, [self._reference.value, *others])
-            self._found[:] = comparison_parts(pairs)
+            parts = comparison_parts(pairs)
         except FusionError as error:
-            self._found[:] = [paragraph(str(error), kind="fault")]
-        finally:
-            self._compare.disabled = False
+            parts = [paragraph(str(error), kind="fault")]
+        in_turn(lambda: self._tell(parts))
+
+    def _tell(self, parts: list[pn.viewable.Viewable]) -> None:
+        """Show a comparison, or why there is none."""
+        self._found[:] = parts
+        self._compare.disabled = False
 
 
 def comparison_parts(pairs: list[PairComparison]) -> list[pn.viewable.Viewable]:

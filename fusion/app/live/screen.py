@@ -12,6 +12,7 @@ from fusion.app.live.session import Course, LiveSession
 from fusion.app.places import PlaceError, place_within
 from fusion.app.results.charts import shown
 from fusion.app.state import State
+from fusion.app.turn import in_turn
 from fusion.errors import FusionError
 from fusion.products.notices import counted
 from fusion.report.wording import number
@@ -160,6 +161,6 @@ def live_screen(state: State) -> pn.viewable.Viewable:
         Of Panel.
     """
     screen = LiveScreen(state)
-    pn.state.add_periodic_callback(screen.update, _INTERVAL_MS)
+    pn.state.add_periodic_callback(lambda: in_turn(screen.update), _INTERVAL_MS)
     pn.state.on_session_destroyed(lambda context: screen.end())
     return screen.view

@@ -13,6 +13,7 @@ from fusion.app.results.products import Products
 from fusion.app.run.process import RUNS, RunProcess
 from fusion.app.run.screen import stages_markup
 from fusion.app.state import State
+from fusion.app.turn import in_turn
 from fusion.effects.library import library
 from fusion.endings import ExitCode
 from fusion.errors import FusionError
@@ -130,7 +131,7 @@ class RunAgain:
             return
         self._go.disabled = True
         self._told[:] = [paragraph(f"{changed.name} was written; its results go to {folder.name}.", kind="done")]
-        self._watch = pn.state.add_periodic_callback(self._update, _INTERVAL_MS)
+        self._watch = pn.state.add_periodic_callback(lambda: in_turn(self._update), _INTERVAL_MS)
 
     def _update(self) -> None:
         """Show how the run goes, and its results when it is done."""

@@ -6,28 +6,17 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import panel as pn
 import param
 from bokeh.events import Tap
 from bokeh.models import Span
 from bokeh.plotting import figure
 
+from fusion.app.turn import in_turn
 from interferometry.figures import ACCENT
 
 #: What a coordinate of a chart is, so that a click on it chooses something.
 Axis = str
 POSITION, CYCLE, HOURS = "position", "cycle", "hours"
-
-
-def change_charts(update: Callable[[], None]) -> None:
-    """Change figures that a page shows: as soon as their document may be changed, at once where no page shows them.
-
-    Parameters
-    ----------
-    update : callable
-        Changes models of Bokeh. An event of a button comes without the lock of the document, which they need.
-    """
-    pn.state.execute(update, schedule=True)
 
 
 class Place(NamedTuple):
@@ -87,7 +76,7 @@ class Selection(param.Parameterized):
         Watcher
             For ``param.unwatch``.
         """
-        return self.param.watch(lambda event: change_charts(update), name)
+        return self.param.watch(lambda event: in_turn(update), name)
 
     def add(self, place: Place) -> None:
         """Add a place, once."""

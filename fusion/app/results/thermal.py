@@ -13,7 +13,8 @@ from bokeh.plotting import figure
 
 from fusion.app.elements import paragraph, paragraph_markup
 from fusion.app.results.products import Products
-from fusion.app.results.selection import HOURS, Linker, Place, Selection, change_charts
+from fusion.app.results.selection import HOURS, Linker, Place, Selection
+from fusion.app.turn import in_turn
 from fusion.report.charts.plan import extent_of
 from fusion.report.charts.style import CATEGORIES, DASHES, add_series, new_figure, palette
 from fusion.report.charts.thermal_map import Layer, draw_hotspots, draw_line, draw_map, draw_sensors
@@ -95,7 +96,7 @@ class ThermalView:
 
     def _connect(self) -> None:
         """Let widgets, map and selection follow each other."""
-        self._quantity.param.watch(lambda event: change_charts(self._show_layer), "value")
+        self._quantity.param.watch(lambda event: in_turn(self._show_layer), "value")
         self._player.param.watch(lambda event: self._choose(event.new), "value")
         self._cycle.param.watch(lambda event: self._choose(event.new), "value")
         self._add.on_click(lambda event: self._add_place(self._x.value, self._y.value))

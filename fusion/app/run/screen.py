@@ -12,6 +12,7 @@ from fusion.app.places import PlaceError, place_within
 from fusion.app.report import report_link
 from fusion.app.run.process import RUNS, RunError, RunProcess, is_begun
 from fusion.app.state import State
+from fusion.app.turn import in_turn
 from fusion.endings import ExitCode
 from fusion.products.store import finished_stages, noted_messages, read_json_object
 
@@ -201,5 +202,5 @@ def run_screen(state: State) -> pn.viewable.Viewable:
         Of Panel.
     """
     screen = RunScreen(state)
-    pn.state.add_periodic_callback(screen.update, _INTERVAL_MS)
+    pn.state.add_periodic_callback(lambda: in_turn(screen.update), _INTERVAL_MS)
     return screen.view

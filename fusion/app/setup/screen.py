@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from fusion.app.setup.times import recordings_of
 from fusion.app.setup.times_view import TimesView
 from fusion.app.setup.upload import LARGEST_MB, store_upload
 from fusion.app.state import State
+from fusion.app.turn import in_turn
 from fusion.campaign.quantities import QuantityError, read_quantity
 from fusion.errors import FusionError
 from fusion.starting.check import CampaignCheck, check_campaign
@@ -216,8 +216,6 @@ class SetUpScreen:
         except PlaceError as error:
             self._found[:] = [paragraph(str(error), kind="fault")]
             return
-        # Everything is changed in the document's own turn: another screen may be changing at the same time.
-        in_turn = partial(pn.state.execute, schedule=True)
         in_turn(self._begin_look)
         try:
             found = await asyncio.to_thread(found_in_folder, folder)
@@ -336,24 +334,32 @@ class SetUpScreen:
         """Write the campaign file and the list of fiducials, and check both."""
         if self._opened is None:
             return
-        self._save.disabled = True
         try:
             campaign = self._write(self._opened)
             self._opened = Opened(**{**vars(self._opened), "campaign": campaign})
             lacking = missing(campaign)
             if lacking:
-                self._checked[:] = [paragraph("Saved. Before it can run, fill in:", kind="warning"), bullets(lacking)]
+                told = [paragraph("Saved. Before it can run, fill in:", kind="warning"), bullets(lacking)]
+                in_turn(lambda: self._tell_check(told))
                 return
-            self._checked[:] = [paragraph("Checking ...", kind="note")]
+            in_turn(lambda: self._tell_check([paragraph("Checking ...", kind="note")], checking=True))
             checked = await asyncio.to_thread(check_campaign, campaign.path)
         except _BAD_INPUT as error:
-            self._checked[:] = [paragraph(line, kind="fault") for line in str(error).splitlines()]
+            faults = [paragraph(line, kind="fault") for line in str(error).splitlines()]
+            in_turn(lambda: self._tell_check(faults))
             return
-        finally:
-            self._save.disabled = False
-        self._checked[:] = told_of_check(checked)
+        in_turn(lambda: self._ready(campaign.path, checked))
+
+    def _tell_check(self, parts: Sequence[Any], *, checking: bool = False) -> None:
+        """Show what became of saving."""
+        self._save.disabled = checking
+        self._checked[:] = list(parts)
+
+    def _ready(self, campaign: Path, checked: CampaignCheck) -> None:
+        """Show the check of the saved file, and lead on to the run."""
+        self._tell_check(told_of_check(checked))
         self._go.visible = not checked.faults
-        self._state.campaign = campaign.path
+        self._state.campaign = campaign
 
     def _write(self, opened: Opened) -> CampaignText:
         """Write what the screen shows; the list of fiducials where it was changed here."""
