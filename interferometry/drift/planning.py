@@ -10,7 +10,6 @@ import xarray as xr
 from scipy import optimize, stats
 
 from interferometry._typing import Array
-from interferometry.drift.components import component_loadings
 from interferometry.errors import InterferometryError
 
 #: Shares of the final drift whose times are named t63 and t95.
@@ -226,11 +225,8 @@ def _cycle_components(estimated: xr.Dataset, deviations: xr.Dataset) -> tuple[Ar
     time = deviations["time"].values.astype("datetime64[ns]")
     first = time[~np.isnat(time)].min()
     drift = (deviations["deviation"] - estimated["profile"]).transpose(*deviations["deviation"].dims).values
-    sign = np.where(deviations["direction"].values == "positive", 1.0, -1.0)[:, None] * np.ones(drift.shape[2])
-    position = np.broadcast_to(deviations["position"].values, drift.shape[1:])
-    span = float(deviations["position"].min()), float(deviations["position"].max())
-    components = estimated["component"].values.tolist()
-    loadings = component_loadings(sign.ravel(), position.ravel(), components=components, span_mm=span)
+    share = estimated["drift_share"].transpose("component", *deviations["deviation"].dims[1:]).values
+    loadings = share.reshape(share.shape[0], -1).T
     seconds, rows = [], []
     for cycle, values in zip(time, drift, strict=True):
         present = np.isfinite(values.ravel())
