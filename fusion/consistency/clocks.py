@@ -22,7 +22,7 @@ from fusion.consistency.temperature import LEAST_FOLLOWED, RESOLUTION_K, SENSOR_
 from fusion.effects.effect import Candidate
 from fusion.model.drift_variances import SHIFT_AND_STRETCH, scaled_systems
 from fusion.model.fit import Term, fit_model
-from fusion.model.least_squares import by_width
+from fusion.model.products import by_width
 from fusion.model.profile_gain import profile_gains
 from interferometry.drift.state_space import DriftModelError
 

@@ -62,7 +62,8 @@ def values_near(near: Candidate | None, parameter: str, grid: Iterable[float], *
     if chosen == 0.0:
         return tried
     least, most = 0.999 * min(value for value in tried if value > 0.0) / ratio, 1.001 * max(tried) * ratio
-    finer = (float(chosen * factor) for factor in np.geomspace(1 / ratio, ratio, 11))
+    # The factor in the middle is 1 exactly: rounding must not decide between the chosen value and itself.
+    finer = (float(chosen * factor) for factor in ratio ** np.linspace(-1.0, 1.0, 11))
     return tuple(value for value in finer if least <= value <= most)
 
 

@@ -172,9 +172,11 @@ class AxisProblem:
         families, faults = self._families(state)
         if not families:
             return Round((), tuple(faults))
-        gains = scorer.gains([candidate for candidates in families.values() for candidate in candidates])
-        scores, decisions = score_effects(families, gains, level=SEARCH_LEVEL)
-        limits = () if state.rounds else tuple(detection_limits(scorer, model, families, scores, self.effects))
+        products = scorer.products([candidate for candidates in families.values() for candidate in candidates])
+        scores, decisions = score_effects(families, scorer.gains_by(products), level=SEARCH_LEVEL)
+        limits = (
+            () if state.rounds else tuple(detection_limits(scorer, products, model, families, scores, self.effects))
+        )
         measured = partial(scorer.gains, simulated=False)
         worth = [
             refine(score, partial(self._near, score.name, model), measured)

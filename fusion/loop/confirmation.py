@@ -20,16 +20,15 @@ from fusion.model.drift_variances import SHIFT_AND_STRETCH, scaled_systems
 from fusion.model.fit import ModelFit
 from fusion.model.least_squares import (
     PriorRows,
-    by_width,
     density_ahead,
     gain_across,
     moments_of,
     profile_likelihood,
     solve,
-    without,
 )
 from fusion.model.null_simulation import DRAWS, simulate_null
-from fusion.model.profile_gain import profile_gains
+from fusion.model.products import Products, by_width, sum_products, sum_products_apart
+from fusion.model.profile_gain import gains_by_products
 from interferometry.drift.gls import DriftFit
 from interferometry.drift.state_space import DriftSystem
 
@@ -43,8 +42,6 @@ _CONTRADICTED = 0.5
 _FIVE_SIGMA = 2.9e-7
 #: Share of the cycles from which the later ones are predicted.
 _EARLY_SHARE = 0.5
-#: Values of candidates' columns that are looked at together, 80 MB of them.
-_VALUES_AT_ONCE = 10_000_000
 
 
 def prior_rows(model: ModelFit, rng: np.random.Generator, *, draws: int = DRAWS) -> PriorRows:
@@ -105,28 +102,23 @@ class CandidateScorer:
         """The drift of the fit with every set of variances of the grid."""
         return scaled_systems(self.fit, SHIFT_AND_STRETCH)
 
+    def products(self, candidates: Sequence[Candidate], *, simulated: bool = True) -> list[Products]:
+        """Products of the candidates with the measured response, freed of the model, and with every simulated one if asked for."""
+        measured = self.fit.residual()[:, None]
+        responses = np.column_stack([measured, self.draws]) if simulated else measured
+        return sum_products(self.systems(), responses, self.fit.design, by_width(candidates, self.used))
+
     def gains(self, candidates: Sequence[Candidate], *, simulated: bool = True) -> Gains:
         """Gain of every candidate for the measured response and, where asked for, for every simulated one."""
-        draws = self.draws if simulated else np.empty((self.fit.response.size, 0))
-        responses, systems = np.column_stack([self.fit.response, draws]), self.systems()
-        widths = np.array([candidate.columns.shape[1] for candidate in candidates])
-        # Of a long test some candidates at a time: their columns are held three times while their gains are computed.
-        batch = (np.cumsum(widths) * self.fit.response.size) // _VALUES_AT_ONCE
-        gains = [
-            profile_gains(
-                systems,
-                responses,
-                self.fit.design,
-                by_width([candidates[k] for k in np.flatnonzero(batch == one)], self.used),
-                priors=self.priors,
-            )
-            for one in np.unique(batch)
-        ]
-        return Gains(
-            np.concatenate([some.gain for some in gains]) - (widths - 1.0)[:, None],
-            np.concatenate([some.drift_place for some in gains]),
-            np.concatenate([some.separable for some in gains]),
-        )
+        return self.gains_by(self.products(candidates, simulated=simulated))
+
+    def gains_by(self, products: Sequence[Products]) -> Gains:
+        """The same from products of the candidates."""
+        gains = gains_by_products(products, self.priors.beside(self.fit.coefficients))
+        widths = np.empty(gains.separable.size)
+        for group in products[0].groups:
+            widths[group.places] = group.width
+        return Gains(gains.gain - (widths - 1.0)[:, None], gains.drift_place, gains.separable)
 
     def confirm(self, scores: Sequence[Score], families: Families) -> list[Score]:
         """The same scores, each with its confirmation.
@@ -165,41 +157,32 @@ class CandidateScorer:
 
     def _event_gain(self, candidates: Sequence[Candidate], place: int) -> Array:
         """Gain of an event with instant and size from one half of the targets on the other half, and back, (1 + draws,)."""
-        responses = self._responses()
-        columns = np.column_stack([candidate.columns[self.used, 0] for candidate in candidates])
-        whitened, _ = self.systems()[place].whiten(np.column_stack([responses, self.fit.design, columns]))
-        y, x, c = np.split(whitened, [responses.shape[1], responses.shape[1] + self.fit.design.shape[1]], axis=1)
-        n = c.shape[0]
-        y, x = self.priors.append(y, x)
-        c = np.vstack([c, np.zeros((y.shape[0] - n, c.shape[1]))])
-        y, c = without(x, y)[:n], without(x, c)[:n]
-        return gain_across(y, c, self.halves) / (2.0 * y[:, :1].var())
+        system, responses, design = self.systems()[place], self._responses(), self.fit.design
+        groups = by_width(candidates, self.used)
+        ((one, other),) = sum_products_apart([system], responses, design, groups, self.halves)
+        prior_design, prior_responses = self.priors.design, self.priors.responses(responses.shape[1])
+        normal = one.design + other.design + prior_design.T @ prior_design
+        of_responses = solve(normal, one.cross + other.cross + prior_design.T @ prior_responses)
+        of_events = solve(normal, one.with_design + other.with_design)
+        halves = [half.freed(of_responses, of_events) for half in (one, other)]
+        measured = system.whiten(np.column_stack([self.fit.response, design]))[0]
+        return gain_across(halves) / (2.0 * (measured[:, 0] - measured[:, 1:] @ of_responses[:, 0]).var())
 
     def _gains_in_time(self, candidates: Sequence[Candidate]) -> list[Array]:
         """Gain in log-density of the later half, predicted forward from the readings before, of every candidate (1 + draws,).
 
         Each model has the drift that suits it best, so that an effect is not given credit for what a wandering drift can explain.
         """
-        responses = self._responses()
-        count, p = responses.shape[1], self.fit.design.shape[1]
-        widths = [candidate.columns.shape[1] for candidate in candidates]
-        ends = p + np.cumsum(widths)
-        designs = [np.arange(p), *(np.r_[:p, end - width : end] for end, width in zip(ends, widths, strict=True))]
-        columns = np.column_stack(
-            [responses, self.fit.design, *(candidate.columns[self.used] for candidate in candidates)]
-        )
-        likelihood: list[list[Array]] = [[] for _ in designs]
-        ahead: list[list[Array]] = [[] for _ in designs]
-        for system in self.systems():
-            errors, spread = system.innovations(columns)
-            errors /= np.sqrt(spread)[:, None]
-            y, x = errors[:, :count], errors[:, count:]
-            # What is known beforehand is known before the early cycles too.
-            whole = moments_of(*self.priors.append(y, x), spread)
-            early = moments_of(*self.priors.append(y[self.early], x[self.early]), spread[self.early])
-            for k, design in enumerate(designs):
-                likelihood[k].append(profile_likelihood(whole.of(design)))
-                ahead[k].append(density_ahead(early.of(design), whole.of(design), p))
+        responses, design = self._responses(), self.fit.design
+        groups = by_width(candidates, self.used)
+        likelihood: list[list[Array]] = [[] for _ in range(len(candidates) + 1)]
+        ahead: list[list[Array]] = [[] for _ in range(len(candidates) + 1)]
+        for before, after in sum_products_apart(self.systems(), responses, design, groups, self.early):
+            for k, (first, second) in enumerate(zip(before.models(), after.models(), strict=True)):
+                # What is known beforehand is known before the early cycles too.
+                early, whole = self.priors.add_to(first), self.priors.add_to(first.plus(second))
+                likelihood[k].append(profile_likelihood(whole))
+                ahead[k].append(density_ahead(early, whole, design.shape[1]))
         chosen = [
             np.take_along_axis(np.array(after), np.argmax(before, axis=0)[None, :], axis=0)[0]
             for before, after in zip(likelihood, ahead, strict=True)
@@ -235,19 +218,20 @@ def ask_hold_out(model: ModelFit, candidate: Candidate, rng: np.random.Generator
     priors = prior_rows(model, rng)
     null = simulate_null(fit, rng, over=replace(whole, observed=np.ones_like(train)))
     responses = np.column_stack([model.readings.response, null])
-    p, count = design.shape[1], responses.shape[1]
+    count = responses.shape[1]
+    columns = np.column_stack([responses, design, candidate.columns])
     likelihood: dict[bool, list[Array]] = {False: [], True: []}
     error: dict[bool, list[Array]] = {False: [], True: []}
     for system in scaled_systems(fit, SHIFT_AND_STRETCH, over=whole):
-        errors, spread = system.innovations(np.column_stack([responses, design, candidate.columns]))
-        root = np.sqrt(spread[train])[:, None]
+        errors, spread = system.innovations(columns)
+        y, x = errors[~train, :count], errors[~train, count:]
+        errors /= np.sqrt(spread)[:, None]
+        seen = priors.add_to(moments_of(errors[train, :count], errors[train, count:], spread[train]))
         for with_candidate in (False, True):
-            used = slice(count, count + p + (candidate.columns.shape[1] if with_candidate else 0))
-            y, x = priors.append(errors[train, :count] / root, errors[train, used] / root)
-            beta = solve(x.T @ x, x.T @ y)
-            variance = ((y - x @ beta) ** 2).mean(axis=0)
-            likelihood[with_candidate].append(-0.5 * (y.shape[0] * np.log(variance) + np.log(spread[train]).sum()))
-            error[with_candidate].append(((errors[~train, :count] - errors[~train, used] @ beta) ** 2).mean(axis=0))
+            moments = seen if with_candidate else seen.first(design.shape[1])
+            beta = solve(moments.design, moments.cross)
+            likelihood[with_candidate].append(profile_likelihood(moments))
+            error[with_candidate].append(((y - x[:, : beta.shape[0]] @ beta) ** 2).mean(axis=0))
     before, after = (
         np.sqrt(np.take_along_axis(np.array(error[key]), np.argmax(likelihood[key], axis=0)[None, :], axis=0)[0])
         for key in (False, True)

@@ -18,7 +18,7 @@ from fusion.loop.admissibility import WARM_UP_SHARE, warm_up_share
 from fusion.loop.confirmation import CandidateScorer
 from fusion.loop.state import DetectionLimit, Score
 from fusion.model.fit import ModelFit
-from fusion.model.least_squares import by_width, reductions
+from fusion.model.products import Products, beside_design, by_width, reductions, sum_products
 
 #: Standard normal quantile of the power: an effect of the stated size is found in 80 % of such campaigns.
 _POWER_QUANTILE = 0.84
@@ -31,6 +31,7 @@ _DRAWS = 20
 
 def detection_limits(
     scorer: CandidateScorer,
+    products: Sequence[Products],
     model: ModelFit,
     families: Mapping[str, Sequence[Candidate]],
     scores: Sequence[Score],
@@ -41,22 +42,23 @@ def detection_limits(
     Parameters
     ----------
     scorer, model : the declared model on the training readings, with simulated campaigns in which it is complete
+    products : of all candidates with the simulated campaigns, as the scorer makes them
     families : candidates of every effect that can be tried
     scores : of the first round of the search; only the gain that chance makes is used
     effects : the library
     """
     named = [(name, candidate) for name, candidates in families.items() for candidate in candidates]
-    first = np.column_stack([candidate.columns[scorer.used, 0] for _, candidate in named])
+    candidates = [candidate for _, candidate in named]
     names = np.array([name for name, _ in named])
     critical = {score.name: score.critical for score in scores}
     wanted = np.array([0.5 * (np.sqrt(2.0 * critical[name]) + _POWER_QUANTILE) ** 2 for name in names])
-    own, left = _beside(model, first)
-    smallest = _smallest(scorer, first, wanted)
+    own, left, spread = _beside(model, candidates)
+    smallest = _smallest(products, spread, wanted)
     # A column that never moves has no size.
     sizes = np.where(own > 0.0, own, np.inf) * smallest
     share = left / np.maximum(own, 1e-300)
     typical = {name: _typical(sizes, names == name) for name in families}
-    alike = _alike(scorer, first, [candidate for _, candidate in named], names, list(typical.values()))
+    alike = _alike(scorer, candidates, names, list(typical.values()))
     limits = []
     for row, name in enumerate(families):
         here = sizes[names == name]
@@ -83,36 +85,39 @@ def _typical(sizes: Array, of_effect: NDArray[np.bool_]) -> int:
     return int(places[np.argsort(sizes[places])[places.size // 2]])
 
 
-def _beside(model: ModelFit, columns: Array) -> tuple[Array, Array]:
-    """Rms of columns freed of their mean at every site, and of what is left of them beside the model's columns, (candidates,) each."""
-    readings = model.readings.subset(model.used)
-    site = readings.site
+def _beside(model: ModelFit, candidates: Sequence[Candidate]) -> tuple[Array, Array, Array]:
+    """Size of every candidate's first column, (candidates,) each.
+
+    Rms when freed of its mean at every site, rms of what is left of it beside the model's columns, and its standard deviation.
+    """
+    site = model.readings.subset(model.used).site
     number = np.maximum(np.bincount(site), 1)
-    means = np.column_stack([np.bincount(site, column) / number for column in columns.T])
     q, _ = np.linalg.qr(model.fit.design)
-    left = columns - q @ (q.T @ columns)
-    return np.sqrt(np.mean((columns - means[site]) ** 2, axis=0)), np.sqrt(np.mean(left**2, axis=0))
+    own, left, spread = np.empty((3, len(candidates)))
+    for k, candidate in enumerate(candidates):
+        column = candidate.columns[model.used, 0]
+        own[k] = np.sqrt(np.mean((column - (np.bincount(site, column) / number)[site]) ** 2))
+        left[k] = np.sqrt(np.mean((column - q @ (q.T @ column)) ** 2))
+        spread[k] = column.std()
+    return own, left, spread
 
 
-def _smallest(scorer: CandidateScorer, columns: Array, wanted: Array) -> Array:
-    """Coefficient of every column at which its expected gain is as wanted, the drift being free with it and without it, (candidates,)."""
-    n, draws = columns.shape[0], scorer.draws[:, :_DRAWS]
-    energy, noise, penalty = [], [], []
-    for system in scorer.systems():
-        errors, spread = system.innovations(np.column_stack([draws, scorer.fit.design, columns]))
-        errors /= np.sqrt(spread)[:, None]
-        count, p = draws.shape[1], scorer.fit.design.shape[1]
-        q, _ = np.linalg.qr(errors[:, count : count + p])
-        free = errors - q @ (q.T @ errors)
-        noise.append(np.mean((free[:, :count] ** 2).sum(axis=0)))
-        energy.append((free[:, count + p :] ** 2).sum(axis=0))
-        penalty.append(np.log(spread).sum())
+def _smallest(sums: Sequence[Products], spread: Array, wanted: Array) -> Array:
+    """Coefficient of every first column at which its expected gain is as wanted, the drift being free with it and without it."""
+    n, energy, noise, penalty = sums[0].readings, [], [], []
+    for products in sums:
+        freed = beside_design(products)
+        noise.append(np.mean(freed.squares[1 : 1 + _DRAWS]))
+        first = np.empty(wanted.size)
+        for group, slots, within in zip(products.groups, products.slots(), products.within, strict=True):
+            # Columns that are no evidence stand before the first one.
+            along = freed.along_design[:, slots[group.beside]]
+            first[group.places] = within[:, group.beside, group.beside] - np.einsum("qm,qm->m", along, along)
+        energy.append(np.maximum(first, 0.0))
+        penalty.append(products.log_spread)
     scatter, without_name = np.array(noise)[:, None], np.array(penalty)[:, None]
     nothing = np.max(-0.5 * (n * np.log(scatter) + without_name), axis=0)
-    low, high = (
-        np.zeros(columns.shape[1]),
-        np.full(columns.shape[1], _LARGEST_UM / np.maximum(columns.std(axis=0), 1e-12)),
-    )
+    low, high = np.zeros(wanted.size), _LARGEST_UM / np.maximum(spread, 1e-12)
 
     def gain(size: Array) -> Array:
         swallowed = -0.5 * (n * np.log(scatter + size**2 * np.array(energy)) + without_name)
@@ -127,23 +132,16 @@ def _smallest(scorer: CandidateScorer, columns: Array, wanted: Array) -> Array:
 
 
 def _alike(
-    scorer: CandidateScorer,
-    first: Array,
-    candidates: Sequence[Candidate],
-    names: NDArray[np.str_],
-    typical: Sequence[int],
+    scorer: CandidateScorer, candidates: Sequence[Candidate], names: NDArray[np.str_], typical: Sequence[int]
 ) -> list[set[str]]:
     """For every effect's typical candidate the effects of which some candidate explains nearly all that is visible of it."""
-    groups = by_width(candidates, scorer.used)
-    columns = np.concatenate([group.columns for group in groups], axis=1)
-    system = scorer.fit.system
-    errors, spread = system.innovations(np.column_stack([first[:, list(typical)], scorer.fit.design, columns]))
-    errors /= np.sqrt(spread)[:, None]
-    count, p = len(typical), scorer.fit.design.shape[1]
-    q, _ = np.linalg.qr(errors[:, count : count + p])
-    y = errors[:, :count] - q @ (q.T @ errors[:, :count])
-    reduced, given, _ = reductions(errors[:, count + p :], y, q, groups)
-    alike = reduced - given > _ALIKE_SHARE * np.maximum((y**2).sum(axis=0), 1e-300)[:, None]
+    design = scorer.fit.design
+    shown = np.column_stack([candidates[k].columns[scorer.used, 0] for k in typical])
+    shown = shown - design @ np.linalg.lstsq(design, shown, rcond=None)[0]
+    (products,) = sum_products([scorer.fit.system], shown, design, by_width(candidates, scorer.used))
+    freed = beside_design(products)
+    reduced, given, _ = reductions(products, freed)
+    alike = reduced - given > _ALIKE_SHARE * np.maximum(freed.squares, 1e-300)[:, None]
     return [set(names[row].tolist()) for row in alike]
 
 

@@ -1,4 +1,4 @@
-"""What columns explain of responses: many candidates against many responses at once, and block by block in time.
+"""What columns explain of responses: by products of columns, beside priors, and block by block in time.
 
 Everything here works on whitened columns, so that plain least squares is generalised least squares.
 """
@@ -6,44 +6,37 @@ Everything here works on whitened columns, so that plain least squares is genera
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from fusion._typing import Array
-from fusion.effects.effect import Candidate
 
-#: A candidate of which the model explains all but this share adds nothing that these data can show.
-_SEPARABLE_SHARE = 1e-4
 _RIDGE = 1e-9
 #: Singular value, relative to the largest, below which a direction of scaled columns counts as given by the others.
 _INDEPENDENT = 1e-3
 
 
-def gain_across(y: Array, c: Array, half: NDArray[np.bool_]) -> Array:
+def gain_across(halves: Sequence[tuple[Array, Array]]) -> Array:
     """Gain of an event whose instant and size come from one half of the targets, on the other half, and back.
 
     Parameters
     ----------
-    y : (n, r) whitened responses, each of which chooses its own event
-    c : (n, events) whitened columns
-    half : (n,) True for one half of the targets
+    halves : for each half the products (events, r) of the events' columns with the responses, each of which chooses its own event, and
+        the squared lengths (events,) of these columns
 
     Returns
     -------
     (r,) ndarray
         Reduction of the squared error.
     """
-    gain = np.zeros(y.shape[1])
-    for train, test in ((half, ~half), (~half, half)):
-        energy = np.maximum((c[train] ** 2).sum(axis=0), 1e-12)
-        moment = c[train].T @ y[train]
+    gain = np.zeros(halves[0][0].shape[1])
+    for (moment, squares), (along, tested) in (halves, halves[::-1]):
+        energy = np.maximum(squares, 1e-12)
         chosen = np.argmax(moment**2 / energy[:, None], axis=0)
         size = np.take_along_axis(moment, chosen[None, :], axis=0)[0] / energy[chosen]
-        along = np.einsum("nr,nr->r", c[test][:, chosen], y[test])
-        gain += 2.0 * size * along - size**2 * (c[test] ** 2).sum(axis=0)[chosen]
+        gain += 2.0 * size * np.take_along_axis(along, chosen[None, :], axis=0)[0] - size**2 * tested[chosen]
     return gain
 
 
@@ -60,21 +53,6 @@ def residual_squares(y: Array, x: Array) -> float:
     u = u[:, s > _INDEPENDENT * s[0]]
     left = y - u @ (u.T @ y)
     return float(left @ left)
-
-
-def without(x: Array, y: Array) -> Array:
-    """Residual of least squares.
-
-    Parameters
-    ----------
-    x : (n, p) columns
-    y : (n, r) responses
-
-    Returns
-    -------
-    (n, r) ndarray
-    """
-    return y - x @ solve(x.T @ x, x.T @ y)
 
 
 def solve(normal: Array, moment: Array) -> Array:
@@ -110,12 +88,24 @@ class PriorRows:
     response: Array
     draws: Array
 
+    def responses(self, count: int) -> Array:
+        """Prior means for the first so many responses, the measured one first, (k, count)."""
+        return np.column_stack([self.response, self.draws])[:, :count]
+
+    def beside(self, coefficients: Array) -> PriorRows:
+        """The same for the measured response without what these coefficients of the design make of it."""
+        return replace(self, response=self.response - self.design @ coefficients)
+
     def append(self, y: Array, x: Array) -> tuple[Array, Array]:
         """Whitened responses (n + k, r) and design (n + k, p + q); columns beyond the model's are zero in the priors' rows."""
-        responses = np.column_stack([self.response, self.draws])[:, : y.shape[1]]
         design = np.zeros((self.response.size, x.shape[1]))
         design[:, : self.design.shape[1]] = self.design
-        return np.vstack([y, responses]), np.vstack([x, design])
+        return np.vstack([y, self.responses(y.shape[1])]), np.vstack([x, design])
+
+    def add_to(self, moments: Moments) -> Moments:
+        """Products over some readings and these rows."""
+        y, x = self.append(np.empty((0, moments.squares.size)), np.empty((0, moments.design.shape[0])))
+        return moments.plus(moments_of(y, x, np.empty(0)))
 
 
 @dataclass(frozen=True)
@@ -137,10 +127,19 @@ class Moments:
     readings: int
     log_spread: float
 
-    def of(self, columns: NDArray[np.int64]) -> Moments:
-        """The same for some of the design's columns."""
-        chosen = self.design[np.ix_(columns, columns)]
-        return Moments(chosen, self.cross[columns], self.squares, self.readings, self.log_spread)
+    def first(self, columns: int) -> Moments:
+        """The same for the design's first columns alone."""
+        return replace(self, design=self.design[:columns, :columns], cross=self.cross[:columns])
+
+    def plus(self, other: Moments) -> Moments:
+        """Products over these readings and others."""
+        return Moments(
+            self.design + other.design,
+            self.cross + other.cross,
+            self.squares + other.squares,
+            self.readings + other.readings,
+            self.log_spread + other.log_spread,
+        )
 
 
 def moments_of(y: Array, x: Array, spread: Array) -> Moments:
@@ -212,111 +211,3 @@ def _evidence(moments: Moments, prior: Array, flat: int) -> Array:
     return np.asarray(
         gammaln(0.5 * freedom) - 0.5 * (freedom * np.log(np.pi * left) + log_determinant + moments.log_spread)
     )
-
-
-@dataclass(frozen=True)
-class Group:
-    """Candidates with as many columns.
-
-    Attributes
-    ----------
-    places : (size,) their places among all candidates
-    width, beside : number of columns of each, and of those that are no evidence for it
-    columns : (n, width * size) the first column of each, then the second of each; those that are no evidence stand before the others
-    """
-
-    places: NDArray[np.int64]
-    width: int
-    beside: int
-    columns: Array
-
-
-def by_width(candidates: Sequence[Candidate], used: NDArray[np.bool_]) -> list[Group]:
-    """Group candidates of equal width, so that products of their columns are products of whole matrices.
-
-    Parameters
-    ----------
-    candidates : with columns for all readings
-    used : (all readings,) True for those of the fit
-
-    Returns
-    -------
-    list of Group
-    """
-    kinds = np.array([(candidate.columns.shape[1], candidate.beside) for candidate in candidates]).reshape(-1, 2)
-    groups = []
-    for width, beside in np.unique(kinds, axis=0):
-        places = np.flatnonzero((kinds == (width, beside)).all(axis=1))
-        stacked = np.stack([np.roll(candidates[k].columns[used], beside, axis=1) for k in places], axis=2)
-        groups.append(Group(places, int(width), int(beside), stacked.reshape(stacked.shape[0], -1)))
-    return groups
-
-
-def reductions(c: Array, y: Array, q: Array, groups: Sequence[Group]) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Reduction of the residual sum of squares by every candidate.
-
-    Parameters
-    ----------
-    c : (n, columns) whitened columns of the candidates, by group
-    y : (n, r) whitened responses, freed of the model
-    q : (n, p) orthonormal basis of the model
-    groups : the candidates
-
-    Returns
-    -------
-    reduced : (r, candidates) by all columns of a candidate
-    given : (r, candidates) by those columns that are no evidence for it
-    separable : (candidates,) whether a candidate is independent of the model
-
-    Notes
-    -----
-    For two candidates of width 1 and one of width 2 whose second column may be present without the effect, ``c`` holds
-    ``[a1, a2, b_second, b_first]``: the columns that are no evidence stand first, so that forward substitution gives ``given`` on the way.
-    """
-    total = sum(group.places.size for group in groups)
-    count = y.shape[1]
-    reduced, given = np.zeros((count, total)), np.zeros((count, total))
-    separable = np.zeros(total, bool)
-    products = np.column_stack([y, q]).T @ c
-    moments, within = products[:count], products[count:]
-    start = 0
-    for group in groups:
-        size, width = group.places.size, group.width
-        slots = [slice(start + k * size, start + (k + 1) * size) for k in range(width)]
-        start += width * size
-        gram = np.empty((size, width, width))
-        own = np.empty((width, size))
-        for i in range(width):
-            for j in range(i + 1):
-                whole = np.einsum("nm,nm->m", c[:, slots[i]], c[:, slots[j]])
-                gram[:, i, j] = gram[:, j, i] = whole - np.einsum("qm,qm->m", within[:, slots[i]], within[:, slots[j]])
-            # The product of two of them must not vanish either.
-            own[i] = np.maximum(np.sqrt(whole), 1e-150)
-        gram /= own.T[:, :, None] * own.T[:, None, :]
-        good = np.linalg.eigvalsh(gram)[:, 0] > _SEPARABLE_SHARE
-        # A candidate that is not separable explains nothing: its factor is replaced, its moment made zero.
-        gram[~good] = np.eye(width)
-        scaled = [moments[:, slot] * (good / own[k]) for k, slot in enumerate(slots)]
-        reduced[:, group.places], given[:, group.places] = _explained(
-            np.asarray(np.linalg.cholesky(gram)), scaled, group.beside
-        )
-        separable[group.places] = good
-    return reduced, given, separable
-
-
-def _explained(lower: Array, moment: list[Array], first: int) -> tuple[Array, Array]:
-    """Squared length of every response along each candidate and along its first columns, by forward substitution.
-
-    ``lower`` (candidates, width, width) are the Cholesky factors.
-    """
-    total = np.zeros_like(moment[0])
-    along_first = total
-    solved: list[Array] = []
-    for i, along in enumerate(moment):
-        if i == first:
-            along_first = total.copy()
-        for j, before in enumerate(solved):
-            along = along - lower[:, i, j] * before
-        solved.append(along / lower[:, i, i])
-        total += solved[i] ** 2
-    return total, along_first

@@ -33,12 +33,18 @@ def simulate_null(
     noise, share = fit.noise()
     system = fit.system if over is None else over
     relative = noise / np.sqrt(np.maximum(share, 1e-12))
-    drawn = rng.choice(relative, size=(system.seconds.size, draws)) * np.sqrt(system.variance)[:, None]
+    # In place throughout: these are the largest matrices of a long test.
+    shape = (system.seconds.size, draws)
+    drawn: Array = rng.choice(relative, size=shape)
+    drawn *= np.sqrt(system.variance)[:, None]
     ratios = plausible_ratios(fit, rng, draws=draws)
     for ratio, loading in zip(ratios.T, system.loadings.T, strict=True):
-        first = rng.standard_normal(drawn.shape)
-        second = rng.standard_normal(drawn.shape) if system.order == 2 else np.zeros_like(first)
-        drawn += fit.sigma * np.sqrt(ratio) * random_walk(system, first, second) * loading[:, None]
+        first = rng.standard_normal(shape)
+        second = rng.standard_normal(shape) if system.order == 2 else first
+        walk = random_walk(system, first, second)
+        walk *= fit.sigma * np.sqrt(ratio)
+        walk *= loading[:, None]
+        drawn += walk
     return drawn
 
 
@@ -48,7 +54,7 @@ def random_walk(system: DriftSystem, first: Array, second: Array) -> Array:
     Parameters
     ----------
     system : times and order of the drift
-    first, second : (n, draws) independent standard normal numbers; order 1 uses the first only
+    first, second : (n, draws) independent standard normal numbers; order 1 uses the first only. Both are overwritten.
 
     Returns
     -------
@@ -60,13 +66,15 @@ def random_walk(system: DriftSystem, first: Array, second: Array) -> Array:
     dt**3 / 12 (Durbin and Koopman 2012, Time Series Analysis by State Space Methods, section 3.8).
     """
     steps = np.diff(system.seconds, prepend=system.seconds[0])[:, None]
-    shocks = first * np.sqrt(steps)
+    shocks = np.multiply(first, np.sqrt(steps), out=first)
     if system.order == 1:
-        return np.asarray(np.cumsum(shocks, axis=0))
-    rate = np.cumsum(shocks, axis=0)
-    before = np.vstack([np.zeros(shocks.shape[1]), rate[:-1]])
-    within = 0.5 * shocks + second * np.sqrt(steps / 12.0)
-    return np.asarray(np.cumsum((before + within) * steps, axis=0))
+        return np.asarray(np.cumsum(shocks, axis=0, out=shocks))
+    moved = np.multiply(second, np.sqrt(steps / 12.0), out=second)
+    moved += 0.5 * shocks
+    rate = np.cumsum(shocks, axis=0, out=shocks)
+    moved[1:] += rate[:-1]
+    moved *= steps
+    return np.asarray(np.cumsum(moved, axis=0, out=moved))
 
 
 def tail_probability(value: float, null: Array) -> float:

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.model.least_squares import Group, PriorRows, reductions
+from fusion.model.least_squares import PriorRows
+from fusion.model.products import Group, Products, beside_design, reductions, sum_products
 from interferometry.drift.state_space import DriftSystem
 
 #: The residual sum of squares beside a candidate is at least this share of the model's.
@@ -61,10 +62,19 @@ def profile_gains(
         (``beside`` of :class:`fusion.effects.effect.Candidate`) are part of the model it is held against, at the price of one unit of
         log-likelihood each.
     """
-    n, count = responses.shape
+    return gains_by_products(sum_products(systems, responses, design, groups), priors)
+
+
+def gains_by_products(sums: Sequence[Products], priors: PriorRows | None = None) -> ProfileGains:
+    """Compute the gain of every candidate for every response from products over the readings.
+
+    Parameters
+    ----------
+    sums : products under every set of variances over which the likelihood is maximised
+    priors : what is known beforehand of the model's coefficients
+    """
+    groups, count = sums[0].groups, sums[0].squares.size
     size = sum(group.places.size for group in groups)
-    columns = np.concatenate([group.columns for group in groups], axis=1)
-    known = np.column_stack([responses, design])
     beside = np.zeros(size, int)
     for group in groups:
         beside[group.places] = group.beside
@@ -72,22 +82,13 @@ def profile_gains(
     without, best = np.full(count, -np.inf), np.full((count, size), -np.inf)
     best_started = np.full((count, started.size), -np.inf)
     drift_place, separable = np.zeros(size, int), np.zeros(size, bool)
-    for place, system in enumerate(systems):
-        c, spread = system.innovations(columns)
-        root, log_determinant = np.sqrt(spread)[:, None], float(np.log(spread).sum())
-        c /= root
-        whitened = system.innovations(known)[0] / root
-        y, x = whitened[:, :count], whitened[:, count:]
-        if priors is not None:
-            y, x = priors.append(y, x)
-        q, _ = np.linalg.qr(x)
-        y = y - q @ (q.T @ y)
-        # A response that the design explains exactly leaves nothing; it has no gain, and no logarithm of zero.
-        rss = np.maximum((y**2).sum(axis=0), np.finfo(float).tiny)
-        reduced, given, separate = reductions(c, y[:n], q[:n], groups)
-        likelihood = _likelihood(rss, reduced, n, log_determinant)
-        without = np.maximum(without, -0.5 * (n * np.log(rss) + log_determinant))
-        best_started = np.maximum(best_started, _likelihood(rss, given[:, started], n, log_determinant))
+    for place, products in enumerate(sums):
+        n, log_determinant = products.readings, products.log_spread
+        freed = beside_design(products, priors)
+        reduced, given, separate = reductions(products, freed)
+        likelihood = _likelihood(freed.squares, reduced, n, log_determinant)
+        without = np.maximum(without, -0.5 * (n * np.log(freed.squares) + log_determinant))
+        best_started = np.maximum(best_started, _likelihood(freed.squares, given[:, started], n, log_determinant))
         better = likelihood[0] > best[0]
         drift_place[better] = place
         np.maximum(best, likelihood, out=best)

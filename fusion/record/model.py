@@ -19,8 +19,8 @@ from fusion.effects.effect import Candidate
 from fusion.loop.scoring import Gains
 from fusion.model.drift_variances import SINGLE, plausible_ratios, scaled_systems
 from fusion.model.fit import Term
-from fusion.model.least_squares import by_width
 from fusion.model.null_simulation import random_walk
+from fusion.model.products import by_width
 from fusion.model.profile_gain import profile_gains
 from fusion.record.blocks import Record, RecordError, independent
 from interferometry.drift.gls import DriftFit, estimate

@@ -265,17 +265,69 @@ def filter_columns(
         predict_state(state, order, step)
         if keep:
             states[k] = state
+        # One loop over the columns for every term: the compiler then takes several columns at a time.
+        innovation = innovations[k]
         for j in range(p):
-            predicted = 0.0
-            for c in range(components):
-                predicted += loadings[k, c] * state[c * order, j]
-            innovations[k, j] = columns[k, j] - predicted
+            innovation[j] = 0.0
+        for c in range(components):
+            loading, level = loadings[k, c], state[c * order]
+            for j in range(p):
+                innovation[j] += loading * level[j]
+        for j in range(p):
+            innovation[j] = columns[k, j] - innovation[j]
         for i in range(m):
-            gain = gains[k, i]
-            if gain != 0.0:
-                for j in range(p):
-                    state[i, j] += gain * innovations[k, j]
+            gain, expected = gains[k, i], state[i]
+            for j in range(p):
+                expected[j] += gain * innovation[j]
     return innovations, states
+
+
+@njit(cache=True)
+def whiten_rows(
+    seconds: Array,
+    loadings: Array,
+    order: int,
+    gains: Array,
+    roots: Array,
+    first: int,
+    state: Array,
+    rows: Array,
+) -> None:
+    """Standardise the innovations of some successive readings in place, going on from the state before them.
+
+    Parameters
+    ----------
+    seconds : (n,) ndarray
+        Time of each reading, s, not decreasing.
+    loadings : (n, c) ndarray
+    order : {1, 2}
+    gains : (n, m) ndarray
+        From `filter_covariance`.
+    roots : (n,) ndarray
+        Square roots of its innovation variances.
+    first : int
+        Index of the first of these readings.
+    state : (m, p) ndarray
+        State after the reading before, zero before the first; overwritten with that after the last of these readings.
+    rows : (some, p) ndarray
+        Columns at these readings; overwritten with their innovations over the roots.
+    """
+    p = rows.shape[1]
+    for row in range(rows.shape[0]):
+        k = first + row
+        step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
+        predict_state(state, order, step)
+        innovation = rows[row]
+        for c in range(loadings.shape[1]):
+            loading, level = loadings[k, c], state[c * order]
+            for j in range(p):
+                innovation[j] -= loading * level[j]
+        for i in range(gains.shape[1]):
+            gain, expected = gains[k, i], state[i]
+            for j in range(p):
+                expected[j] += gain * innovation[j]
+        for j in range(p):
+            innovation[j] /= roots[k]
 
 
 @njit(cache=True)

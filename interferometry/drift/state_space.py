@@ -93,6 +93,11 @@ class DriftSystem:
         )
         return innovations, innovation_variances
 
+    def whitening(self, columns: int) -> Whitening:
+        """Start to whiten so many columns, some readings after others."""
+        gains, innovation_variances, _ = self._filter_covariance(False)
+        return Whitening(self, gains, np.sqrt(innovation_variances), np.zeros((gains.shape[1], columns)))
+
     def normal_equations(self, columns: Array) -> tuple[Array, float]:
         """Gram matrix (p, p) of the whitened columns (n, p) of the observed readings, and the log-determinant of their covariance."""
         return kalman.normal_equations(
@@ -131,6 +136,40 @@ class DriftSystem:
                 covariances,
             )
         )
+
+
+@dataclass
+class Whitening:
+    """The filter of many columns on its way through the readings, so that not all readings need be held at once.
+
+    Attributes
+    ----------
+    system : DriftSystem
+        Of n readings.
+    gains : (n, m) ndarray
+        Of the filter.
+    roots : (n,) ndarray
+        Square roots of the innovation variances, in units of sigma.
+    state : (m, p) ndarray
+        Of every column, after the readings so far.
+    done : int
+        Number of these readings.
+    """
+
+    system: DriftSystem
+    gains: Array
+    roots: Array
+    state: Array
+    done: int = 0
+
+    def whiten(self, rows: Array) -> Array:
+        """Standardised innovations of the next readings, (some, p); overwrites ``rows``."""
+        system = self.system
+        kalman.whiten_rows(
+            system.seconds, system.loadings, system.order, self.gains, self.roots, self.done, self.state, rows
+        )
+        self.done += rows.shape[0]
+        return rows
 
 
 def start_columns(seconds: Array, loadings: Array, order: Order) -> Array:

@@ -13,7 +13,7 @@ from fusion.loop.confirmation import CandidateScorer, _judged, ask_hold_out, pri
 from fusion.loop.state import Confirmed, Score
 from fusion.model.drift_variances import SHIFT_AND_STRETCH, scaled_systems
 from fusion.model.fit import ModelFit
-from fusion.model.least_squares import by_width
+from fusion.model.products import by_width
 from fusion.model.profile_gain import profile_gains
 from tests.fusion.small_campaign import campaign, dense_covariance, model_of, term
 
@@ -107,13 +107,13 @@ def test_every_coefficient_beyond_the_first_costs_one_unit(rng):
     np.testing.assert_allclose(gains.gain, bare.gain - np.array([[0.0], [1.0]]), rtol=1e-9)
 
 
-def test_a_few_candidates_at_a_time_gain_what_all_together_gain(monkeypatch, rng):
+def test_a_few_readings_at_a_time_gain_what_all_together_gain(monkeypatch, rng):
     scorer = CandidateScorer.of(model_of(measured(), used=TRAINING), rng)
     candidates = [candidate(rng.standard_normal((BARE.seconds.size, width))) for width in (1, 2, 1, 3, 2)]
     whole = scorer.gains(candidates)
-    monkeypatch.setattr("fusion.loop.confirmation._VALUES_AT_ONCE", 2 * BARE.seconds.size)
+    monkeypatch.setattr("fusion.model.products._VALUES_AT_ONCE", 5 * 220)
     parts = scorer.gains(candidates)
-    # Products of other shapes are rounded otherwise.
+    # Sums in another order are rounded otherwise.
     np.testing.assert_allclose(parts.gain, whole.gain, atol=1e-8)
     np.testing.assert_array_equal(parts.drift_place, whole.drift_place)
     np.testing.assert_array_equal(parts.separable, whole.separable)

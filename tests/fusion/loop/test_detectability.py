@@ -31,7 +31,8 @@ def limits_of(fitted: ModelFit, families: dict[str, list[Candidate]], **effects:
     scorer = CandidateScorer.of(fitted, np.random.default_rng(1))
     scores = [Score(name, None, critical=CRITICAL) for name in families]
     known = {name: effects.get(name, Effect(name, "", "", lambda *_: iter(()))) for name in families}
-    return {limit.effect: limit for limit in detection_limits(scorer, fitted, families, scores, known)}
+    products = scorer.products([one for candidates in families.values() for one in candidates])
+    return {limit.effect: limit for limit in detection_limits(scorer, products, fitted, families, scores, known)}
 
 
 def candidate(columns: np.ndarray, **changes) -> Candidate:
@@ -70,7 +71,9 @@ def test_a_more_critical_search_needs_a_larger_effect():
     families = {"a": [candidate(REVERSAL)]}
     effects = {"a": Effect("a", "", "", lambda *_: iter(()))}
     sizes = [
-        detection_limits(scorer, model(), families, [Score("a", None, critical=critical)], effects)[0].detectable_um
+        detection_limits(
+            scorer, scorer.products(families["a"]), model(), families, [Score("a", None, critical=critical)], effects
+        )[0].detectable_um
         for critical in (2.0, 8.0)
     ]
     assert sizes[0] < sizes[1]

@@ -6,18 +6,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fusion.effects.effect import Candidate
 from fusion.model.least_squares import (
     PriorRows,
-    by_width,
     density_ahead,
     gain_across,
     moments_of,
     profile_likelihood,
-    reductions,
     residual_squares,
     solve,
-    without,
 )
 
 
@@ -27,12 +23,17 @@ def squares_beside(y: np.ndarray, x: np.ndarray) -> float:
     return float(left @ left)
 
 
+def halves_of(y: np.ndarray, columns: np.ndarray, half: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Products of columns and responses over each half, and squared lengths of the columns there."""
+    return [(columns[part].T @ y[part], (columns[part] ** 2).sum(axis=0)) for part in (half, ~half)]
+
+
 def test_an_event_sized_on_one_half_is_tested_on_the_other():
     half = np.array([True, True, False, False])
     y = np.array([[1.0], [3.0], [1.0], [0.0]])
     column = np.ones((4, 1))
     # Size 2 from (1, 3) on (1, 0): 1 + 0 - (1 + 4) = -4; size 0.5 from (1, 0) on (1, 3): 10 - (0.25 + 6.25) = 3.5.
-    np.testing.assert_allclose(gain_across(y, column, half), [-0.5], rtol=1e-12)
+    np.testing.assert_allclose(gain_across(halves_of(y, column, half)), [-0.5], rtol=1e-12)
 
 
 def test_every_response_chooses_its_own_event_on_the_half_that_sizes_it(rng):
@@ -50,7 +51,7 @@ def test_every_response_chooses_its_own_event_on_the_half_that_sizes_it(rng):
             chosen.add(best)
             expected[k] += (y[test, k] ** 2).sum() - ((y[test, k] - size[best] * columns[test, best]) ** 2).sum()
     assert len(chosen) > 2
-    np.testing.assert_allclose(gain_across(y, columns, half), expected, rtol=1e-10)
+    np.testing.assert_allclose(gain_across(halves_of(y, columns, half)), expected, rtol=1e-10)
 
 
 def test_residual_squares_count_dependent_columns_once():
@@ -64,13 +65,6 @@ def test_a_direction_below_a_thousandth_counts_as_dependent(tilt, left):
     """Two unit columns at a small angle t have singular values in the ratio t / 2."""
     x = np.array([[1.0, 1.0], [0.0, tilt], [0.0, 0.0]]) * np.array([1.0, 1e6])
     assert residual_squares(np.array([0.0, 1.0, 0.0]), x) == pytest.approx(left, abs=1e-6)
-
-
-def test_the_residual_of_several_responses_is_orthogonal_to_the_columns(rng):
-    x, y = rng.standard_normal((30, 3)), rng.standard_normal((30, 4))
-    left = without(x, y)
-    np.testing.assert_allclose(left, y - x @ np.linalg.lstsq(x, y, rcond=None)[0], atol=1e-7)
-    assert np.abs(x.T @ left).max() < 1e-6
 
 
 def test_normal_equations_are_solved_for_several_responses_in_any_units(rng):
@@ -99,15 +93,30 @@ def test_priors_are_further_rows_that_know_the_models_columns_only():
     np.testing.assert_array_equal(measured_only[:, 0], [0.0, 0.0, 0.0, 5.0])
 
 
-def test_moments_hold_products_and_give_those_of_some_columns(rng):
+def test_the_priors_of_the_measured_response_lose_what_coefficients_make_of_it():
+    rows = PriorRows(np.array([[0.0, 2.0]]), np.array([5.0]), np.array([[7.0, 8.0]]))
+    beside = rows.beside(np.array([9.0, 1.5]))
+    np.testing.assert_array_equal(beside.responses(3), [[2.0, 7.0, 8.0]])
+    assert beside.design is rows.design
+
+
+def test_moments_hold_products_and_give_those_of_the_first_columns(rng):
     x, y, spread = rng.standard_normal((9, 3)), rng.standard_normal((9, 2)), rng.uniform(1.0, 2.0, 9)
-    moments = moments_of(y, x, spread)
-    part = moments.of(np.array([2, 0]))
-    np.testing.assert_allclose(part.design, x[:, [2, 0]].T @ x[:, [2, 0]], rtol=1e-12)
-    np.testing.assert_allclose(part.cross, x[:, [2, 0]].T @ y, rtol=1e-12)
+    part = moments_of(y, x, spread).first(2)
+    np.testing.assert_allclose(part.design, x[:, :2].T @ x[:, :2], rtol=1e-12)
+    np.testing.assert_allclose(part.cross, x[:, :2].T @ y, rtol=1e-12)
     np.testing.assert_allclose(part.squares, (y**2).sum(axis=0), rtol=1e-12)
     assert part.readings == 9
     assert part.log_spread == pytest.approx(np.log(spread).sum())
+
+
+def test_moments_of_parts_and_of_priors_add_up(rng):
+    x, y, spread = rng.standard_normal((9, 3)), rng.standard_normal((9, 2)), rng.uniform(1.0, 2.0, 9)
+    priors = PriorRows(np.array([[0.0, 2.0]]), np.array([5.0]), np.array([[7.0]]))
+    told = priors.add_to(moments_of(y[:4], x[:4], spread[:4]).plus(moments_of(y[4:], x[4:], spread[4:])))
+    whole = moments_of(*priors.append(y, x), spread)
+    for name in ("design", "cross", "squares", "readings", "log_spread"):
+        np.testing.assert_allclose(getattr(told, name), getattr(whole, name), rtol=1e-12)
 
 
 def test_the_profile_likelihood_is_that_of_the_best_coefficients_and_noise(rng):
@@ -140,70 +149,3 @@ def test_the_density_of_later_readings_is_the_predictive_t_density(rng, flat):
     expected = stats.multivariate_t.logpdf(y[late], x[late] @ beta, shape, df=freedom)
     told = density_ahead(moments_of(y[early, None], x[early], spread[early]), moments_of(y[:, None], x, spread), flat)
     assert told[0] == pytest.approx(expected - 0.5 * np.log(spread[late]).sum(), rel=1e-7)
-
-
-def candidates_of_three_kinds(rng: np.random.Generator, n: int) -> list[Candidate]:
-    """Width 1, 2, and 2 of which the last column is no evidence, mixed."""
-    widths = [(1, 0), (2, 0), (2, 1), (1, 0), (3, 2)]
-    return [Candidate(rng.standard_normal((n, width)), {}, ("um",) * width, beside=beside) for width, beside in widths]
-
-
-def test_candidates_are_grouped_by_width_with_what_is_no_evidence_first(rng):
-    candidates = candidates_of_three_kinds(rng, 6)
-    used = np.array([True, False, True, True, True, False])
-    groups = by_width(candidates, used)
-    assert [(group.width, group.beside, group.places.tolist()) for group in groups] == [
-        (1, 0, [0, 3]),
-        (2, 0, [1]),
-        (2, 1, [2]),
-        (3, 2, [4]),
-    ]
-    np.testing.assert_array_equal(groups[0].columns, np.column_stack([candidates[k].columns[used, 0] for k in (0, 3)]))
-    np.testing.assert_array_equal(groups[1].columns, candidates[1].columns[used])
-    np.testing.assert_array_equal(groups[2].columns, candidates[2].columns[used][:, [1, 0]])
-    np.testing.assert_array_equal(groups[3].columns, candidates[4].columns[used][:, [1, 2, 0]])
-
-
-def test_reductions_equal_one_least_squares_fit_for_every_candidate_and_response(rng):
-    n = 40
-    candidates = candidates_of_three_kinds(rng, n)
-    model, responses = rng.standard_normal((n, 3)), rng.standard_normal((n, 2))
-    groups = by_width(candidates, np.ones(n, bool))
-    q, _ = np.linalg.qr(model)
-    y = responses - q @ (q.T @ responses)
-    reduced, given, separable = reductions(np.concatenate([group.columns for group in groups], axis=1), y, q, groups)
-    assert separable.all()
-    for place, candidate in enumerate(candidates):
-        evidence = candidate.columns.shape[1] - candidate.beside
-        for k in range(2):
-            alone = squares_beside(responses[:, k], model)
-            whole = squares_beside(responses[:, k], np.column_stack([model, candidate.columns]))
-            started = squares_beside(responses[:, k], np.column_stack([model, candidate.columns[:, evidence:]]))
-            assert reduced[k, place] == pytest.approx(alone - whole, rel=1e-8)
-            assert given[k, place] == pytest.approx(alone - started if candidate.beside else 0.0, rel=1e-8, abs=1e-12)
-
-
-@pytest.mark.parametrize(("share", "separable"), [(0.9e-4, False), (1.1e-4, True)])
-def test_a_candidate_of_which_the_model_holds_all_but_a_ten_thousandth_explains_nothing(rng, share, separable):
-    q, _ = np.linalg.qr(rng.standard_normal((20, 3)))
-    model, outside, y = q[:, :1], q[:, 1], q[:, 1:2]
-    column = np.sqrt(1.0 - share) * model[:, 0] + np.sqrt(share) * outside
-    groups = by_width([Candidate(5.0 * column[:, None], {}, ("um",))], np.ones(20, bool))
-    reduced, _, told = reductions(groups[0].columns, y, model, groups)
-    assert told.tolist() == [separable]
-    # What is outside the model points along the response: all of it is explained, or nothing.
-    assert reduced[0, 0] == pytest.approx(1.0 if separable else 0.0, abs=1e-6)
-
-
-@pytest.mark.parametrize("width", [1, 2, 4])
-def test_a_candidate_with_a_column_of_zeros_explains_nothing(rng, width):
-    """A driver that is logged and never runs makes such columns; the other candidates are not touched by them."""
-    columns = rng.standard_normal((20, width))
-    columns[:, 0] = 0.0
-    candidates = [Candidate(c, {}, ("um",) * width) for c in (columns, rng.standard_normal((20, width)))]
-    groups = by_width(candidates, np.ones(20, bool))
-    y = rng.standard_normal((20, 1))
-    reduced, _, separable = reductions(groups[0].columns, y, np.zeros((20, 1)), groups)
-    assert separable.tolist() == [False, True]
-    assert reduced[0, 0] == 0.0
-    assert reduced[0, 1] == pytest.approx(y[:, 0] @ y[:, 0] - squares_beside(y[:, 0], candidates[1].columns))

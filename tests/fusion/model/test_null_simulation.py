@@ -25,7 +25,7 @@ def covariance_of_walk(order: int) -> np.ndarray:
     n = SECONDS.size
     system = drift_system(SECONDS, np.ones((n, 1)), order=order, ratios=np.ones(1))
     unit, nothing = np.eye(n), np.zeros((n, n))
-    matrix = np.column_stack([random_walk(system, unit, nothing), random_walk(system, nothing, unit)])
+    matrix = np.column_stack([random_walk(system, unit.copy(), nothing.copy()), random_walk(system, nothing, unit)])
     return matrix @ matrix.T
 
 

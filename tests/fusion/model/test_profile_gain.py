@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from fusion.effects.effect import Candidate
-from fusion.model.least_squares import PriorRows, by_width
+from fusion.model.least_squares import PriorRows
+from fusion.model.products import by_width
 from fusion.model.profile_gain import profile_gains
 from interferometry.drift.gls import DriftSystem, drift_system
 

@@ -10,7 +10,7 @@ import pytest
 from fusion.effects.effect import Candidate
 from fusion.model.drift_variances import SINGLE, scaled_systems
 from fusion.model.fit import Term
-from fusion.model.least_squares import by_width
+from fusion.model.products import by_width
 from fusion.model.profile_gain import profile_gains
 from fusion.record.blocks import RecordError, reduce_record
 from fusion.record.hold_out import declare

@@ -1,0 +1,365 @@
+"""What many candidates explain of many responses, from products of whitened columns.
+
+The columns of all candidates at all readings would be the largest thing in memory by far. The readings are therefore whitened some at a
+time, under every drift that is tried, and only sums of products are kept: they do not grow with the readings, and all that follows needs
+no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion._typing import Array
+from fusion.effects.effect import Candidate
+from fusion.model.least_squares import Moments, PriorRows
+from interferometry.drift.state_space import DriftSystem
+
+#: Values that are whitened together, 4 MB: enough for products of whole matrices, few enough to stay in the processor's cache.
+_VALUES_AT_ONCE = 2**19
+#: A candidate of which the model explains all but this share adds nothing that these data can show.
+_SEPARABLE_SHARE = 1e-4
+#: Eigenvalue of the model's products, relative to the largest, below which its columns count as dependent.
+_DEPENDENT = 1e-13
+
+
+@dataclass(frozen=True)
+class Group:
+    """Candidates with as many columns.
+
+    Attributes
+    ----------
+    places : (size,) their places among all candidates
+    width, beside : number of columns of each, and of those that are no evidence for it
+    candidates : those at the places
+    readings : (n,) places of the readings of the fit among all readings
+    """
+
+    places: NDArray[np.int64]
+    width: int
+    beside: int
+    candidates: tuple[Candidate, ...]
+    readings: NDArray[np.int64]
+
+    def columns(self, rows: slice) -> Array:
+        """Columns at some readings of the fit, (rows, width * size): the first of each candidate, then the second of each.
+
+        Those that are no evidence stand before the others.
+        """
+        here = self.readings[rows]
+        stacked = np.empty((here.size, self.width, self.places.size))
+        for k, candidate in enumerate(self.candidates):
+            own = candidate.columns[here]
+            stacked[:, self.beside :, k] = own[:, : self.width - self.beside]
+            stacked[:, : self.beside, k] = own[:, self.width - self.beside :]
+        return stacked.reshape(here.size, -1)
+
+
+def by_width(candidates: Sequence[Candidate], used: NDArray[np.bool_]) -> list[Group]:
+    """Group candidates of equal width, so that products of their columns are products of whole matrices.
+
+    Parameters
+    ----------
+    candidates : with columns for all readings
+    used : (all readings,) True for those of the fit
+
+    Returns
+    -------
+    list of Group
+    """
+    kinds = np.array([(candidate.columns.shape[1], candidate.beside) for candidate in candidates]).reshape(-1, 2)
+    groups = []
+    for width, beside in np.unique(kinds, axis=0):
+        places = np.flatnonzero((kinds == (width, beside)).all(axis=1))
+        chosen = tuple(candidates[k] for k in places)
+        groups.append(Group(places, int(width), int(beside), chosen, np.flatnonzero(used)))
+    return groups
+
+
+@dataclass
+class Products:
+    """Sums over some readings of products of columns that were whitened under one drift.
+
+    Attributes
+    ----------
+    groups : the candidates
+    basis : (columns of the model, p) of the columns that are the design here
+    design, cross, squares : (p, p), (p, r), (r,) of the design with itself, with the responses, and of each response with itself
+    with_responses, with_design : (r, columns), (p, columns) of the candidates' columns by group with responses and design
+    within : for every group the products of each candidate's columns with one another, (size, width, width)
+    readings : number of readings
+    log_spread : sum of the logarithms of the innovation variances
+    """
+
+    groups: Sequence[Group]
+    basis: Array
+    design: Array
+    cross: Array
+    squares: Array
+    with_responses: Array
+    with_design: Array
+    within: list[Array]
+    readings: int = 0
+    log_spread: float = 0.0
+
+    @classmethod
+    def none(cls, groups: Sequence[Group], basis: Array, responses: int) -> Products:
+        """Sums over no readings, for so many responses."""
+        columns, design = sum(group.width * group.places.size for group in groups), basis.shape[1]
+        return cls(
+            groups,
+            basis,
+            np.zeros((design, design)),
+            np.zeros((design, responses)),
+            np.zeros(responses),
+            np.zeros((responses, columns)),
+            np.zeros((design, columns)),
+            [np.zeros((group.places.size, group.width, group.width)) for group in groups],
+        )
+
+    def add(self, rows: Array, roots: Array) -> None:
+        """Add whitened rows, responses first, then the design, then the candidates; ``roots`` of their innovation variances."""
+        known = self.squares.size + self.design.shape[0]
+        y, x, c = rows[:, : self.squares.size], rows[:, self.squares.size : known], rows[:, known:]
+        self.design += x.T @ x
+        self.cross += x.T @ y
+        self.squares += np.einsum("nr,nr->r", y, y)
+        products = rows[:, :known].T @ c
+        self.with_responses += products[: y.shape[1]]
+        self.with_design += products[y.shape[1] :]
+        for within, slots in zip(self.within, self.slots(), strict=True):
+            for i, first in enumerate(slots):
+                for j, second in enumerate(slots[: i + 1]):
+                    within[:, i, j] += np.einsum("nm,nm->m", c[:, first], c[:, second])
+                    within[:, j, i] = within[:, i, j]
+        self.readings += rows.shape[0]
+        self.log_spread += 2.0 * float(np.log(roots).sum())
+
+    def slots(self) -> list[list[slice]]:
+        """For every group the places of the first column of each candidate, of the second of each, and so on."""
+        start, slots = 0, []
+        for group in self.groups:
+            size = group.places.size
+            slots.append([slice(start + k * size, start + (k + 1) * size) for k in range(group.width)])
+            start += group.width * size
+        return slots
+
+    def models(self) -> list[Moments]:
+        """Products of the design alone, then with each candidate added to it, in the order of the candidates."""
+        alone = Moments(self.design, self.cross, self.squares, self.readings, self.log_spread)
+        models = {-1: alone}
+        for group, slots, within in zip(self.groups, self.slots(), self.within, strict=True):
+            for k, place in enumerate(group.places):
+                columns = [slot.start + k for slot in slots]
+                beside = self.with_design[:, columns]
+                models[int(place)] = replace(
+                    alone,
+                    design=np.block([[self.design, beside], [beside.T, within[k]]]),
+                    cross=np.vstack([self.cross, self.with_responses[:, columns].T]),
+                )
+        return [models[place] for place in sorted(models)]
+
+    def freed(self, of_responses: Array, of_columns: Array) -> tuple[Array, Array]:
+        """Products of the candidates' columns with the responses, and of each with itself, both freed of the design.
+
+        Parameters
+        ----------
+        of_responses, of_columns : (p, r), (p, columns) coefficients of the design
+
+        Returns
+        -------
+        (columns, r), (columns,) ndarray
+        """
+        crossed = self.with_responses.T - self.with_design.T @ of_responses
+        crossed -= of_columns.T @ (self.cross - self.design @ of_responses)
+        own = np.concatenate([np.einsum("mii->im", within).ravel() for within in self.within])
+        own -= 2.0 * np.einsum("pm,pm->m", of_columns, self.with_design)
+        own += np.einsum("pm,pm->m", of_columns, self.design @ of_columns)
+        return crossed, own
+
+
+def sum_products(
+    systems: Sequence[DriftSystem], responses: Array, design: Array, groups: Sequence[Group]
+) -> list[Products]:
+    """Whiten responses, design and candidates under every drift, and sum their products over all readings.
+
+    The design enters by columns that are nearly orthonormal when whitened, so that nothing is lost by taking products.
+
+    Parameters
+    ----------
+    systems : of the same n readings
+    responses : (n, r)
+    design : (n, p) columns of the model
+    groups : the candidates
+
+    Returns
+    -------
+    list of Products
+        For every system.
+    """
+    every = np.ones(responses.shape[0], bool)
+    bases = [_orthonormal(system.normal_equations(design)[0]) for system in systems]
+    return [products for (products,) in _sums_over(systems, responses, design, groups, bases, [every])]
+
+
+def sum_products_apart(
+    systems: Sequence[DriftSystem],
+    responses: Array,
+    design: Array,
+    groups: Sequence[Group],
+    part: NDArray[np.bool_],
+) -> list[tuple[Products, Products]]:
+    """Sum the same products over a part of the readings and over the others; the drift is followed through both.
+
+    Parameters
+    ----------
+    systems, responses, design, groups : as for :func:`sum_products`
+    part : (n,) True for the readings of the part
+
+    Returns
+    -------
+    list of tuple
+        For every system: of the part, of the others.
+    """
+    bases = [np.eye(design.shape[1])] * len(systems)
+    return [(one, other) for one, other in _sums_over(systems, responses, design, groups, bases, [part, ~part])]
+
+
+def _sums_over(
+    systems: Sequence[DriftSystem],
+    responses: Array,
+    design: Array,
+    groups: Sequence[Group],
+    bases: Sequence[Array],
+    parts: Sequence[NDArray[np.bool_]],
+) -> list[list[Products]]:
+    columns = responses.shape[1] + sum(group.width * group.places.size for group in groups)
+    whitenings = [system.whitening(columns + basis.shape[1]) for system, basis in zip(systems, bases, strict=True)]
+    sums = [[Products.none(groups, basis, responses.shape[1]) for _ in parts] for basis in bases]
+    at_once = max(1, _VALUES_AT_ONCE // (columns + design.shape[1]))
+    for start in range(0, responses.shape[0], at_once):
+        rows = slice(start, start + at_once)
+        candidates = [group.columns(rows) for group in groups]
+        for whitening, basis, of_parts in zip(whitenings, bases, sums, strict=True):
+            here = np.concatenate([responses[rows], design[rows] @ basis, *candidates], axis=1)
+            whitened, roots = whitening.whiten(here), whitening.roots[rows]
+            for part, products in zip(parts, of_parts, strict=True):
+                counted = part[rows]
+                products.add(*((whitened, roots) if counted.all() else (whitened[counted], roots[counted])))
+    return sums
+
+
+def _orthonormal(normal: Array) -> Array:
+    """Combinations (p, k) of columns that are orthonormal, from the columns' products with one another (p, p).
+
+    With the eigenvalues and vectors of the scaled products X'X = D V L V' D the columns of X B with B = D^-1 V L^-1/2 are orthonormal.
+    """
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
+    kept = values > _DEPENDENT * values.max(initial=0.0)
+    return np.asarray(vectors[:, kept] / np.sqrt(values[kept]) / scale[:, None])
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Products beside the design, which may be known beforehand.
+
+    Attributes
+    ----------
+    squares : (r,) of every response, freed of the design
+    with_responses : (r, columns) of the candidates' columns with these responses
+    along_design : (k, columns) of the candidates' columns with an orthonormal basis of the design
+    """
+
+    squares: Array
+    with_responses: Array
+    along_design: Array
+
+
+def beside_design(products: Products, priors: PriorRows | None = None) -> Beside:
+    """Free responses of the design by its products.
+
+    Parameters
+    ----------
+    products : of whitened columns
+    priors : further rows of design and responses; none by default
+
+    Returns
+    -------
+    Beside
+    """
+    normal, cross, squares = products.design, products.cross, products.squares
+    if priors is not None:
+        rows, known = priors.design @ products.basis, priors.responses(squares.size)
+        normal, cross = normal + rows.T @ rows, cross + rows.T @ known
+        squares = squares + (known**2).sum(axis=0)
+    basis = _orthonormal(normal)
+    along, along_design = basis.T @ cross, basis.T @ products.with_design
+    return Beside(
+        # A response that the design explains exactly leaves nothing; it has no gain, and no logarithm of zero.
+        np.maximum(squares - (along**2).sum(axis=0), np.finfo(float).tiny),
+        products.with_responses - along.T @ along_design,
+        along_design,
+    )
+
+
+def reductions(products: Products, beside: Beside) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Reduction of the residual sum of squares by every candidate.
+
+    Parameters
+    ----------
+    products : with the candidates
+    beside : the same beside the design
+
+    Returns
+    -------
+    reduced : (r, candidates) by all columns of a candidate
+    given : (r, candidates) by those columns that are no evidence for it
+    separable : (candidates,) whether a candidate is independent of the model
+
+    Notes
+    -----
+    For two candidates of width 1 and one of width 2 whose second column may be present without the effect, the columns are
+    ``[a1, a2, b_second, b_first]``: the columns that are no evidence stand first, so that forward substitution gives ``given`` on the way.
+    """
+    total = sum(group.places.size for group in products.groups)
+    reduced, given = np.zeros((2, beside.squares.size, total))
+    separable = np.zeros(total, bool)
+    for group, slots, within in zip(products.groups, products.slots(), products.within, strict=True):
+        # The product of two of them must not vanish either.
+        own = np.maximum(np.sqrt(np.einsum("mii->im", within)), 1e-150)
+        gram = np.empty_like(within)
+        for i, first in enumerate(slots):
+            for j, second in enumerate(slots[: i + 1]):
+                inside = np.einsum("qm,qm->m", beside.along_design[:, first], beside.along_design[:, second])
+                gram[:, i, j] = gram[:, j, i] = within[:, i, j] - inside
+        gram /= own.T[:, :, None] * own.T[:, None, :]
+        good = np.linalg.eigvalsh(gram)[:, 0] > _SEPARABLE_SHARE
+        # A candidate that is not separable explains nothing: its factor is replaced, its moment made zero.
+        gram[~good] = np.eye(group.width)
+        scaled = [beside.with_responses[:, slot] * (good / own[k]) for k, slot in enumerate(slots)]
+        lower = np.asarray(np.linalg.cholesky(gram))
+        reduced[:, group.places], given[:, group.places] = _explained(lower, scaled, group.beside)
+        separable[group.places] = good
+    return reduced, given, separable
+
+
+def _explained(lower: Array, moment: list[Array], first: int) -> tuple[Array, Array]:
+    """Squared length of every response along each candidate and along its first columns, by forward substitution.
+
+    ``lower`` (candidates, width, width) are the Cholesky factors.
+    """
+    total = np.zeros_like(moment[0])
+    along_first = total
+    solved: list[Array] = []
+    for i, along in enumerate(moment):
+        if i == first:
+            along_first = total.copy()
+        for j, before in enumerate(solved):
+            along = along - lower[:, i, j] * before
+        solved.append(along / lower[:, i, i])
+        total += solved[i] ** 2
+    return total, along_first
