@@ -159,8 +159,17 @@ def _clear_filled_runs(runs: list[_Run], unidirectional: bool) -> list[str]:
 
 def _keyed(section: list[tuple[int, str]]) -> dict[str, str]:
     """Return values by key, letter case and spaces of the key ignored ("Date Time" and "DateTime" both occur)."""
-    pairs = (content.split(":", 1) for _, content in section if ":" in content)
-    return {re.sub(r"[^a-z0-9]", "", key.lower()): value.strip() for key, value in pairs}
+    return {key: value for key, (_, value) in _keyed_lines(section).items()}
+
+
+def _keyed_lines(section: list[tuple[int, str]]) -> dict[str, tuple[int, str]]:
+    """Return the line number and the value by key, as `_keyed`; of a key that comes twice the last."""
+    pairs = ((line, content.partition(":")) for line, content in section if ":" in content)
+    return {_key(name): (line, value.strip()) for line, (name, _, value) in pairs}
+
+
+def _key(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
 def _parse_targets(path: Path, sections: dict[str, list[tuple[int, str]]]) -> np.ndarray:
@@ -186,11 +195,10 @@ def _parse_targets(path: Path, sections: dict[str, list[tuple[int, str]]]) -> np
 
 def _whole(path: Path, section: list[tuple[int, str]], name: str, default: int) -> int:
     """Return the whole number that a line of a section gives, `default` where there is no such line."""
-    text = _keyed(section).get(re.sub(r"[^a-z]", "", name.lower()), "")
+    line, text = _keyed_lines(section).get(_key(name), (0, ""))
     if not text:
         return default
     if not re.fullmatch(r"\d{1,9}", text):
-        line = next(line for line, content in section if content.lower().startswith(name.lower()))
         raise LaserFormatError(
             f"{path}, line {line}: {name} is {text!r} and no whole number; copy the file again from the measuring computer"
         )

@@ -30,6 +30,8 @@ _LEAST_TRIANGLE_PX2 = 10.0
 _LEAST_FOR_TEST = 6
 #: Probability that a right disc is called wrong, for the whole list.
 _FALSE_ALARM = 1e-3
+#: Degrees of freedom below which a fit has nothing left that could contradict it.
+_LEAST_FREEDOM = 0.5
 #: A place that the others miss by less is as good as a calliper measures it, mm.
 _MISPLACED_MM = 0.2
 
@@ -106,7 +108,9 @@ def _passes(
     missed_mm = np.linalg.norm(
         np.linalg.solve(projection.jacobian(observations.centres_mm), errors[..., None])[..., 0], axis=1
     )
-    return np.asarray(~unlikely | (missed_mm < _MISPLACED_MM))
+    # Where the others alone determine the fit and no more, nothing tells whether an agreeing disc is wrong.
+    untold = agreeing & (freedom - 2 < _LEAST_FREEDOM)
+    return np.asarray(~unlikely | (missed_mm < _MISPLACED_MM) | untold)
 
 
 def _robust_start(observations: DiscObservations, ideal: Projection, *, calibrated: bool) -> NDArray[np.bool_]:

@@ -124,6 +124,7 @@ def test_feed_and_dwell_place_readings_within_their_run(tmp_path: Path) -> None:
         ("Run-count:4", "Run-count:2", r"Run-count is 2, but DEVIATIONS holds runs \[1, 2, 3, 4\]"),
         (": rtl", ": rta", "File type is rta, not rtl; only linear tests"),
         ("Run-count:4", "Run-count:ten", "line 13: Run-count is 'ten' and no whole number; copy the file again"),
+        ("Run-count:4", "Run+count:ten", "line 13: Run-count is 'ten' and no whole number"),
         ("Target-count: 3", "Target-count: five", "line 6: Target-count is 'five' and no whole number"),
         ("10.000000 \nFlags", "1_0.0\nFlags", r"line 9: '1_0.0' is not a row of target positions"),
         ("EOF::", "", "no section EOF::; the file is cut short"),

@@ -41,6 +41,13 @@ def test_right_places_are_not_called_wrong(rng, places_u_mm):
     assert lost <= 1
 
 
+def test_six_right_places_are_all_kept(rng):
+    # As six discs of a coarse camera lie, three of them nearly on a line: every five of them leave hardly a degree of freedom.
+    plan = np.array([(60, 30), (350, 32), (640, 35), (60, 145), (350, 150), (640, 148)], float)
+    lost = sum(not fit_agreeing(observed(rng, plan=plan), IDEAL, calibrated=False)[2].all() for _ in range(50))
+    assert lost <= 1
+
+
 def test_five_discs_cannot_be_told_apart(rng):
     observations = observed(rng, plan=PLAN[[0, 4, 5, 9, 10]])
     observations.centres_mm[0] += (20.0, 0.0)
