@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fusion.campaign.config import load_campaign
-from fusion.pipeline.provenance import hash_inputs, versions
+from fusion.pipeline.provenance import hash_files, versions
 from fusion.pipeline.run import run_campaign
 from fusion.products.progress import Report, silent
 from fusion.products.results import ResultsError
@@ -76,7 +76,7 @@ def reproduce(results: Path, *, campaign: Path | str | None = None, report: Repo
 def _compare(results: Path, provenance: Mapping[str, Any], path: Path, report: Report) -> Reproduction:
     """Compute a run again from a campaign file of this machine and compare it."""
     loaded = load_campaign(path)
-    strange = tuple(_compare_inputs(provenance["inputs"], hash_inputs(loaded.input_files(), report=report)))
+    strange = tuple(_compare_inputs(provenance["inputs"], hash_files(loaded.input_files(), report=report)))
     if strange:
         return Reproduction(False, (*strange, "the inputs are not those of the run, so it was not computed again"))
     remarks = tuple(_compare_versions(provenance["versions"], versions()))

@@ -13,6 +13,7 @@ from scipy import stats
 
 from fusion.comparison.profile_changes import SAME_POSITION_MM, ComparisonError, ProfileChange, compare_profiles
 from fusion.comparison.scatter_changes import compare_scatters
+from fusion.products.contracts import require_kind, require_own
 from fusion.products.grouped import group, has
 from fusion.products.results import Results, read_results
 from fusion.products.results_loop import AxisLoop, Coefficient
@@ -200,8 +201,9 @@ def _drift(path: Path) -> xr.Dataset | None:
     """Return the joint estimate of deviations.nc with its positions, without what belongs to single readings."""
     if not path.is_file():
         return None
+    require_own(path.parent, [path.name])
     with told_if_damaged(path), xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as stored:
-        if not has(stored, "drift"):
+        if not has(require_kind(stored, "deviations", path), "drift"):
             return None
         drift = group(stored, "drift").assign(position=stored["position"])
         return drift.drop_dims("cycle").load()

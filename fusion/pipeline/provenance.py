@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
@@ -42,15 +42,15 @@ def versions() -> dict[str, str]:
     return installed
 
 
-def hash_inputs(files: Mapping[str, Path], *, report: Report = silent) -> dict[str, dict[str, Any]]:
-    """Return size and SHA-256 of each input, keyed by its name relative to the campaign file.
+def hash_files(files: Mapping[str, Path], *, report: Report = silent) -> dict[str, dict[str, Any]]:
+    """Return size and SHA-256 of each file.
 
     Parameters
     ----------
     files : mapping of str to Path
-        Files by their name relative to the campaign file.
+        Inputs by their name relative to the campaign file, or products by theirs in the results folder.
     report : callable
-        ``report(label, done, total)``, for progress.
+        ``report(label, done, total)``, for progress through the inputs.
 
     Returns
     -------
@@ -86,7 +86,7 @@ def stamp_run(
     campaign : Campaign
         What was run.
     inputs : mapping
-        Result of `hash_inputs`, from before the run.
+        Result of `hash_files`, from before the run.
     products : sequence of Path
         Everything that the run wrote or kept.
     """
@@ -113,7 +113,7 @@ def kept_results(campaign: Campaign, folder: Path) -> Results | None:
         return None
     noted, files = stamps.note(_REPORT)["inputs"], campaign.input_files()
     sizes = {name: path.stat().st_size for name, path in files.items() if path.is_file()}
-    if sizes != {name: known["bytes"] for name, known in noted.items()} or hash_inputs(files) != noted:
+    if sizes != {name: known["bytes"] for name, known in noted.items()} or hash_files(files) != noted:
         return None
     return read_results(folder)
 
@@ -198,6 +198,7 @@ def describe_run(
     *,
     started: datetime,
     seconds: Mapping[str, float],
+    products: Iterable[Path] = (),
     address: str | None = None,
 ) -> dict[str, Any]:
     """Return the provenance of a run, without names of machine or user.
@@ -207,16 +208,19 @@ def describe_run(
     campaign : Campaign
         Stored as it was understood, with units in the names.
     inputs : mapping
-        Result of `hash_inputs`.
+        Result of `hash_files`.
     folder : Path
         Results folder.
     started : datetime
         Start of the run, UTC.
     seconds : mapping
         Wall time of each stage, s; 0 for a stage that was kept from an earlier run.
+    products : iterable of Path
+        What the run wrote for others to read; each is listed with its size and SHA-256.
     address : str or None
         Where the campaign file was fetched from; None for one of this machine.
     """
+    named = {path.relative_to(folder).as_posix(): path for path in products}
     return {
         "software": "thermofuse",
         "versions": versions(),
@@ -228,6 +232,7 @@ def describe_run(
         "stage_seconds": {name: round(value, 2) for name, value in seconds.items()},
         "parameters": campaign.model_dump(mode="json", exclude={"path"}, exclude_none=True),
         "inputs": dict(inputs),
+        "products": hash_files(named),
     }
 
 

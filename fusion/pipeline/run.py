@@ -28,7 +28,7 @@ from fusion.pipeline.provenance import (
     dependencies,
     describe_run,
     forget_run,
-    hash_inputs,
+    hash_files,
     input_states,
     kept_results,
     note_changes,
@@ -252,7 +252,7 @@ def _start_run(
     products = [name for name in FILES.values() if not name.startswith(".")]
     claim(folder, *products, *PAGES)
     started = datetime.now(UTC)
-    inputs = hash_inputs(campaign.input_files(), report=report)
+    inputs = hash_files(campaign.input_files(), report=report)
     stamps = StageStamps(folder)
     forget_run(stamps)
     return Run(campaign, folder, report, stamps, inputs, seen, started, address)
@@ -291,7 +291,7 @@ def _join_sensors(run: Run, source: Inputs, fields: xr.Dataset | None) -> dict[s
     run.parts["sensors"] = describe_sensors(joined, file=sensors.file)
     joined = run.described(joined)
     claim(run.folder, _SENSORS)
-    write_dataset(run.folder / _SENSORS, joined)
+    run.products.append(write_dataset(run.folder / _SENSORS, joined))
     return {"sensors": joined}
 
 
@@ -443,11 +443,17 @@ def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
     run.parts["plugins"] = [asdict(plugin) for plugin in plugins()]
     run.notices.extend(note_changes(run.seen, input_states(run.campaign)))
     results = assemble(run.campaign.campaign.title, run.parts, run.notices)
-    provenance = describe_run(
-        run.campaign, run.inputs, run.folder, started=run.started, seconds=run.seconds, address=run.address
-    )
     run.report("report", 0, 1)
-    write_json(run.folder / "results.json", results.as_json())
+    content = write_json(run.folder / "results.json", results.as_json())
+    provenance = describe_run(
+        run.campaign,
+        run.inputs,
+        run.folder,
+        started=run.started,
+        seconds=run.seconds,
+        products=[content, *(path for path in run.products if path.parent != run.folder / ".stages")],
+        address=run.address,
+    )
     write_json(run.folder / "provenance.json", provenance)
     write_text(run.folder / "report.html", render_report(results, provenance, datasets))
     stamp_run(run.stamps, run.campaign, run.inputs, [*run.products, *(run.folder / name for name in PAGES)])

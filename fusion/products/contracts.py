@@ -1,12 +1,30 @@
-"""Check of a Dataset against the contract of the instrument that made it."""
+"""Contracts of Datasets: what an instrument makes, and what a product of a run holds when it is read again."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeGuard
 
 import xarray as xr
 
 from fusion.errors import FusionError
+from fusion.products.store import DamagedProductError, file_sha256, read_dataset, read_json_object, read_tree
+from interferometry.contract import DEVIATIONS
+from thermography.contract import FIELDS
+
+_READINGS = {name: dims for name, (dims, *_) in DEVIATIONS.items()}
+#: What every product of a kind holds, whatever the campaign: variable -> dims.
+PRODUCTS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
+    "fields": {name: dims for name, (dims, *_) in FIELDS.items()},
+    "deviations": _READINGS,
+    "fusion": _READINGS,
+    "record": {"displacement": ("time", "channel"), "temperature": ("time", "sensor"), "predicted_u": ("channel",)},
+    "sensors": {
+        **dict.fromkeys(("temperature", "rise"), ("time", "sensor")),
+        **dict.fromkeys(("x", "y", "is_faulty", "fault"), ("sensor",)),
+    },
+}
 
 
 class ContractError(FusionError):
@@ -45,6 +63,116 @@ def check(dataset: xr.Dataset, contract: Mapping[str, tuple[tuple[str, ...], str
     if faults:
         raise ContractError(f"{name} breaks its contract: {'; '.join(faults)}")
     return dataset
+
+
+def read_product(folder: Path, name: str) -> xr.Dataset:
+    """Read a product of a run into memory.
+
+    Parameters
+    ----------
+    folder : Path
+        Results folder.
+    name : {"fields", "deviations", "fusion", "record", "sensors"}
+        Kind of product; of ``fusion.nc`` the root, which ``record`` reads as that of a record.
+
+    Returns
+    -------
+    Dataset
+
+    Raises
+    ------
+    DamagedProductError
+        If the file is not what the run wrote, see `require_own`, is no NetCDF, or holds something else.
+    FileNotFoundError
+        If there is none.
+    """
+    path = folder / ("fusion.nc" if name == "record" else f"{name}.nc")
+    require_own(folder, [path.name])
+    return require_kind(read_dataset(path), name, path)
+
+
+def read_fusion(folder: Path) -> xr.DataTree:
+    """Read the whole of ``fusion.nc`` into memory, as `read_product` reads its root.
+
+    Parameters
+    ----------
+    folder : Path
+        Results folder.
+    """
+    path = folder / "fusion.nc"
+    require_own(folder, [path.name])
+    tree = read_tree(path)
+    require_kind(tree.to_dataset(), "fusion", path)
+    return tree
+
+
+def require_kind(product: xr.Dataset, name: str, path: Path) -> xr.Dataset:
+    """Return a product that was opened, if it holds what every product of its kind does.
+
+    Parameters
+    ----------
+    product : Dataset
+        Content of the file.
+    name : str
+        Kind of product, a key of `PRODUCTS`.
+    path : Path
+        The file, for the message.
+
+    Raises
+    ------
+    DamagedProductError
+        With the variables that are missing, or lie over other dims.
+    """
+    lacks = [
+        f"{variable} {_tuple(dims)}"
+        for variable, dims in PRODUCTS[name].items()
+        if variable not in product.variables or product[variable].dims != dims
+    ]
+    if lacks:
+        raise DamagedProductError(
+            f"{path}: is another kind of file: {', '.join(lacks[:3])}{' and more' if len(lacks) > 3 else ''} not in it; "
+            "put the file of this run back, or run the campaign again"
+        )
+    return product
+
+
+def require_own(folder: Path, names: Iterable[str]) -> None:
+    """Refuse products that are not the files which the run of a folder wrote.
+
+    Parameters
+    ----------
+    folder : Path
+        Results folder; a run without ``products`` in its ``provenance.json`` is taken as it is.
+    names : iterable of str
+        Files in it; one that is absent is no matter of this check.
+
+    Raises
+    ------
+    DamagedProductError
+        If the SHA-256 of one differs from that in ``provenance.json``.
+    """
+    written = read_json_object(folder / "provenance.json").get("products")
+    known: dict[str, Any] = written if is_file_list(written) else {}
+    for name in names:
+        path = folder / name
+        if name in known and path.is_file() and file_sha256(path) != known[name]["sha256"]:
+            raise DamagedProductError(
+                f"{path}: is not the file that this run wrote (its SHA-256 is not that of provenance.json); put that file back, or run the "
+                "campaign again"
+            )
+
+
+def is_file_list(content: object) -> TypeGuard[dict[str, Any]]:
+    """Return whether JSON is a list of files as a provenance holds it: by name, with ``bytes`` and ``sha256`` of each.
+
+    Parameters
+    ----------
+    content : object
+        ``inputs`` or ``products`` of a provenance.json.
+    """
+    return isinstance(content, dict) and all(
+        isinstance(one, dict) and {"bytes", "sha256"} <= one.keys() for one in content.values()
+    )
 
 
 def _tuple(dims: tuple[object, ...]) -> str:

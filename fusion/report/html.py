@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,9 @@ import xarray as xr
 
 from fusion.attribution.family_wise import LEVEL
 from fusion.errors import FusionError
+from fusion.products.contracts import is_file_list, read_fusion, read_product
 from fusion.products.grouped import group, has
 from fusion.products.results import RecordLoop, Results, read_results
-from fusion.products.store import read_dataset, read_tree
 from fusion.report import record_section, summary_section
 from fusion.report.attribution_section import leading_region
 from fusion.report.charts import attribution, drift, iso230, neighbours, plan, prediction, readings, sensors, timeline
@@ -23,12 +23,8 @@ from fusion.report.charts.thermal_map import plot_thermal_map
 from fusion.report.page import render_page
 from interferometry.figures import evaluate_common_start, hours_since_start
 
-_READERS: Mapping[str, Callable[[Path], Any]] = {
-    "fields": read_dataset,
-    "deviations": read_dataset,
-    "fusion": read_tree,
-    "sensors": read_dataset,
-}
+#: Products that a report draws, where a campaign has them.
+_DRAWN = ("fields", "deviations", "fusion", "sensors")
 
 
 class ProductsError(FusionError):
@@ -134,10 +130,11 @@ def report_of(folder: Path) -> str:
         raise ProductsError(
             f"{origin}: not the provenance of a run; run the campaign again, with --resume to keep what is finished"
         )
-    there = {name: folder / f"{name}.nc" for name in _READERS if (folder / f"{name}.nc").is_file()}
     if isinstance(results.loop, RecordLoop):
-        return render_report(results, provenance, {"record": read_dataset(there["fusion"])})
-    return render_report(results, provenance, {name: _READERS[name](path) for name, path in there.items()})
+        return render_report(results, provenance, {"record": read_product(folder, "record")})
+    there = [name for name in _DRAWN if (folder / f"{name}.nc").is_file()]
+    read = {name: read_fusion(folder) if name == "fusion" else read_product(folder, name) for name in there}
+    return render_report(results, provenance, read)
 
 
 def _is_provenance(content: Any) -> bool:
@@ -147,7 +144,7 @@ def _is_provenance(content: Any) -> bool:
     parts = [content.get(key) for key in ("inputs", "versions", "parameters")]
     if not (all(isinstance(part, dict) for part in parts) and isinstance(content["parameters"].get("campaign"), dict)):
         return False
-    return all(isinstance(one, dict) and {"bytes", "sha256"} <= one.keys() for one in content["inputs"].values())
+    return is_file_list(content["inputs"])
 
 
 def _draw_charts(results: Results, datasets: Mapping[str, Any]) -> dict[str, Chart]:

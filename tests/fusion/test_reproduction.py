@@ -11,7 +11,7 @@ import pytest
 
 from fusion import reproduction as module
 from fusion.campaign.config import load_campaign
-from fusion.pipeline.provenance import hash_inputs, versions
+from fusion.pipeline.provenance import hash_files, versions
 from fusion.products.results import ResultsError
 from fusion.reproduction import reproduce
 
@@ -24,7 +24,7 @@ def finished(copied: Path) -> Path:
     results.mkdir()
     provenance = {
         "versions": versions(),
-        "inputs": hash_inputs(campaign.input_files()),
+        "inputs": hash_files(campaign.input_files()),
         "campaign_file": "../campaign.toml",
     }
     (results / "provenance.json").write_text(json.dumps(provenance))

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from fusion.products.contracts import read_product, require_kind
 from fusion.products.grouped import group, has
 from fusion.products.results import RecordLoop, Results, read_results
-from fusion.products.store import read_dataset, read_json_object, told_if_damaged
+from fusion.products.store import read_json_object, told_if_damaged
 from fusion.report.charts.thermal_map import LAYERS, Layer, scale_of
 
 #: Cycles from which the one colour scale of all cycles is taken; of a longer test evenly spaced ones.
@@ -60,13 +61,13 @@ class Products:
         if not path.is_file():
             return None
         with told_if_damaged(path):
-            return xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False, cache=False)
+            opened = xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False, cache=False)
+        return require_kind(opened, "fields", path)
 
     @cached_property
     def deviations(self) -> xr.Dataset | None:
         """Content of deviations.nc; None without a laser."""
-        path = self.folder / "deviations.nc"
-        return read_dataset(path) if path.is_file() else None
+        return read_product(self.folder, "deviations") if (self.folder / "deviations.nc").is_file() else None
 
     @cached_property
     def drift(self) -> xr.Dataset | None:
@@ -77,8 +78,8 @@ class Products:
     @cached_property
     def fusion(self) -> xr.Dataset | None:
         """Root of fusion.nc; None where a run has none."""
-        path = self.folder / "fusion.nc"
-        return read_dataset(path) if path.is_file() else None
+        kind = "record" if isinstance(self.results.loop, RecordLoop) else "fusion"
+        return read_product(self.folder, kind) if (self.folder / "fusion.nc").is_file() else None
 
     @cached_property
     def loop(self) -> xr.Dataset | None:

@@ -15,11 +15,12 @@ from fusion.campaign.inputs import read_laser
 from fusion.campaign.iso_budget import Origin, StatedBudget, material_by_cycle
 from fusion.pipeline.iso230.evaluation import evaluate_standard
 from fusion.pipeline.iso230.sheet import complete_sheet
+from fusion.products.contracts import read_product
 from fusion.products.grouped import joined
 from fusion.products.notices import left_out_notices
 from fusion.products.results import read_results
 from fusion.products.results_axis import Iso230Part
-from fusion.products.store import plain, read_dataset
+from fusion.products.store import plain
 from interferometry.drift.estimate import estimate_drift
 from interferometry.errors import InterferometryError
 from interferometry.inspection import describe_notes
@@ -109,7 +110,7 @@ def _of_results(folder: Path, cycles: str | None) -> StandardTest:
         raise CampaignError(
             f"{folder}: these results hold no evaluation by ISO 230-2 of this version; run the campaign again"
         )
-    dataset = read_dataset(folder / "deviations.nc")
+    dataset = read_product(folder, "deviations")
     return StandardTest(results.campaign, results.iso230, dataset, _remarks(dataset))
 
 

@@ -11,9 +11,10 @@ from pathlib import Path
 import pandas as pd
 import xarray as xr
 
+from fusion.products.contracts import read_product
 from fusion.products.grouped import has
 from fusion.products.results import Results, read_results
-from fusion.products.store import read_dataset, write_atomically
+from fusion.products.store import write_atomically
 from fusion.report.exports import tables
 from fusion.report.exports.controls import CONTROLS, Control
 from fusion.report.exports.errors import ExportError
@@ -108,10 +109,9 @@ def export_results(
     """
     if format not in FORMATS:
         raise ExportError(f'there is no format "{format}"; write one of {", ".join(FORMATS)}')
-    source = results / "deviations.nc"
-    if not source.is_file():
+    if not (results / "deviations.nc").is_file():
         return _export_camera(results, format, out, overwrite=overwrite)
-    found, deviations = read_results(results), read_dataset(source)
+    found, deviations = read_results(results), read_product(results, "deviations")
     content: dict[str, Writer]
     if format == "csv":
         content = _csv_files(results, found, deviations, with_fields=fields)
@@ -203,8 +203,8 @@ def _temperature_text(
     run: _Run, axis: str | None, reference_mm: float | None, *, force: bool
 ) -> tuple[dict[str, str], list[str]]:
     """Return the file of the temperature compensation by name, and what to tell the user."""
-    fused = run.folder / "fusion.nc"
-    material = read_dataset(fused).get("material_temperature") if fused.is_file() else None
+    there = (run.folder / "fusion.nc").is_file()
+    material = read_product(run.folder, "fusion").get("material_temperature") if there else None
     if material is None:
         raise ExportError(
             f"{run.folder}: no material temperature was logged; a temperature line needs one ([interferometry] environment)"

@@ -8,9 +8,10 @@ from pathlib import Path
 import pandas as pd
 import xarray as xr
 
+from fusion.products.contracts import read_product, require_kind
 from fusion.products.grouped import group, has
 from fusion.products.results import Results
-from fusion.products.store import read_dataset, told_if_damaged
+from fusion.products.store import told_if_damaged
 from fusion.report.findings import quoted_window
 from interferometry import iso230
 from thermography.fields.cycle_fields import plan_unit
@@ -117,7 +118,7 @@ def fields_table(folder: Path) -> pd.DataFrame:
     folder : Path
         Results folder with ``fields.nc``.
     """
-    fields = read_dataset(folder / "fields.nc")
+    fields = read_product(folder, "fields")
     frame = fields[["temperature", "temperature_rise", "temperature_rise_u"]].to_dataframe().dropna().reset_index()
     names = {"temperature": "temperature_degC", "temperature_rise": "rise_K", "temperature_rise_u": "rise_u_K"}
     unit = plan_unit(fields)
@@ -136,7 +137,7 @@ def fields_megabytes(folder: Path) -> float | None:
     if not path.is_file():
         return None
     with told_if_damaged(path), xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False) as fields:
-        return fields["temperature"].size * _FIELD_ROW_BYTES / 1e6
+        return require_kind(fields, "fields", path)["temperature"].size * _FIELD_ROW_BYTES / 1e6
 
 
 def _cycles_of(window: str, deviations: xr.Dataset) -> list[int] | None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from fusion.products.store import read_dataset
+from fusion.products.contracts import read_product
 from fusion.report.wording import moment
 
 #: Variables of fusion.nc that say how warm it was, and their names.
@@ -64,7 +64,7 @@ def read_thermal_state(folder: Path, deviations: xr.Dataset) -> ThermalState:
     cycles = deviations["cycle"].values
     found = {}
     if (folder / "fusion.nc").is_file():
-        fused = read_dataset(folder / "fusion.nc")
+        fused = read_product(folder, "fusion")
         for variable, name in _TEMPERATURES.items():
             if variable in fused and bool(fused[variable].notnull().any()):
                 values = fused[variable]

@@ -16,7 +16,7 @@ from fusion.pipeline.provenance import (
     FileState,
     dependencies,
     describe_run,
-    hash_inputs,
+    hash_files,
     input_states,
     kept_results,
     note_changes,
@@ -27,7 +27,7 @@ from fusion.pipeline.provenance import (
 def test_inputs_are_hashed_by_name(tmp_path: Path) -> None:
     (tmp_path / "laser.csv").write_bytes(b"readings")
     told: list[tuple[str, int, int]] = []
-    hashed = hash_inputs({"laser.csv": tmp_path / "laser.csv"}, report=lambda *step: told.append(step))
+    hashed = hash_files({"laser.csv": tmp_path / "laser.csv"}, report=lambda *step: told.append(step))
     assert hashed == {"laser.csv": {"bytes": 8, "sha256": hashlib.sha256(b"readings").hexdigest()}}
     assert told == [("input files", 0, 1), ("input files", 1, 1)]
 
@@ -40,6 +40,22 @@ def test_a_run_is_described_without_a_folder(campaign_folder: Path, monkeypatch:
     assert run["command"] == ["thermofuse", "run", "campaign.toml", "--resume"]
     assert run["started"] == "2026-03-09T06:30:00+00:00" and run["stage_seconds"] == {"fields": 1.23}
     assert run["parameters"]["plan"]["cell_size_mm"] == 20.0 and "path" not in run["parameters"]
+    assert run["products"] == {}
+
+
+def test_products_are_listed_with_their_hash(campaign_folder: Path, tmp_path: Path) -> None:
+    campaign, folder = load_campaign(campaign_folder / "campaign.toml"), tmp_path / "results"
+    (folder / "maps").mkdir(parents=True)
+    (folder / "maps" / "cycle_0001.exr").write_bytes(b"map")
+    run = describe_run(
+        campaign,
+        {},
+        folder,
+        started=datetime(2026, 3, 9, tzinfo=UTC),
+        seconds={},
+        products=[folder / "maps" / "cycle_0001.exr"],
+    )
+    assert run["products"] == {"maps/cycle_0001.exr": {"bytes": 3, "sha256": hashlib.sha256(b"map").hexdigest()}}
 
 
 @pytest.mark.parametrize(

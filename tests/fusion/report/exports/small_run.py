@@ -16,6 +16,7 @@ from interferometry.deviations import build_deviations
 from interferometry.drift.estimate import estimate_drift
 from interferometry.iso230 import evaluate_windows
 from tests.fusion.results_sample import PARTS
+from thermography.contract import FIELDS
 
 #: Unequal distances, as ISO 230-2 asks for.
 UNEVEN_MM = np.array([0.0, 26.0, 48.0, 77.0, 101.0, 124.0, 153.0, 175.0])
@@ -68,7 +69,10 @@ def write_fields(folder: Path) -> None:
     """Write a fields.nc of 2 cycles and 6 cells, one of which was never seen."""
     seen = np.ones((2, 2, 3), dtype=np.float32)
     seen[:, 0, 0] = np.nan
-    names = ("temperature", "temperature_rise", "temperature_rise_u")
-    coordinates = {"cycle": [1, 2], "y": [2.5, 7.5], "x": [2.5, 7.5, 12.5]}
-    fields = xr.Dataset(dict.fromkeys(names, (("cycle", "y", "x"), seen)), coords=coordinates)
+    moments = np.array(["2026-03-09T06:30", "2026-03-09T06:40"], dtype="datetime64[ns]")
+    coordinates = {"cycle": [1, 2], "y": [2.5, 7.5], "x": [2.5, 7.5, 12.5], "time": moments}
+    values = {("cycle",): moments, ("y", "x"): seen[0]}
+    fields = xr.Dataset(
+        {name: (dims, values.get(dims, seen)) for name, (dims, *_) in FIELDS.items()}, coords=coordinates
+    )
     write_dataset(folder / "fields.nc", fields)
