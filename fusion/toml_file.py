@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,17 @@ from fusion.errors import FusionError
 
 #: More than any campaign or recipe that a person writes, with thousands of file names listed one by one, bytes.
 _MOST_BYTES = 1_000_000
+#: More levels than any key of a campaign or recipe has: ``table.key`` with lists of lists is four.
+_MOST_LEVELS = 32
+#: A key of more levels, wherever it stands; the parser's time grows with the square of their number.
+_DEEP_KEY = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){%d}""" % _MOST_LEVELS)  # noqa: UP031
+#: Whole numbers of TOML have 64 bits.
+_INTEGERS = range(-(2**63), 2**63)
+
+
+_TOO_DEEP = (
+    f"brackets stand in brackets too many times, more than {_MOST_LEVELS} levels; no key here needs more than four"
+)
 
 
 class TomlError(FusionError):
@@ -34,7 +46,7 @@ def read_toml(path: Path) -> tuple[dict[str, Any], str]:
     Raises
     ------
     TomlError
-        If it is not TOML, has numbers of thousands of digits or brackets without end, or is longer than 1 MB.
+        If it is not TOML, has whole numbers of more than 64 bits or more than 32 levels, or is longer than 1 MB.
     UnicodeDecodeError
         If it is not UTF-8.
     OSError
@@ -48,12 +60,38 @@ def read_toml(path: Path) -> tuple[dict[str, Any], str]:
         content = file.read(_MOST_BYTES + 1)
     if len(content) > _MOST_BYTES:
         raise TomlError(f"it is longer than {_MOST_BYTES // 1_000_000} MB; name many files by a pattern")
-    # Line ends become one character, as of any text file.
-    text = content.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+    # Line ends become one character, as of any text file; a byte order mark, with which editors of Windows begin UTF-8, is no text.
+    text = content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+    deep = _DEEP_KEY.search(text)
+    if deep is not None:
+        line = text.count("\n", 0, deep.start()) + 1
+        raise TomlError(f"line {line} has a key of more than {_MOST_LEVELS} levels; no key here needs more than four")
     try:
-        return tomllib.loads(text), text
+        tables = tomllib.loads(text)
+        _require_bounds(tables)
+        return tables, text
     except RecursionError:
-        raise TomlError("brackets stand in brackets too many times") from None
+        raise TomlError(_TOO_DEEP) from None
+    except TomlError:
+        raise
     # Also whole numbers of thousands of digits, which the parser hands to Python.
     except ValueError as error:
         raise TomlError(str(error)) from None
+
+
+def _require_bounds(tables: dict[str, Any]) -> None:
+    """Refuse what the format allows and no reader of the values expects: levels without end, whole numbers beyond 64 bits."""
+    level: list[tuple[str, Any]] = list(tables.items())
+    for _ in range(_MOST_LEVELS):
+        for key, value in level:
+            if isinstance(value, int) and value not in _INTEGERS:
+                raise TomlError(f"{key} is a whole number beyond 64 bits; write a smaller one")
+        below = [
+            (f"{key}.{name}" if isinstance(value, dict) else key, item)
+            for key, value in level
+            if isinstance(value, dict | list)
+            for name, item in (value.items() if isinstance(value, dict) else enumerate(value))
+        ]
+        level = below
+    if level:
+        raise TomlError(_TOO_DEEP)

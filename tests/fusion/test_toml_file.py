@@ -18,16 +18,26 @@ def test_the_tables_and_the_text(tmp_path: Path) -> None:
     assert read_toml(path) == ({"campaign": {"title": "X"}}, "[campaign]\ntitle = 'X'\n")
 
 
+def test_a_byte_order_mark_of_windows_is_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_bytes(b"\xef\xbb\xbf[campaign]\r\ntitle = 'X'\r\n")
+    assert read_toml(path) == ({"campaign": {"title": "X"}}, "[campaign]\ntitle = 'X'\n")
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
         ("x = ", "Invalid value"),
         ("x = " + "[" * 100_000, "brackets stand in brackets too many times"),
         ("x = " + "{a=" * 20_000, "brackets stand in brackets too many times"),
+        ("x = " + "[" * 40 + "]" * 40, "brackets stand in brackets too many times, more than 32 levels"),
+        ("[" + ".".join(["a"] * 50_000) + "]", "line 1 has a key of more than 32 levels"),
+        ("y = 1\n" + " . ".join(["'a'"] * 40) + " = 1", "line 2 has a key of more than 32 levels"),
+        ("[x]\ny = [1, 0x" + "f" * 900_000 + "]", "x.y is a whole number beyond 64 bits; write a smaller one"),
         ("x = " + "9" * 6_000, "Exceeds the limit"),
         ("#" * 2_000_000, "longer than 1 MB"),
     ],
-    ids=["no value", "lists", "tables", "digits", "length"],
+    ids=["no value", "lists", "tables", "levels", "header", "key", "hexadecimal", "digits", "length"],
 )
 def test_whatever_stands_in_it_is_one_fault_with_the_file(tmp_path: Path, text: str, reason: str) -> None:
     path = tmp_path / "a.toml"
