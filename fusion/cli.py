@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import io
 import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,9 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from fusion.endings import ExitCode, answering, failed_code, interrupt_ends_step, leave
+from fusion.terminal import Terminal, printable, printable_json
 
 if TYPE_CHECKING:
     from fusion.products.progress import Report
@@ -28,8 +29,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-console = Console()
-errors = Console(stderr=True, soft_wrap=True)
+console = Terminal()
+errors = Terminal(stderr=True, soft_wrap=True)
 #: Characters of a line of a wide table where the output is no terminal.
 _TABLE_WIDTH = 160
 
@@ -64,7 +65,7 @@ def _kept(folders: Sequence[Path]) -> str:
 def _print_version(asked: bool) -> None:
     """Print name and version and stop, where asked."""
     if asked:
-        console.print(f"thermofuse {metadata.version('thermofuse')}", highlight=False)
+        console.print(f"thermofuse {metadata.version('thermofuse')}")
         raise typer.Exit
 
 
@@ -119,10 +120,10 @@ def run(
     Temperature maps, drift, anomalies, the closed loop, and report.html.
     """
     if len(campaigns) > 2:
-        errors.print("thermofuse: one campaign, or two of one machine, can be analysed at a time", highlight=False)
+        errors.print("thermofuse: one campaign, or two of one machine, can be analysed at a time")
         raise typer.Exit(ExitCode.BAD_INPUT)
     if watch and len(campaigns) > 1:
-        errors.print("thermofuse: one campaign can be watched at a time", highlight=False)
+        errors.print("thermofuse: one campaign can be watched at a time")
         raise typer.Exit(ExitCode.BAD_INPUT)
 
     places = [_place(text) for text in campaigns]
@@ -145,11 +146,11 @@ def run(
                 results = _run_or_keep(campaign, folder, resume=resume, scheduler=scheduler, report=report)
             if not quiet:
                 console.print(summary_table(results))
-                console.print(f"report: {(folder / 'report.html').resolve()}", soft_wrap=True, highlight=False)
+                console.print(f"report: {(folder / 'report.html').resolve()}", soft_wrap=True)
         if join is not None:
             for name, text in join([folder for _, folder in folders], folders[0][1].parent):
                 if not quiet:
-                    console.print(f"both campaigns, {name}: {text}", soft_wrap=True, highlight=False)
+                    console.print(f"both campaigns, {name}: {text}", soft_wrap=True)
 
 
 def _watch(campaign: Path, *, until_idle_s: float | None, wanted: str, quiet: bool) -> None:
@@ -165,9 +166,9 @@ def _watch(campaign: Path, *, until_idle_s: float | None, wanted: str, quiet: bo
         states = follow(load_campaign(campaign), until_idle_s=until_idle_s, wanted_u_um=wanted_u_um, stop=asked)
         for state in states:
             for warning in state.warnings:
-                errors.print(f"thermofuse: {warning}", highlight=False, markup=False)
+                errors.print(f"thermofuse: {warning}")
             if state.cycle is not None and not quiet:
-                console.print(live_line(state), soft_wrap=True, highlight=False, markup=False)
+                console.print(live_line(state), soft_wrap=True)
 
 
 def _run_or_keep(campaign: Path | str, folder: Path, *, resume: bool, scheduler: str | None, report: Report) -> Results:
@@ -203,6 +204,11 @@ def _progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
         return
     with Reporter(console) as report:
         yield report
+
+
+def _print_json(content: object, told: Callable[[str], str] = str) -> None:
+    """Print JSON for other programs; `told` puts in the address of what was fetched."""
+    sys.stdout.write(told(printable_json(json.dumps(content, indent=1, ensure_ascii=False))) + "\n")
 
 
 def _place(text: str) -> Path | str:
@@ -263,9 +269,7 @@ def fleet(
 
     def say(row: Row) -> None:
         what = row.message if row.state == "failed" else row.headline or row.state
-        (errors if row.state == "failed" else console).print(
-            f"{row.name}: {what}", soft_wrap=True, highlight=False, markup=False
-        )
+        (errors if row.state == "failed" else console).print(f"{row.name}: {what}", soft_wrap=True)
 
     with answering(errors, kept=kept):
         members = find_members(paths)
@@ -273,9 +277,9 @@ def fleet(
             said = (lambda row: say(row) if row.state == "failed" else None) if quiet else say
             rows = run_fleet(members, out, jobs=jobs, resume=resume, report=report, say=said)
         if not quiet:
-            wide = console if console.is_terminal else Console(width=_TABLE_WIDTH)
+            wide = console if console.is_terminal else Terminal(width=_TABLE_WIDTH)
             wide.print(summary_table(rows, count_line(rows)))
-            console.print(f"summary: {(out / 'fleet.html').resolve()}", soft_wrap=True, highlight=False)
+            console.print(f"summary: {(out / 'fleet.html').resolve()}", soft_wrap=True)
         failed = sum(row.state == "failed" for row in rows)
         if failed:
             raise typer.Exit(failed_code(failed))
@@ -303,16 +307,16 @@ def init(
         ask = (
             None
             if yes
-            else lambda question, default: typer.prompt(question, default=default, show_default=bool(default))
+            else lambda question, default: typer.prompt(
+                printable(f"{question} [{default}]" if default else question), default=default, show_default=False
+            )
         )
-        path, missing = write_campaign(
-            folder, Asker(ask, lambda text: errors.print(text, highlight=False, markup=False))
-        )
-        console.print(f"campaign: {path.resolve()}", soft_wrap=True, highlight=False, markup=False)
+        path, missing = write_campaign(folder, Asker(ask, lambda text: errors.print(text)))
+        console.print(f"campaign: {path.resolve()}", soft_wrap=True)
         lines = [f"not used: {line}" for line in unused_files(path)]
         lines += [f"to fill in, {line}" for line in missing] or check_campaign(path).lines()
         for line in lines:
-            console.print(line, soft_wrap=True, highlight=False, markup=False)
+            console.print(line, soft_wrap=True)
 
 
 @app.command("app")
@@ -335,7 +339,7 @@ def application(
             folder or Path.cwd(),
             port=port,
             open_browser=open_browser,
-            say=lambda address: console.print(f"app: {address}", soft_wrap=True, highlight=False, markup=False),
+            say=lambda address: console.print(f"app: {address}", soft_wrap=True),
         )
 
 
@@ -357,10 +361,10 @@ def check(
         place, told = _fetched(campaign, whole=True, quiet=quiet or as_json)
         checked = check_campaign(place)
         if as_json:
-            sys.stdout.write(told(json.dumps(checked.as_json(), indent=1, ensure_ascii=False)) + "\n")
+            _print_json(checked.as_json(), told)
         else:
             for line in checked.lines(quiet=quiet):
-                console.print(told(line), soft_wrap=True, highlight=False, markup=False)
+                console.print(told(line), soft_wrap=True)
         if checked.faults:
             raise typer.Exit(ExitCode.BAD_INPUT)
 
@@ -374,7 +378,7 @@ def _fetched(text: str, *, whole: bool, quiet: bool) -> tuple[Path, Callable[[st
     with _progress(quiet=quiet) as report:
         mirror = (fetch_campaign if whole else fetch_file)(text, report=report)
     if not quiet:
-        errors.print(mirror.line(), highlight=False, markup=False)
+        errors.print(mirror.line())
     return mirror.path, mirror.told
 
 
@@ -396,7 +400,7 @@ def reproduce(
         with Reporter(console) as report:
             found = compute_again(results, campaign=None if campaign is None else _place(campaign), report=report)
         for line in found.lines:
-            console.print(line, soft_wrap=True, highlight=False, markup=False)
+            console.print(line, soft_wrap=True)
         if not found.equal:
             raise typer.Exit(ExitCode.DIFFERENT)
 
@@ -415,7 +419,7 @@ def simulate(
 
     with _answering(), Reporter(console) as report:
         simulate_campaign(recipe, out, progress=lambda done, total, what: report(what, done, total))
-        console.print(f"campaign: {(out / 'campaign.toml').resolve()}", soft_wrap=True, highlight=False)
+        console.print(f"campaign: {(out / 'campaign.toml').resolve()}", soft_wrap=True)
 
 
 @app.command()
@@ -448,14 +452,14 @@ def inspect(
         for one in inspect_paths(places):
             looked_into.append(one)
             for line in [] if as_json else one.shown(quiet=quiet):
-                console.print(told(line), soft_wrap=True, highlight=False, markup=False)
+                console.print(told(line), soft_wrap=True)
         if thumbnails is not None:
             for picture in write_thumbnails(places, thumbnails):
                 if not (quiet or as_json):
-                    console.print(f"  thumbnail: {picture}", soft_wrap=True, highlight=False, markup=False)
+                    console.print(f"  thumbnail: {picture}", soft_wrap=True)
         if as_json:
             files = [one.as_json() for one in looked_into]
-            sys.stdout.write(told(json.dumps({"files": files}, indent=1, ensure_ascii=False)) + "\n")
+            _print_json({"files": files}, told)
         if any(one.fails for one in looked_into):
             raise typer.Exit(ExitCode.BAD_INPUT)
 
@@ -494,20 +498,20 @@ def iso230(
     with _answering():
         found = read_test(test, cycles)
         if as_json:
-            sys.stdout.write(json.dumps(iso230_json(found.part, found.dataset), indent=1) + "\n")
+            _print_json(iso230_json(found.part, found.dataset))
         elif as_csv:
             sys.stdout.write(iso230_csv(found.part, found.dataset))
         else:
             # Twelve columns: a file or a pipe, which has no width of its own, gets them on one line.
-            wide = console if console.is_terminal else Console(width=_TABLE_WIDTH)
+            wide = console if console.is_terminal else Terminal(width=_TABLE_WIDTH)
             for table in iso230_tables(found.part, found.dataset, title=found.title):
                 wide.print(table)
             for line in (*(() if found.part else (NO_SCATTER,)), *found.remarks):
-                console.print(line, soft_wrap=True, highlight=False, markup=False)
+                console.print(line, soft_wrap=True)
         if out is not None:
             page = render_iso230(found.title, found.part, found.dataset, remarks=found.remarks, versions=versions())
             write_iso230(out, page)
-            errors.print(f"page: {out.resolve()}", highlight=False, markup=False)
+            errors.print(f"page: {out.resolve()}")
 
 
 @app.command()
@@ -521,9 +525,9 @@ def schema(
 
     schemas = {"results": results_schema, "campaign": campaign_schema, "recipe": recipe_schema}
     if name not in schemas:
-        errors.print(f'thermofuse: there is no schema "{name}"; write results, campaign or recipe', highlight=False)
+        errors.print(f'thermofuse: there is no schema "{name}"; write results, campaign or recipe')
         raise typer.Exit(ExitCode.BAD_INPUT)
-    sys.stdout.write(json.dumps(schemas[name](), indent=1) + "\n")
+    _print_json(schemas[name]())
 
 
 @app.command()
@@ -567,9 +571,9 @@ def export(
             overwrite=overwrite,
         )
         for remark in exported.remarks:
-            errors.print(f"thermofuse: {remark}", highlight=False, markup=False)
+            errors.print(f"thermofuse: {remark}")
         for path in exported.files:
-            console.print(str(path), soft_wrap=True, highlight=False)
+            console.print(str(path), soft_wrap=True)
 
 
 @app.command()
@@ -599,7 +603,7 @@ def report(
             written = print_pdf(page, out or results / "report.pdf", browser=browser, full=full)
         else:
             written = write_text(out or results / "report.html", page)
-        console.print(str(written), soft_wrap=True, highlight=False)
+        console.print(str(written), soft_wrap=True)
 
 
 @app.command()
@@ -629,16 +633,16 @@ def compare(
     with _answering():
         pairs = compare_campaigns(results)
         if as_json:
-            sys.stdout.write(json.dumps(comparison_json(pairs), indent=1, ensure_ascii=False) + "\n")
+            _print_json(comparison_json(pairs))
             return
-        wide = console if console.is_terminal else Console(width=_TABLE_WIDTH)
+        wide = console if console.is_terminal else Terminal(width=_TABLE_WIDTH)
         wide.print(print_table(side_by_side(pairs), "Side by side"))
         names = campaign_names(pairs)
         for name, pair in zip(names[1:], pairs, strict=True):
             if pair.changes:
                 wide.print(print_table(changes_table(pair), f"{names[0]} -> {name}"))
             for line in (*conclude_comparison(pair), *(f"Not compared: {lack}" for lack in pair.not_compared)):
-                console.print(line, soft_wrap=True, highlight=False, markup=False)
+                console.print(line, soft_wrap=True)
 
 
 @app.command()
@@ -665,13 +669,17 @@ def plan(
 
     with _answering():
         for line in duty_lines(source, effect=effect, drift=drift, noise=noise, cycle=cycle, power=power, seed=seed):
-            console.print(line, soft_wrap=True, highlight=False, markup=False)
+            console.print(line, soft_wrap=True)
 
 
 def main() -> None:
     """Run the command line, as the script ``thermofuse`` or as a module; the exit code is that of the process."""
     # Loading libraries and drawing charts make very many small objects, which are not garbage: looking for some takes a tenth of a run.
     gc.set_threshold(50_000)
+    # A terminal or pipe of another encoding than UTF-8 shows what it has no character for as its number.
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         app(prog_name="thermofuse")
     except SystemExit as ended:

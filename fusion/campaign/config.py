@@ -19,7 +19,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from fusion.campaign.messages import describe, find_line, key_lines, suggest
+from fusion.campaign.messages import describe, find_line, first_faults, is_text, key_lines, near_file, suggest
 from fusion.campaign.needed_tables import check_tables
 from fusion.campaign.quantities import split_uncertainty
 from fusion.campaign.standard_test import AcceptanceTable, ReportTable, UncertaintyTable
@@ -51,6 +51,8 @@ from fusion.toml_file import TomlError, read_toml
 
 #: What a record may be declared with: every displacement a linear function of the temperatures.
 RECORD_EFFECTS = (QUASI_STATIC,)
+#: Folders of a pattern, each of which is searched within the one before.
+_MOST_PARTS = 64
 #: Effects that need positions along an axis; a record that declares them is run without, and the results say so.
 _ALONG_AN_AXIS = ("axis_expansion", "table_offset")
 #: Attribute of ``[thermography]`` -> its key, of what files of temperatures are corrected for already.
@@ -82,7 +84,7 @@ def _existing(name: str, info: ValidationInfo) -> str:
     if isinstance(info.context, _Surroundings):
         path = (info.context.folder / name).resolve()
         if not path.is_file():
-            text = f"no such file {path}; {_near_file(path)}paths are relative to the campaign file"
+            text = f"no such file {path}; {near_file(path)}paths are relative to the campaign file"
             raise PydanticCustomError("file", "{text}", {"text": text})
     return name
 
@@ -92,8 +94,10 @@ def _matching(pattern: str, info: ValidationInfo) -> str:
     if isinstance(info.context, _Surroundings):
         found = _matches(info.context.folder, pattern)
         lost = [path for path in found if not path.exists()]
-        if lost or not found:
+        unnamed = [path for path in found if not is_text(path.name)]
+        if lost or unnamed or not found:
             text = f"matches no file in {info.context.folder}; paths are relative to the campaign file"
+            text = f"{str(unnamed[0])!a} has a name that is no text in UTF-8; rename it" if unnamed else text
             text = f"{lost[0]} is a link to a file that is gone; bring it back or remove the link" if lost else text
             raise PydanticCustomError("pattern", "{text}", {"text": text})
     return pattern
@@ -657,7 +661,7 @@ def load_campaign(path: str | Path, *, effects: Mapping[str, Effect] | None = No
         details = [item for item in ordered if not (faults and item["type"] == "missing" and len(item["loc"]) == 1)]
         faults += [describe(_as_written(item, content), Campaign, place) for item in details]
     if faults:
-        raise CampaignError("\n".join(dict.fromkeys(faults)))
+        raise CampaignError("\n".join(first_faults(faults, path)))
     return campaign
 
 
@@ -681,6 +685,10 @@ def _as_written(item: ErrorDetails, content: Mapping[str, Any]) -> ErrorDetails:
 def _matches(folder: Path, pattern: str) -> list[Path]:
     """Return the files that a glob pattern, relative or absolute, matches; a link whose file is gone counts, so that it is missed."""
     given = Path(pattern)
+    if len(given.parts) > _MOST_PARTS:
+        raise PydanticCustomError(
+            "pattern", f"has more than {_MOST_PARTS} folders; name the files from a folder nearer to them"
+        )
     found = Path(given.anchor).glob(str(given.relative_to(given.anchor))) if given.anchor else folder.glob(pattern)
     there = [path for path in found if path.is_file() or (path.is_symlink() and not path.exists())]
     return [path.resolve() if path.exists() and not given.anchor else path for path in there]
@@ -689,11 +697,3 @@ def _matches(folder: Path, pattern: str) -> list[Path]:
 def _each_match(folder: Path, patterns: tuple[str, ...]) -> tuple[Path, ...]:
     """Return the files that patterns match, each once, in the order of the patterns and of the names that one pattern matches."""
     return tuple(dict.fromkeys(path for pattern in patterns for path in sorted(_matches(folder, pattern))))
-
-
-def _near_file(path: Path) -> str:
-    """Return the hint that names the nearest file of the same folder."""
-    if not path.parent.is_dir():
-        return ""
-    names = [item.name for item in path.parent.iterdir() if item.is_file()]
-    return suggest(path.name, names)

@@ -9,6 +9,7 @@ import difflib
 import json
 import re
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
@@ -27,6 +28,8 @@ _REMEDIES = {
     "too_short": "this list is empty; fill it in",
     "model_type": "this is a table; write it as [name] with its keys below",
 }
+#: Faults of one file that are told one by one.
+_MOST_FAULTS = 30
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
@@ -41,6 +44,46 @@ def suggest(name: str, known: Iterable[str]) -> str:
     """
     near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
     return f"did you mean {near[0]}? " if near else ""
+
+
+def is_text(name: str) -> bool:
+    """Return whether the name of a file is text: others cannot be written into results.
+
+    Parameters
+    ----------
+    name : str
+        As the system gives it, with halves of characters in place of bytes that are no UTF-8.
+    """
+    return not any("\ud800" <= character <= "\udfff" for character in name)
+
+
+def near_file(path: Path) -> str:
+    """Return the hint that names the nearest file of the same folder.
+
+    Parameters
+    ----------
+    path : Path
+        What was named, and is not there.
+    """
+    if not path.parent.is_dir():
+        return ""
+    names = [item.name for item in path.parent.iterdir() if item.is_file()]
+    return suggest(path.name, names)
+
+
+def first_faults(faults: Iterable[str], path: Path) -> list[str]:
+    """Return the faults of a campaign file that are told, each once; of very many the first, and how many more there are.
+
+    Parameters
+    ----------
+    faults : iterable of str
+        One sentence each.
+    path : Path
+        The campaign file.
+    """
+    told = list(dict.fromkeys(faults))
+    more = len(told) - _MOST_FAULTS
+    return told if more <= 0 else [*told[:_MOST_FAULTS], f"{path}: and {more} more faults"]
 
 
 def describe(item: ErrorDetails, model: type[BaseModel], place: Place) -> str:

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import rich.table
-from rich.markup import escape
 
 from fusion.products.results import ResultsError, read_results
 from fusion.report.conclusions.answers import headline
 from fusion.report.wording import measured, number
+from fusion.terminal import cell
 
 State = Literal["finished", "kept", "failed", "stopped", "waiting"]
 SUMMARY = "fleet.json"
@@ -207,11 +207,11 @@ def summary_table(rows: Sequence[Row], title: str) -> rich.table.Table:
     title : str
         Line above the table.
     """
-    printed = rich.table.Table(title=escape(title), title_justify="left")
+    printed = rich.table.Table(title=cell(title), title_justify="left")
     for heading in HEADINGS[:_SHOWN]:
         printed.add_column(heading, justify="left" if heading in TEXT else "right", overflow="fold")
     for row in rows:
-        printed.add_row(*map(escape, cells(row)[:_SHOWN]))
+        printed.add_row(*map(cell, cells(row)[:_SHOWN]))
     return printed
 
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 
 import rich.table
 
+from fusion.terminal import cell
+
 
 @dataclass(frozen=True)
 class Column:
@@ -88,9 +90,9 @@ def print_table(shown: Table, title: str) -> rich.table.Table:
     title : str
         Line above the table.
     """
-    printed = rich.table.Table(title=title, title_justify="left")
+    printed = rich.table.Table(title=cell(title), title_justify="left")
     for column in shown.columns:
-        printed.add_column(column.title, justify="right" if column.numeric else "left")
+        printed.add_column(cell(column.title), justify="right" if column.numeric else "left")
     for row in shown.rows:
-        printed.add_row(*row.cells)
+        printed.add_row(*map(cell, row.cells))
     return printed

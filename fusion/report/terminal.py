@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 
 import rich.table
-from rich.markup import escape
 
 from fusion.campaign.quantities import read_quantity
 from fusion.products.results import Results
@@ -29,6 +28,7 @@ from fusion.report.wording import (
     p_words,
     untouched,
 )
+from fusion.terminal import cell
 
 
 def summary_table(results: Results) -> rich.table.Table:
@@ -39,12 +39,12 @@ def summary_table(results: Results) -> rich.table.Table:
     results : Results
         Results of a run.
     """
-    printed = rich.table.Table(title=results.campaign, title_justify="left", show_header=False, pad_edge=False)
+    printed = rich.table.Table(title=cell(results.campaign), title_justify="left", show_header=False, pad_edge=False)
     printed.add_column(no_wrap=True)
     printed.add_column(overflow="fold")
     for name, text in summary_rows(results):
         # Names of keys stand in brackets, which rich would take for styles.
-        printed.add_row(escape(name), escape(text))
+        printed.add_row(cell(name), cell(text))
     return printed
 
 

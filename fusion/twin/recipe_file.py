@@ -18,6 +18,8 @@ from fusion.twin.machine.effects import EFFECTS
 from fusion.twin.machine.recipe import EffectRecipe, Recipe, RecipeError
 
 _RECIPE = TypeAdapter(Recipe)
+#: Faults of one file that are told one by one; the others are counted.
+_MOST_FAULTS = 30
 #: What to write instead, where pydantic's own words name a Python type.
 _REMEDIES = {
     "bool_type": "write true or false",
@@ -238,7 +240,9 @@ def _faults_of_parameters(effect: EffectRecipe) -> Iterator[str]:
 
 def _sentences(error: ValidationError) -> str:
     """Return what pydantic found, each with key, value and remedy."""
-    return "; also ".join(_sentence(fault) for fault in error.errors())
+    faults = error.errors()
+    more = [f"{len(faults) - _MOST_FAULTS} more faults"] if len(faults) > _MOST_FAULTS else []
+    return "; also ".join([*map(_sentence, faults[:_MOST_FAULTS]), *more])
 
 
 def _sentence(fault: ErrorDetails) -> str:

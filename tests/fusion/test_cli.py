@@ -27,8 +27,8 @@ def invoke(*arguments: str | Path) -> Result:
 @pytest.fixture(autouse=True)
 def _consoles_follow_the_runner(monkeypatch: pytest.MonkeyPatch) -> None:
     """The runner swaps stdout and stderr after import, so the consoles have to look them up anew."""
-    monkeypatch.setattr(cli, "console", cli.Console(width=160))
-    monkeypatch.setattr(cli, "errors", cli.Console(stderr=True, soft_wrap=True))
+    monkeypatch.setattr(cli, "console", cli.Terminal(width=160))
+    monkeypatch.setattr(cli, "errors", cli.Terminal(stderr=True, soft_wrap=True))
 
 
 def test_run_ends_with_a_summary_and_the_report(results_folder: Path, campaign_folder: Path, tmp_path: Path) -> None:

@@ -50,3 +50,30 @@ def test_whatever_stands_in_it_is_one_fault_with_the_file(tmp_path: Path, text: 
         read_recipe(path)
     found = recognise(path)
     assert found.kind is Kind.UNKNOWN and reason in found.reason
+
+
+def test_very_many_faults_are_counted(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text("\n".join(f"a{number} = 1" for number in range(2_000)))
+    with pytest.raises(CampaignError, match=r"a\.toml: and 1971 more faults$"):
+        load_campaign(path)
+    with pytest.raises(RecipeError, match=r"also 1970 more faults$"):
+        read_recipe(path)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "reason"),
+    [
+        ("*/" * 2_000 + "*", "has more than 64 folders"),
+        ("*.jpg", r"IR_\\udcff\.jpg' has a name that is no text in UTF-8"),
+    ],
+)
+def test_patterns_without_end_and_names_that_are_no_text_are_refused(tmp_path: Path, pattern: str, reason: str) -> None:
+    try:
+        (tmp_path / "IR_\udcff.jpg").write_bytes(b"")
+    except OSError:
+        pytest.skip("this file system has no such names")
+    path = tmp_path / "a.toml"
+    path.write_text(f'[thermography]\nframes = ["{pattern}"]\n')
+    with pytest.raises(CampaignError, match=rf"a\.toml, line 2: thermography\.frames = .*{reason}"):
+        load_campaign(path)

@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 
 import typer
-from rich.console import Console
 
 from fusion.endings import answering
+from fusion.terminal import Terminal
 
 
 def main(campaign: str, results: str, *more: str) -> int:
@@ -30,7 +30,7 @@ def main(campaign: str, results: str, *more: str) -> int:
         Exit code of the process, as that of the command.
     """
     try:
-        with answering(Console(stderr=True, soft_wrap=True)):
+        with answering(Terminal(stderr=True, soft_wrap=True)):
             write_progress("start", 0, 1)
             from fusion.pipeline.run import run_campaign
 
