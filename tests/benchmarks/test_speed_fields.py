@@ -69,15 +69,15 @@ def registration():
 
 
 def take_turns(*works: Callable[[], object], rounds: int = 9) -> np.ndarray:
-    """Wall times, (rounds, works), s: all take turns, because the machine may be shared; their ratios are compared round by round."""
+    """Wall and processor times, (2, works, rounds), s: all take turns, because the machine may be shared; ratios are taken by rounds."""
     for work in works:
         work()
-    times = np.empty((rounds, len(works)))
-    for row in times:
+    times = np.empty((2, len(works), rounds))
+    for turn in range(rounds):
         for i, work in enumerate(works):
-            start = time.perf_counter()
+            wall, processor = time.perf_counter(), time.process_time()
             work()
-            row[i] = time.perf_counter() - start
+            times[:, i, turn] = time.perf_counter() - wall, time.process_time() - processor
     return times
 
 
@@ -85,6 +85,11 @@ def median_of(values: np.ndarray) -> str:
     """Median, with the quartiles over the rounds."""
     low, middle, high = np.percentile(values, (25, 50, 75))
     return f"{middle:.3g} ({low:.3g} to {high:.3g})"
+
+
+def processor_line(ours: np.ndarray, peer: np.ndarray) -> str:
+    """Processor time of a frame of the whole film and of 60 that the peer reads: with two threads, half of it passes on two free cores."""
+    return f"by processor time {1e3 * np.median(ours) / FRAMES:.3f} ms a frame, {median_of(peer / 60 * FRAMES / ours)} x on one core"
 
 
 def flirpy_reads(path: Path, frames: int) -> None:
@@ -114,12 +119,14 @@ def test_still_table_file_to_cycle_fields(film: Path, registration) -> None:
     def set_up() -> None:
         reduce_frames(references[:2], registration, GRID, bounds)
 
-    ours, start, peer, limit = take_turns(reduce, set_up, lambda: flirpy_reads(film, 60), lambda: map_and_sum(film)).T
+    (ours, start, peer, limit), (ours_cpu, _, peer_cpu, _) = take_turns(
+        reduce, set_up, lambda: flirpy_reads(film, 60), lambda: map_and_sum(film)
+    )
     print(
         f"\nstill: {median_of(FRAMES / ours)} frames/s with index and set-up ({np.median(start):.3f} s); "
         f"against flirpy Seq to temperature ({median_of(60 / peer)} frames/s): {median_of(peer / 60 * FRAMES / ours)} x; "
         f"against summing the mapped file ({median_of(FRAMES / limit)} frames/s): {median_of(limit / ours)}, "
-        f"without set-up {median_of(limit / (ours - start))}"
+        f"without set-up {median_of(limit / (ours - start))}; {processor_line(ours_cpu, peer_cpu)}"
     )
 
 
@@ -131,11 +138,10 @@ def test_moving_table(film: Path, registration) -> None:
     def reduce() -> None:
         reduce_moving_frames(references, registration, GRID, bounds, direction=(-1, 0))
 
-    times = take_turns(reduce, lambda: flirpy_reads(film, 60), rounds=5)
-    ours, peer = times.T
+    (ours, peer), (ours_cpu, peer_cpu) = take_turns(reduce, lambda: flirpy_reads(film, 60), rounds=5)
     print(
         f"\nmoving: {median_of(FRAMES / ours)} frames/s; "
-        f"against flirpy Seq to temperature: {median_of(peer / 60 * FRAMES / ours)} x"
+        f"against flirpy Seq to temperature: {median_of(peer / 60 * FRAMES / ours)} x; {processor_line(ours_cpu, peer_cpu)}"
     )
 
 
@@ -157,7 +163,7 @@ def test_cold_file(film: Path, registration) -> None:
         drop()
         reduce_frames(references, registration, GRID, bounds_of(FRAMES, 2))
 
-    ours, reader = take_turns(reduce, plain).T
+    ours, reader = take_turns(reduce, plain)[0]
     print(
         f"\ncold: {median_of(FRAMES / ours)} frames/s, plain reader {median_of(FRAMES / reader)}: "
         f"{median_of(reader / ours)} of its speed"
@@ -167,7 +173,7 @@ def test_cold_file(film: Path, registration) -> None:
 def test_recalibration_of_100_cycles(film: Path, registration, tmp_path: Path) -> None:
     references, _ = index_frames([film])
     reduce_frames(references, registration, GRID, bounds_of(FRAMES, 100), checkpoint=tmp_path)
-    again, whole = take_turns(
+    (again, whole), _ = take_turns(
         lambda: recalibrate(
             tmp_path,
             [RegistrationSpan(0, registration)],
@@ -177,7 +183,7 @@ def test_recalibration_of_100_cycles(film: Path, registration, tmp_path: Path) -
         ),
         lambda: reduce_frames(references, registration, GRID, bounds_of(FRAMES, 100)),
         rounds=5,
-    ).T
+    )
     print(
         f"\nrecalibrating 100 cycles: {median_of(again)} s, reducing their frames anew ({FRAMES // 100} per cycle) {median_of(whole)} s: "
         f"{median_of(whole / again)} x"

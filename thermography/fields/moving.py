@@ -17,7 +17,15 @@ from thermography.fields.blocks import BLOCK_FRAMES, Block, cut_blocks
 from thermography.fields.checkpoint import Checkpoint, describe_reduction
 from thermography.fields.cycle_fields import CyclePart, assemble_fields, pixel_noise, position_covariance
 from thermography.fields.inputs import NO_CYCLE, FrameSeries, Override, ReductionError, make_frame_series
-from thermography.fields.moving_sampling import CellSums, Samples, add_frame, on_plan, sample_points
+from thermography.fields.moving_sampling import (
+    CellSums,
+    CellWeights,
+    Samples,
+    add_frame,
+    on_plan,
+    sample_points,
+    weigh_pixels,
+)
 from thermography.fields.scheduling import in_order, open_pool
 from thermography.fields.still import BLOCK_S
 from thermography.fields.tasks.frame_run import FrameRun
@@ -33,6 +41,8 @@ from thermography.registration.tracking import TableTracker, locate_table, make_
 
 #: Frames in which the position of the table is less certain than this are left out of the fields, mm.
 _LARGEST_U_MM = 1.0
+#: A table whose place differs by no more than this stands, and its frames are sampled alike, mm: the place of one frame is known no better.
+_STANDING_MM = 0.02
 
 _ATTRIBUTES: dict[str, dict[str, Any]] = {
     "temperature_spread": {"long_name": "standard deviation of the cell's temperature over the frames of the cycle"},
@@ -261,6 +271,7 @@ def _reduce_block(
     shift_mm, u_mm = np.full((len(frames), 2), np.nan), np.full(len(frames), np.nan)
     discs = np.zeros(len(frames), np.int64)
     previous = None
+    sampling = _Sampling(tracker, samples)
     with WindowReader((slice(0, rows), slice(0, columns))) as reader:
         for start, chunk in zip(
             range(0, len(frames), CHUNK_FRAMES), reader.read_in_chunks(frames, CHUNK_FRAMES), strict=True
@@ -272,11 +283,23 @@ def _reduce_block(
                     continue
                 shift_mm[i], u_mm[i], discs[i] = position.shift_mm, position.u_mm, position.discs
                 if position.u_mm <= _LARGEST_U_MM:
-                    correction, shift = float(correction_K[i]), position.shift_mm
-                    add_frame(
-                        counts, calibration, samples.points_mm, samples.valid, shift, tracker.lens, correction, sums
-                    )
+                    add_frame(counts, calibration, sampling.at(position.shift_mm), float(correction_K[i]), sums)
     return _BlockResult(*sums, shift_mm, u_mm, discs)
+
+
+class _Sampling:
+    """Weights of the pixels where the table stands, computed again when it has moved."""
+
+    def __init__(self, tracker: TableTracker, samples: Samples) -> None:
+        self.tracker, self.samples = tracker, samples
+        self.shift_mm = np.full(2, np.nan)
+
+    def at(self, shift_mm: Array) -> CellWeights:
+        """Weights for a displacement (x, y) of the table, mm."""
+        if not np.hypot(*(shift_mm - self.shift_mm)) <= _STANDING_MM:
+            points, valid, shape = self.samples.points_mm, self.samples.valid, self.tracker.registration.shape
+            self.shift_mm, self.weights = shift_mm, weigh_pixels(points, valid, shift_mm, self.tracker.lens, shape)
+        return self.weights
 
 
 def _assemble(

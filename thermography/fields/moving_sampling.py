@@ -20,7 +20,7 @@ from thermography.registration.register import Registration
 _POINTS_PER_SIDE = 4
 #: Range of the counts within a cell up to which they are averaged before they are calibrated: the temperature of the mean count
 #: differs from the mean temperature by a few hundredths of a millikelvin.
-_NARROW_COUNTS = 600.0
+_NARROW_COUNTS = 600
 
 
 @dataclass(frozen=True)
@@ -110,18 +110,109 @@ class _CellView(NamedTuple):
     row_by_y: float
 
 
+class CellWeights(NamedTuple):
+    """Weights of the pixels in the mean of every cell, for one place of the table.
+
+    Attributes
+    ----------
+    windows : (cells, 5) ndarray of unsigned int
+        First column, first row, number of columns and of rows of the pixels around a cell's points, and the place of the first one's
+        weight; no columns where an unmasked point is out of view.
+    weights : (pixels of all windows,) ndarray
+        Cell by cell, row by row; those of a cell sum to 1.
+    """
+
+    windows: Array
+    weights: Array
+
+
 @numba.njit(cache=True, nogil=True)
-def add_frame(
-    counts: Array,
-    calibration: Array,
-    points: Array,
-    valid: Array,
-    shift: Array,
-    lens: Array,
-    correction: float,
-    sums: CellSums,
-) -> None:
-    """Sample one frame and add it to every cell whose unmasked points are all in view.
+def weigh_pixels(points: Array, valid: Array, shift: Array, lens: Array, shape: tuple[int, int]) -> CellWeights:
+    """Weigh the pixels around the points of every cell, each of which is interpolated between four pixels (bilinear).
+
+    Parameters
+    ----------
+    points, valid : (cells, points, 2) ndarray, mm, and (cells, points) ndarray of bool
+        Of `Samples`.
+    shift : (2,) ndarray, mm
+        Displacement (x, y) of the table.
+    lens : (16,) ndarray
+        `thermography.registration.projection.Projection.as_array`.
+    shape : (int, int)
+        Rows and columns of the frames.
+
+    Returns
+    -------
+    CellWeights
+    """
+    places, windows, pixels = _place_points(points, valid, shift, lens, shape)
+    weights = np.zeros(pixels)
+    one = np.uint64(1)
+    for cell in range(len(points)):
+        left, top, columns, first = windows[cell, 0], windows[cell, 1], windows[cell, 2], windows[cell, 4]
+        if columns == 0:
+            continue
+        used = 0
+        for k in range(valid.shape[1]):
+            used += valid[cell, k]
+        for k in range(valid.shape[1]):
+            if valid[cell, k]:
+                column, row = places[cell, k, 0], places[cell, k, 1]
+                j, i = np.uint64(int(column)), np.uint64(int(row))
+                u, v = column - j, row - i
+                upper = first + (i - top) * columns + (j - left)
+                lower = upper + columns
+                below = v / used
+                above = 1 / used - below
+                weights[upper] += above - u * above
+                weights[upper + one] += u * above
+                weights[lower] += below - u * below
+                weights[lower + one] += u * below
+    return CellWeights(windows, weights)
+
+
+@numba.njit(cache=True, nogil=True)
+def _place_points(
+    points: Array, valid: Array, shift: Array, lens: Array, shape: tuple[int, int]
+) -> tuple[Array, Array, int]:
+    """Columns and rows of all points, (cells, points, 2) px; the windows of the cells, as `CellWeights`; the pixels of all windows."""
+    places = np.empty(points.shape)
+    # Unsigned: negative indices would be counted from the end, and looking for them costs as much as the sums themselves.
+    windows = np.zeros((len(points), 5), np.uint64)
+    pixels = 0
+    for cell in range(len(points)):
+        view = _cell_view(points, cell, shift, lens)
+        left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
+        for k in range(points.shape[1]):
+            x, y = points[cell, k, 0] - view.x_mm, points[cell, k, 1] - view.y_mm
+            column = view.column + x * view.column_by_x + y * view.column_by_y
+            row = view.row + x * view.row_by_x + y * view.row_by_y
+            places[cell, k, 0], places[cell, k, 1] = column, row
+            if valid[cell, k]:
+                left, right, top, bottom = min(left, column), max(right, column), min(top, row), max(bottom, row)
+        if 0 <= left <= right < shape[1] - 1 and 0 <= top <= bottom < shape[0] - 1:
+            columns, rows = int(right) - int(left) + 2, int(bottom) - int(top) + 2
+            windows[cell, 0], windows[cell, 1], windows[cell, 2] = int(left), int(top), columns
+            windows[cell, 3], windows[cell, 4] = rows, pixels
+            pixels += columns * rows
+    return places, windows, pixels
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _cell_view(points: Array, cell: int, shift: Array, lens: Array) -> _CellView:
+    """The affine map about the middle one of a cell's points, of a table displaced by `shift`."""
+    middle = points.shape[1] // 2
+    x_mm, y_mm = points[cell, middle, 0], points[cell, middle, 1]
+    x, y = x_mm + shift[0], y_mm + shift[1]
+    c0, r0 = project_point(x, y, lens)
+    c1, r1 = project_point(x + 1.0, y, lens)
+    c2, r2 = project_point(x, y + 1.0, lens)
+    return _CellView(x_mm, y_mm, c0, r0, c1 - c0, c2 - c0, r1 - r0, r2 - r0)
+
+
+@numba.njit(cache=True, nogil=True)
+def add_frame(counts: Array, calibration: Array, sampling: CellWeights, correction: float, sums: CellSums) -> None:
+    """Average one frame over every cell that it shows, and add it to the sums.
 
     Parameters
     ----------
@@ -129,12 +220,8 @@ def add_frame(
         Raw counts.
     calibration : (65536,) ndarray, degC
         Temperature of every count.
-    points, valid : (cells, points, 2) ndarray, mm, and (cells, points) ndarray of bool
-        Of `Samples`.
-    shift : (2,) ndarray, mm
-        Displacement (x, y) of the table in this frame.
-    lens : (16,) ndarray
-        `thermography.registration.projection.Projection.as_array`.
+    sampling : CellWeights
+        Of the place of the table in this frame.
     correction : float, K
         Added to the temperature.
     sums : CellSums
@@ -145,10 +232,17 @@ def add_frame(
     Updating of mean and squared deviation after B. P. Welford, Technometrics 4 (1962) 419-420.
     """
     frames, mean, squares = sums
-    for cell in range(len(points)):
-        seen, temperature = _cell_temperature(counts, calibration, points, valid, cell, shift, lens)
-        if not seen:
+    windows, weights = sampling
+    temperatures = np.empty(len(windows))
+    for cell in range(len(windows)):
+        if windows[cell, 2] > 0:
+            temperatures[cell] = _temperature_of_mean(counts, windows[cell], weights, calibration)
+    for cell in range(len(windows)):
+        if windows[cell, 2] == 0:
             continue
+        temperature = temperatures[cell]
+        if np.isnan(temperature):
+            temperature = _mean_temperature(counts, windows[cell], weights, calibration)
         temperature += correction
         frames[cell] += 1
         step = temperature - mean[cell]
@@ -156,62 +250,32 @@ def add_frame(
         squares[cell] += step * (temperature - mean[cell])
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def _cell_temperature(
-    counts: Array, calibration: Array, points: Array, valid: Array, cell: int, shift: Array, lens: Array
-) -> tuple[bool, float]:
-    """Whether all unmasked points of one cell are in view, and the mean temperature over them, degC."""
-    rows, columns = counts.shape
-    middle = points.shape[1] // 2
-    view = _cell_view(points[cell, middle, 0], points[cell, middle, 1], shift, lens)
-    total, used, low, high = 0.0, 0, 1e9, -1e9
-    for k in range(points.shape[1]):
-        if valid[cell, k]:
-            column, row = _on_sensor(view, points[cell, k, 0], points[cell, k, 1])
-            if column < 0 or row < 0 or column >= columns - 1 or row >= rows - 1:
-                return False, np.nan
-            value = _interpolate(counts, column, row)
-            total += value
+@numba.njit(cache=True, nogil=True)
+def _temperature_of_mean(counts: Array, window: Array, weights: Array, calibration: Array) -> float:
+    """Temperature of the mean count of a cell, degC; NaN where the counts of its pixels differ too much for that."""
+    left, top, columns, rows, place = window[0], window[1], window[2], window[3], window[4]
+    total, low, high = 0.0, np.uint16(65535), np.uint16(0)
+    for i in range(top, top + rows):
+        for j in range(left, left + columns):
+            value = counts[i, j]
+            total += weights[place] * value
+            place += np.uint64(1)
             low, high = min(low, value), max(high, value)
-            used += 1
-    if used == 0:
-        return False, np.nan
-    if high - low <= _NARROW_COUNTS:
-        return True, _calibrate(calibration, total / used)
-    total = 0.0
-    for k in range(points.shape[1]):
-        if valid[cell, k]:
-            column, row = _on_sensor(view, points[cell, k, 0], points[cell, k, 1])
-            total += _calibrate(calibration, _interpolate(counts, column, row))
-    return True, total / used
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
-def _cell_view(x_mm: float, y_mm: float, shift: Array, lens: Array) -> _CellView:
-    """The affine map about a plan point of a table displaced by `shift`."""
-    x, y = x_mm + shift[0], y_mm + shift[1]
-    c0, r0 = project_point(x, y, lens)
-    c1, r1 = project_point(x + 1.0, y, lens)
-    c2, r2 = project_point(x, y + 1.0, lens)
-    return _CellView(x_mm, y_mm, c0, r0, c1 - c0, c2 - c0, r1 - r0, r2 - r0)
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
-def _on_sensor(view: _CellView, x_mm: float, y_mm: float) -> tuple[float, float]:
-    """Column and row of a plan point of the cell, px."""
-    x, y = x_mm - view.x_mm, y_mm - view.y_mm
-    column = view.column + x * view.column_by_x + y * view.column_by_y
-    return column, view.row + x * view.row_by_x + y * view.row_by_y
+    return _calibrate(calibration, total) if high - low <= _NARROW_COUNTS else np.nan
 
 
 @numba.njit(cache=True, nogil=True)
-def _interpolate(counts: Array, column: float, row: float) -> float:
-    """Counts between four pixels, bilinear."""
-    j, i = int(column), int(row)
-    u, v = column - j, row - i
-    upper = (1 - u) * counts[i, j] + u * counts[i, j + 1]
-    lower = (1 - u) * counts[i + 1, j] + u * counts[i + 1, j + 1]
-    return (1 - v) * upper + v * lower
+def _mean_temperature(counts: Array, window: Array, weights: Array, calibration: Array) -> float:
+    """Mean of the temperatures of the pixels of a cell, degC."""
+    left, top, columns, rows, place = window[0], window[1], window[2], window[3], window[4]
+    total = 0.0
+    for i in range(top, top + rows):
+        for j in range(left, left + columns):
+            # A pixel without a temperature counts only where it has a weight.
+            if weights[place] > 0:
+                total += weights[place] * calibration[counts[i, j]]
+            place += np.uint64(1)
+    return total
 
 
 @numba.njit(cache=True, nogil=True)

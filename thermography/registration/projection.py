@@ -144,13 +144,18 @@ class Projection:
             [self.plan_to_sensor.ravel(), [self.focal_length_px], self.principal_point_px, self.distortion], dtype=float
         )
 
+    @cached_property
+    def sensor_to_plan(self) -> Array:
+        """Homography from undistorted px to plan mm, (3, 3)."""
+        return np.linalg.inv(self.plan_to_sensor)
+
     def to_sensor(self, points_mm: Array) -> Array:
         """Project plan points (x, y), shape (..., 2) mm, to sensor points (column, row), shape (..., 2) px."""
         return _each(_project, points_mm, self.as_array)
 
     def to_plan(self, points_px: Array) -> Array:
         """Locate sensor points (column, row), shape (..., 2) px, on the plan, shape (..., 2) mm."""
-        return _each(_transform, self.undistort(points_px), np.linalg.inv(self.plan_to_sensor))
+        return _each(_transform, self.undistort(points_px), self.sensor_to_plan)
 
     def undistort(self, points_px: Array) -> Array:
         """Move sensor points, shape (..., 2) px, to where a lens without distortion would show them."""

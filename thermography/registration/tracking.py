@@ -195,15 +195,30 @@ def _refine(counts: NDArray[np.uint16], tracker: TableTracker, predicted_mm: Arr
     if len(discs) < 2:
         return None
     shifts = tracker.registration.to_plan(centroids[discs] - tracker.bias_px[discs]) - tracker.discs[discs, :2]
-    distance = np.linalg.norm(shifts - np.median(shifts, axis=0), axis=1)
-    kept = distance <= max(_OUTLIER_MM, 5 * float(np.median(distance)))
-    if kept.sum() < 2:
+    mean, scatter, kept = _agreement(shifts)
+    if kept < 2:
         return None
-    mean = shifts[kept].mean(axis=0)
-    scatter = np.sqrt(((shifts[kept] - mean) ** 2).sum() / (2 * kept.sum() - 2))
     common = np.interp(mean @ tracker.direction, tracker.common_mm, tracker.common_u_mm)
-    own = float(scatter / np.sqrt(kept.sum()))
-    return TablePosition(mean, float(np.hypot(own, common)), int(kept.sum()), own)
+    own = scatter / np.sqrt(kept)
+    return TablePosition(mean, float(np.hypot(own, common)), kept, float(own))
+
+
+@numba.njit(cache=True, nogil=True)
+def _agreement(shifts: Array) -> tuple[Array, float, int]:
+    """Mean of the displacements, (n, 2) mm, without outliers; their standard deviation along either coordinate, and their number."""
+    middle_x, middle_y = np.median(shifts[:, 0]), np.median(shifts[:, 1])
+    distance = np.sqrt((shifts[:, 0] - middle_x) ** 2 + (shifts[:, 1] - middle_y) ** 2)
+    largest = max(_OUTLIER_MM, 5 * np.median(distance))
+    mean, squares, kept = np.zeros(2), 0.0, 0
+    for d in range(len(shifts)):
+        if distance[d] <= largest:
+            mean += shifts[d]
+            kept += 1
+    mean /= kept
+    for d in range(len(shifts)):
+        if distance[d] <= largest:
+            squares += ((shifts[d] - mean) ** 2).sum()
+    return mean, np.sqrt(squares / max(2 * kept - 2, 1)), kept
 
 
 @numba.njit(cache=True, nogil=True)
@@ -246,25 +261,25 @@ def _coarse_contrast(counts: Array, x: float, y: float, radius: float, lens: Arr
 class _DiscView(NamedTuple):
     """A disc on the sensor near its predicted position: its local affine map, and its zones on the plan around its centre.
 
-    The Jacobian is (column by x, column by y; row by x, row by y), px/mm. Pixels within `core_mm` show the disc alone, those
+    The inverse Jacobian is (x by column, x by row; y by column, y by row), mm/px. Pixels within `core_mm` show the disc alone, those
     within `rim_mm` any part of it, those between `rim_mm` and `outer_mm` the table around it. `x_mm`, `y_mm` is the disc's listed
     position: the ring lies on the table wherever the table is.
     """
 
     column: float
     row: float
-    column_by_x: float
-    column_by_y: float
-    row_by_x: float
-    row_by_y: float
-    determinant: float
+    x_by_column: float
+    x_by_row: float
+    y_by_column: float
+    y_by_row: float
+    area_px: float
     radius_mm: float
     core_mm: float
     rim_mm: float
     outer_mm: float
     blur_mm: float
-    half_columns: int
-    half_rows: int
+    columns_per_mm: float
+    rows_per_mm: float
     x_mm: float
     y_mm: float
 
@@ -303,11 +318,10 @@ def _disc_view(disc: Array, shift: Array, lens: Array) -> _DiscView:
     determinant = column_by_x * row_by_y - column_by_y * row_by_x
     blur = 1.5 * max(np.hypot(row_by_y, row_by_x), np.hypot(column_by_y, column_by_x)) / abs(determinant)
     outer = 2.2 * radius + blur
-    half_columns = int(outer * np.hypot(column_by_x, column_by_y)) + 2
-    half_rows = int(outer * np.hypot(row_by_x, row_by_y)) + 2
     return _DiscView(
-        c0, r0, column_by_x, column_by_y, row_by_x, row_by_y, determinant,
-        radius, max(radius - blur, 0.45 * radius), radius + blur, outer, blur, half_columns, half_rows, disc[0], disc[1],
+        c0, r0, row_by_y / determinant, -column_by_y / determinant, -row_by_x / determinant, column_by_x / determinant,
+        np.pi * radius * radius * abs(determinant), radius, max(radius - blur, 0.45 * radius), radius + blur, outer, blur,
+        np.hypot(column_by_x, column_by_y), np.hypot(row_by_x, row_by_y), disc[0], disc[1],
     )  # fmt: skip
 
 
@@ -318,46 +332,52 @@ def _locate_disc(
     """Centroid (column, row) px of one disc by repeated centroids of its coverage, and whether it is located."""
     height, width = counts.shape
     column, row = view.column, view.row
-    area = np.pi * view.radius_mm * view.radius_mm * abs(view.determinant)
     for _ in range(8):
-        left, top = round(column) - view.half_columns, round(row) - view.half_rows
-        right, bottom = left + 2 * view.half_columns, top + 2 * view.half_rows
-        if left < 0 or top < 0 or right >= width or bottom >= height:
+        patch = _patch_around(column, row, view.outer_mm, view)
+        if patch.left < 0 or patch.top < 0 or patch.right >= width or patch.bottom >= height:
             return column, row, False
-        patch = _Patch(left, top, right, bottom, column, row)
         plane, contrast, noise = _contrast(counts, patch, view, size)
         if not abs(contrast) > least_contrast * noise:
             return column, row, False
-        total, moment_c, moment_r = _moments(counts, patch, view, plane, contrast)
-        if not 0.6 * area < total < 1.4 * area:
+        within_rim = _patch_around(column, row, view.rim_mm, view)
+        total, moment_c, moment_r = _moments(counts, within_rim, view, plane, contrast)
+        if not 0.6 * view.area_px < total < 1.4 * view.area_px:
             return column, row, False
         column += moment_c / total
         row += moment_r / total
         # The next step would be less than a thousandth of a step as small as this.
         if abs(moment_c / total) + abs(moment_r / total) < 0.03:
             break
-    near = abs(column - view.column) + abs(row - view.row) <= 2.5 * view.radius_mm * np.sqrt(abs(view.determinant))
+    near = abs(column - view.column) + abs(row - view.row) <= 2.5 * np.sqrt(view.area_px / np.pi)
     return column, row, near
+
+
+@numba.njit(cache=True, nogil=True)
+def _patch_around(column: float, row: float, reach_mm: float, view: _DiscView) -> _Patch:
+    """The pixels around a centre that lie within some distance on the plan."""
+    half_columns, half_rows = int(reach_mm * view.columns_per_mm) + 2, int(reach_mm * view.rows_per_mm) + 2
+    left, top = round(column) - half_columns, round(row) - half_rows
+    return _Patch(left, top, left + 2 * half_columns, top + 2 * half_rows, column, row)
 
 
 @numba.njit(cache=True, nogil=True)
 def _plan_offset(view: _DiscView, u: float, v: float) -> tuple[float, float]:
     """Offset (x, y) mm on the plan for an offset (column, row) px on the sensor."""
-    return (
-        (view.row_by_y * u - view.column_by_y * v) / view.determinant,
-        (view.column_by_x * v - view.row_by_x * u) / view.determinant,
-    )
+    return view.x_by_column * u + view.x_by_row * v, view.y_by_column * u + view.y_by_row * v
 
 
 @numba.njit(cache=True, nogil=True)
 def _contrast(counts: Array, patch: _Patch, view: _DiscView, size: tuple[float, float]) -> tuple[Array, float, float]:
     """Plane through the ring around a disc, contrast of the disc to it, and noise of the ring; NaN where there are too few pixels."""
     core, rim, outer, blur = view.core_mm, view.rim_mm, view.outer_mm, view.blur_mm
-    normal, right = np.zeros((3, 3)), np.zeros(3)
-    core_sum, core_c, core_r, core_n, ring_n, squares = 0.0, 0.0, 0.0, 0, 0, 0.0
-    for i in range(patch.top, patch.bottom + 1):
-        for j in range(patch.left, patch.right + 1):
-            u, v = j - patch.column, i - patch.row
+    # Sums over the ring of the products of (1, column, row), and of these with the counts.
+    su, sv, suu, suv, svv = 0.0, 0.0, 0.0, 0.0, 0.0
+    ring_sum, ring_u, ring_v, squares, ring_n = 0.0, 0.0, 0.0, 0.0, 0
+    core_sum, core_c, core_r, core_n = 0.0, 0.0, 0.0, 0
+    # Unsigned: a signed index costs a comparison with zero for every pixel.
+    for i in range(np.uint64(patch.top), np.uint64(patch.bottom + 1)):
+        for j in range(np.uint64(patch.left), np.uint64(patch.right + 1)):
+            u, v = np.int64(j) - patch.column, np.int64(i) - patch.row
             x, y = _plan_offset(view, u, v)
             distance = x * x + y * y
             value = float(counts[i, j])
@@ -366,13 +386,12 @@ def _contrast(counts: Array, patch: _Patch, view: _DiscView, size: tuple[float, 
                 continue
             in_ring = rim * rim < distance < outer * outer
             if in_ring and blur < view.x_mm + x < size[0] - blur and blur < view.y_mm + y < size[1] - blur:
-                basis = (1.0, u, v)
-                for a in range(3):
-                    right[a] += basis[a] * value
-                    for b in range(3):
-                        normal[a, b] += basis[a] * basis[b]
+                su, sv, suu, suv, svv = su + u, sv + v, suu + u * u, suv + u * v, svv + v * v
+                ring_sum, ring_u, ring_v = ring_sum + value, ring_u + u * value, ring_v + v * value
                 ring_n += 1
                 squares += value * value
+    normal = np.array([[ring_n, su, sv], [su, suu, suv], [sv, suv, svv]])
+    right = np.array([ring_sum, ring_u, ring_v])
     if ring_n < 12 or core_n < 3:
         return right, np.nan, np.nan
     plane = np.linalg.solve(normal, right)
@@ -386,9 +405,9 @@ def _moments(
 ) -> tuple[float, float, float]:
     """Sum and first moments (column, row) of the coverage of a disc, 1 within it and 0 around it."""
     total, moment_c, moment_r = 0.0, 0.0, 0.0
-    for i in range(patch.top, patch.bottom + 1):
-        for j in range(patch.left, patch.right + 1):
-            u, v = j - patch.column, i - patch.row
+    for i in range(np.uint64(patch.top), np.uint64(patch.bottom + 1)):
+        for j in range(np.uint64(patch.left), np.uint64(patch.right + 1)):
+            u, v = np.int64(j) - patch.column, np.int64(i) - patch.row
             x, y = _plan_offset(view, u, v)
             if x * x + y * y < view.rim_mm * view.rim_mm:
                 coverage = (counts[i, j] - plane[0] - plane[1] * u - plane[2] * v) / contrast

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.thermography.plan_scene import overhead
-from thermography.fields.moving_sampling import CellSums, add_frame, on_plan, sample_points
+from thermography.fields.moving_sampling import CellSums, add_frame, on_plan, sample_points, weigh_pixels
 from thermography.registration.plan import Fiducial, PlanGrid
 
 PLAN = PlanGrid(60, 40, 5)
@@ -31,7 +31,8 @@ def empty_sums(samples):
 
 def add(counts, samples, registration, shift, sums, *, correction=0.0, calibration=CALIBRATION):
     lens = registration.projection.as_array
-    add_frame(counts, calibration, samples.points_mm, samples.valid, np.array(shift), lens, correction, sums)
+    weights = weigh_pixels(samples.points_mm, samples.valid, np.array(shift), lens, SHAPE)
+    add_frame(counts, calibration, weights, correction, sums)
 
 
 def test_points_lie_in_their_cells_and_off_disc_and_edge(samples):
@@ -78,11 +79,25 @@ def test_mean_and_deviation_over_frames_and_calibration_point_by_point(registrat
     shown = samples.valid.any(axis=1)
     np.testing.assert_allclose(sums.mean[shown], 0.01 * levels.mean())
     np.testing.assert_allclose(sums.squares[shown], 7 * np.var(0.01 * levels))
-    # A curved calibration and counts more than 600 apart: the mean of the temperatures, not the temperature of the mean.
+    # A curved calibration and counts more than 600 apart: the mean of the pixels' temperatures, not the temperature of the mean.
     curved, steep = (1e-3 * np.arange(65536.0)) ** 2, np.zeros(SHAPE, np.uint16)
     steep[:] = 200 * np.arange(SHAPE[1])
     sums = empty_sums(samples)
     add(steep, samples, registration, (0.0, 0.0), sums, calibration=curved)
     cell = 2 * PLAN.shape[1] + 2
     columns = 10 + 2 * samples.points_mm[cell, :, 0]
-    assert sums.mean[cell] == pytest.approx(((1e-3 * 200 * columns) ** 2).mean(), abs=1e-6)
+    temperatures = (1e-3 * steep[0].astype(float)) ** 2
+    assert sums.mean[cell] == pytest.approx(np.interp(columns, np.arange(SHAPE[1]), temperatures).mean(), abs=1e-6)
+
+
+def test_a_pixel_without_temperature_counts_only_where_it_has_a_weight(registration, samples):
+    counts = np.full(SHAPE, 2000, np.uint16)
+    below = np.where(np.arange(65536) < 1000, np.nan, CALIBRATION)
+    # Cell (3, 5) has points at columns 61.25 to 68.75 and rows 41.25 to 48.75, but those of its lower right corner lie on the disc.
+    counts[49, 69] = 10
+    counts[36, 46] = 10
+    sums = empty_sums(samples)
+    add(counts, samples, registration, (0.0, 0.0), sums, calibration=below)
+    means = sums.mean.reshape(PLAN.shape)
+    assert means[3, 5] == pytest.approx(20.0)
+    assert np.isnan(means[2, 3])
