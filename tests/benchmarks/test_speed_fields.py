@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import psutil
 import pytest
@@ -27,7 +28,8 @@ from thermography.fields.still import reduce_frames
 from thermography.fields.tasks.stretches import cut_stretches, gather_frames
 from thermography.io.flir import index_frames
 from thermography.io.flir_writer import write_sequence
-from thermography.io.frame import CameraIdentity, Frame
+from thermography.io.frame import CameraIdentity, Frame, FrameReference
+from thermography.io.frame_index.flir_frame import FlirFrameReference
 from thermography.radiometry.planck import counts_from_temperature, override
 from thermography.registration.displacement import RegistrationSpan
 from thermography.registration.register import register
@@ -168,6 +170,39 @@ def test_cold_file(film: Path, registration) -> None:
         f"\ncold: {median_of(FRAMES / ours)} frames/s, plain reader {median_of(FRAMES / reader)}: "
         f"{median_of(reader / ours)} of its speed"
     )
+
+
+def test_jpegls_film_against_its_decoder_alone(film: Path, registration, tmp_path: Path) -> None:
+    """By processor time: that of a bare loop over the streams in memory is the limit, whatever the number of cores."""
+    frames = 120
+    path = tmp_path / "a.csq"
+    write_sequence(path, (reference.read() for reference in index_frames([film])[0][:frames]), encoding="jpegls")
+    references, _ = index_frames([path])
+    data = path.read_bytes()
+    streams = [data[start : start + length] for start, length in map(samples_in_file, references)]
+    assert (imagecodecs.jpegls_decode(streams[-1]) == references[-1].read_counts()).all()
+    bounds = bounds_of(frames, 2)
+
+    def reduce() -> None:
+        index_frames([path])
+        reduce_frames(references, registration, GRID, bounds)
+
+    ours, bare, start = take_turns(
+        reduce,
+        lambda: [imagecodecs.jpegls_decode(stream) for stream in streams],
+        lambda: reduce_frames(references[:2], registration, GRID, bounds),
+        rounds=5,
+    )[1]
+    print(
+        f"\nJPEG-LS: {1e3 * np.median(ours) / frames:.2f} ms of processor a frame with index and set-up; of the rate of imagecodecs alone "
+        f"{median_of(bare / ours)}, without set-up {median_of(bare / (ours - start))}"
+    )
+
+
+def samples_in_file(reference: FrameReference) -> tuple[int, int]:
+    """Place and length of the packed pixels of a frame in its file, bytes."""
+    assert isinstance(reference, FlirFrameReference)
+    return reference.segments[0][0] + reference.samples.offset, reference.samples.length
 
 
 def test_recalibration_of_100_cycles(film: Path, registration, tmp_path: Path) -> None:
