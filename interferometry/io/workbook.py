@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import datetime
 import io
+import re
 import struct
 import zipfile
+import zlib
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 import python_calamine
 
@@ -19,6 +21,12 @@ _MAGIC = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
 _MOST_CELLS = 20_000_000
 #: Bytes that the parts of a spreadsheet may unpack to: that many cells take about 50 to 100 bytes of XML each.
 _MOST_BYTES = 2_000_000_000
+#: Last row and column of a sheet (XFD1048576).
+_LAST_ROW, _LAST_COLUMN = 1_048_576, 16_384
+#: Place of a cell in the XML of a sheet, as in <c r="B7">.
+_CELL = re.compile(rb"<(?:\w+:)?c\s[^<>]{0,200}?\br\s*=\s*[\"']([A-Za-z]{1,20})(\d{1,40})[\"']")
+#: Bytes of XML that are searched at a time, and the longest beginning of a cell.
+_PIECE, _OVERLAP = 1 << 20, 300
 
 Rows = list[tuple[int, list[str]]]
 
@@ -82,7 +90,7 @@ def read_sheets(path: Path, content: bytes) -> dict[str, Rows]:
 
 
 def refuse_bomb(path: Path, archive: BinaryIO) -> None:
-    """Refuse a spreadsheet whose parts would unpack to more than memory holds, by the sizes that the archive states.
+    """Refuse a spreadsheet that would take more than memory holds: by the sizes that the archive states, and by the places of its cells.
 
     Parameters
     ----------
@@ -94,20 +102,57 @@ def refuse_bomb(path: Path, archive: BinaryIO) -> None:
     Raises
     ------
     LaserFormatError
-        The parts state more than 2 GB in all.
+        The parts state more than 2 GB in all, or a cell lies so far from the others that the sheet between them would have more than
+        20 million cells: a reader makes them all.
     """
     try:
         with zipfile.ZipFile(archive) as parts:
             total = sum(part.file_size for part in parts.infolist())
-    # A damaged directory of the archive is told by the reader itself, which takes it apart more carefully.
-    except (zipfile.BadZipFile, NotImplementedError, ValueError, OverflowError, OSError, struct.error):
-        total = 0
-    archive.seek(0)
-    if total > _MOST_BYTES:
-        raise LaserFormatError(
-            f"{path}: unpacks to {total / 1e9:.1f} GB, at most {_MOST_BYTES / 1e9:g} GB are read; "
-            "save the sheet with the measured values alone"
-        )
+            if total > _MOST_BYTES:
+                raise LaserFormatError(
+                    f"{path}: unpacks to {total / 1e9:.1f} GB, at most {_MOST_BYTES / 1e9:g} GB are read; "
+                    "save the sheet with the measured values alone"
+                )
+            for part in parts.infolist():
+                if part.filename.startswith("xl/worksheets/") and part.filename.endswith(".xml"):
+                    with parts.open(part) as sheet:
+                        _refuse_far_cells(path, part.filename, sheet)
+    except LaserFormatError:
+        raise
+    # What is damaged in the archive is told by the reader itself, which takes it apart more carefully.
+    except (zipfile.BadZipFile, zlib.error, RuntimeError, ValueError, OverflowError, OSError, EOFError, struct.error):
+        pass
+    finally:
+        archive.seek(0)
+
+
+def _refuse_far_cells(path: Path, part: str, sheet: IO[bytes]) -> None:
+    """Refuse a sheet whose farthest cells span more than may be read; of each piece of XML the end is searched again with the next."""
+    rows = columns = 0
+    lowest = rightmost = b""
+    kept = b""
+    while piece := sheet.read(_PIECE):
+        text = kept + piece
+        for found in _CELL.finditer(text):
+            row, column = int(found[2]), _column_number(found[1])
+            if row > rows:
+                rows, lowest = row, found[1] + found[2]
+            if column > columns:
+                columns, rightmost = column, found[1] + found[2]
+        kept = text[-_OVERLAP:]
+        if rows > _LAST_ROW or columns > _LAST_COLUMN or rows * columns > _MOST_CELLS:
+            raise LaserFormatError(
+                f"{path}, {part}: its cells reach down to {lowest.decode()[:30]} and right to {rightmost.decode()[:30]}; delete the cells "
+                "that lie far from the table, and save the file again"
+            )
+
+
+def _column_number(letters: bytes) -> int:
+    """Return the number of a column: A is 1, Z 26, AA 27."""
+    number = 0
+    for letter in letters.upper():
+        number = 26 * number + letter - ord("A") + 1
+    return number
 
 
 def _rows(path: Path, name: str, sheet: python_calamine.CalamineSheet) -> Rows:

@@ -103,6 +103,23 @@ def test_a_bomb_is_refused_by_the_size_that_it_states(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("place", "told"),
+    [
+        ("XFD1048576", "reach down to XFD1048576 and right to XFD1048576"),
+        ("nanA1", "reach down to A2 and right to nanA1"),
+        ("A1999999999999999999", "reach down to A1999999999999999999"),
+    ],
+)
+def test_a_cell_far_from_the_table_is_refused_before_memory_is_taken(tmp_path: Path, place: str, told: str) -> None:
+    path = tmp_path / "laser.xlsx"
+    cells = f'<row r="1"><c r="A1"/><c s="1" r="{place}"><v>1</v></c></row><row r="2"><c r="A2"/></row>'
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("xl/worksheets/sheet1.xml", f"<worksheet><sheetData>{cells}</sheetData></worksheet>")
+    with pytest.raises(LaserFormatError, match=rf"xl/worksheets/sheet1.xml: its cells {told}.*; delete the cells"):
+        read_sheets(path, path.read_bytes())
+
+
 def test_entities_of_xml_are_not_expanded(tmp_path: Path) -> None:
     """Ten levels of ten would be ten thousand million characters; a file outside must not be read either."""
     levels = "".join(f'<!ENTITY l{k + 1} "{f"&l{k};" * 10}">' for k in range(10))
