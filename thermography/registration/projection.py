@@ -83,18 +83,47 @@ def _project(points: Array, lens: Array) -> Array:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _undistort_point(column: float, row: float, lens: Array) -> tuple[float, float]:
+    """A sensor point, px, as a lens without distortion would show it, by fixed-point iteration."""
+    u0, v0 = (column - lens[10]) / lens[9], (row - lens[11]) / lens[9]
+    u, v = u0, v0
+    for _ in range(_UNDISTORTION_STEPS):
+        du, dv = _distort(u, v, lens)
+        u, v = u + u0 - du, v + v0 - dv
+        if not max(abs(u0 - du), abs(v0 - dv)) >= _UNDISTORTION_TOLERANCE:
+            break
+    return lens[10] + lens[9] * u, lens[11] + lens[9] * v
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def locate_point(column: float, row: float, lens: Array, sensor_to_plan: Array) -> tuple[float, float]:
+    """Locate one sensor point on the plan; for compiled loops.
+
+    Parameters
+    ----------
+    column, row : float, px
+        Sensor point.
+    lens : (16,) ndarray
+        `Projection.as_array`.
+    sensor_to_plan : (3, 3) ndarray
+        `Projection.sensor_to_plan`.
+
+    Returns
+    -------
+    x, y : float, mm
+    """
+    u, v = _undistort_point(column, row, lens)
+    m = sensor_to_plan
+    w = m[2, 0] * u + m[2, 1] * v + m[2, 2]
+    return (m[0, 0] * u + m[0, 1] * v + m[0, 2]) / w, (m[1, 0] * u + m[1, 1] * v + m[1, 2]) / w
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _undistort(points: Array, lens: Array) -> Array:
-    """Sensor points, (n, 2) px, as a lens without distortion would show them, by fixed-point iteration."""
+    """Sensor points, (n, 2) px, as a lens without distortion would show them."""
     undistorted = np.empty(points.shape)
     for i in range(len(points)):
-        u0, v0 = (points[i, 0] - lens[10]) / lens[9], (points[i, 1] - lens[11]) / lens[9]
-        u, v = u0, v0
-        for _ in range(_UNDISTORTION_STEPS):
-            du, dv = _distort(u, v, lens)
-            u, v = u + u0 - du, v + v0 - dv
-            if not max(abs(u0 - du), abs(v0 - dv)) >= _UNDISTORTION_TOLERANCE:
-                break
-        undistorted[i, 0], undistorted[i, 1] = lens[10] + lens[9] * u, lens[11] + lens[9] * v
+        undistorted[i, 0], undistorted[i, 1] = _undistort_point(points[i, 0], points[i, 1], lens)
     return undistorted
 
 

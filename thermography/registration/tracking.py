@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from thermography._typing import Array
 from thermography.registration.plan import PlanGrid
-from thermography.registration.projection import project_point
+from thermography.registration.projection import locate_point, project_point
 from thermography.registration.register import Registration
 
 #: Step of the coarse search along the axis, as share of the smallest disc's diameter.
@@ -175,32 +176,35 @@ def locate_table(
 
 def _is_reliable(position: TablePosition, counts: NDArray[np.uint16], tracker: TableTracker) -> bool:
     """Whether most discs that should be in view are located, and agree."""
-    in_view = _discs_in_view(counts, tracker, position.shift_mm)
+    in_view = _discs_in_view(tracker.discs, position.shift_mm, tracker.margin_px, tracker.lens, counts.shape)
     return position.scatter_u_mm < _RELIABLE_U_MM and position.discs >= _RELIABLE_SHARE * in_view
-
-
-def _discs_in_view(counts: NDArray[np.uint16], tracker: TableTracker, shift_mm: Array) -> int:
-    """Number of discs that lie far enough within the frame when the table is displaced."""
-    places = tracker.registration.to_sensor(tracker.discs[:, :2] + shift_mm)
-    inside = (places > tracker.margin_px) & (places < np.array(counts.shape[::-1]) - tracker.margin_px)
-    return int(inside.all(axis=1).sum())
 
 
 def _refine(counts: NDArray[np.uint16], tracker: TableTracker, predicted_mm: Array) -> TablePosition | None:
     """Mean displacement of the discs located near a predicted displacement; None where fewer than two agree."""
-    centroids, located = _locate_discs(
-        counts, tracker.discs, tracker.lens, tracker.size_mm, np.asarray(predicted_mm, float), _LEAST_CONTRAST
-    )
-    discs = np.flatnonzero(located)
-    if len(discs) < 2:
+    shifts = _displacements(
+        counts, tracker.discs, tracker.bias_px, tracker.lens, tracker.registration.projection.sensor_to_plan,
+        tracker.size_mm, np.asarray(predicted_mm, float), _LEAST_CONTRAST,
+    )  # fmt: skip
+    if len(shifts) < 2:
         return None
-    shifts = tracker.registration.to_plan(centroids[discs] - tracker.bias_px[discs]) - tracker.discs[discs, :2]
     mean, scatter, kept = _agreement(shifts)
     if kept < 2:
         return None
     common = np.interp(mean @ tracker.direction, tracker.common_mm, tracker.common_u_mm)
-    own = scatter / np.sqrt(kept)
-    return TablePosition(mean, float(np.hypot(own, common)), kept, float(own))
+    own = scatter / math.sqrt(kept)
+    return TablePosition(mean, math.hypot(own, common), kept, own)
+
+
+@numba.njit(cache=True, nogil=True)
+def _discs_in_view(discs: Array, shift: Array, margin_px: Array, lens: Array, shape: tuple[int, int]) -> int:
+    """Number of discs that lie far enough within the frame when the table is displaced."""
+    inside = 0
+    for d in range(len(discs)):
+        column, row = project_point(discs[d, 0] + shift[0], discs[d, 1] + shift[1], lens)
+        across, down = margin_px[d, 0], margin_px[d, 1]
+        inside += across < column < shape[1] - across and down < row < shape[0] - down
+    return inside
 
 
 @numba.njit(cache=True, nogil=True)
@@ -296,15 +300,19 @@ class _Patch(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def _locate_discs(
-    counts: Array, discs: Array, lens: Array, size: tuple[float, float], shift: Array, least_contrast: float
-) -> tuple[Array, Array]:
-    """Centroid (column, row) of every disc, (n, 2) px, and whether it is located, (n,): `discs.locate_disc` without robust fits."""
-    centroids, located = np.zeros((len(discs), 2)), np.zeros(len(discs), np.bool_)
+def _displacements(
+    counts: Array, discs: Array, bias_px: Array, lens: Array, sensor_to_plan: Array, size: tuple[float, float], shift: Array,
+    least_contrast: float,
+) -> Array:  # fmt: skip
+    """Displacements of the discs that are located near `shift`, (m, 2) mm: `discs.locate_disc` without robust fits."""
+    displacements, located = np.zeros((len(discs), 2)), 0
     for d in range(len(discs)):
-        view = _disc_view(discs[d], shift, lens)
-        centroids[d, 0], centroids[d, 1], located[d] = _locate_disc(counts, view, size, least_contrast)
-    return centroids, located
+        column, row, found = _locate_disc(counts, _disc_view(discs[d], shift, lens), size, least_contrast)
+        if found:
+            x, y = locate_point(column - bias_px[d, 0], row - bias_px[d, 1], lens, sensor_to_plan)
+            displacements[located, 0], displacements[located, 1] = x - discs[d, 0], y - discs[d, 1]
+            located += 1
+    return displacements[:located]
 
 
 @numba.njit(cache=True, nogil=True)
