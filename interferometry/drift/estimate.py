@@ -453,7 +453,7 @@ def _drift_from_state(joint: JointFit, smoothed: Smoothed, at_state: _StateDrift
     joined = (
         smoothed.level_covariance + at_state.covariance - at_state.with_drift - at_state.with_drift.transpose(0, 2, 1)
     )
-    return drift, fit.sigma**2 * joined + dependence @ fit.covariance @ dependence.transpose(0, 2, 1)
+    return drift, fit.sigma**2 * joined + fit.covariance_of(dependence)
 
 
 def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr.Dataset:

@@ -25,11 +25,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy import optimize, stats
+from scipy import linalg, optimize, stats
+from scipy.linalg import lapack
 
 from interferometry._typing import Array
 from interferometry.drift import kalman
-from interferometry.drift.state_space import DriftModelError, DriftSystem, Order, drift_system, start_columns
+from interferometry.drift.state_space import (
+    MANY_COLUMNS,
+    DriftModelError,
+    DriftSystem,
+    Order,
+    drift_system,
+    start_columns,
+)
 
 #: Search limits of log10(process noise over reading variance), in units that make the drift of one hour comparable to the noise of
 #: one reading: from a drift far below the noise to one that hides everything else.
@@ -119,7 +127,14 @@ class DriftFit:
         per_coefficient = smoothed.levels[:, :, 1:]
         levels = smoothed.levels[:, :, 0] - per_coefficient @ self.coefficients
         covariance = self.sigma**2 * smoothed.level_covariance
-        return levels, covariance + per_coefficient @ self.covariance @ per_coefficient.transpose(0, 2, 1)
+        return levels, covariance + self.covariance_of(per_coefficient)
+
+    def covariance_of(self, per_coefficient: Array) -> Array:
+        """Covariance (n, k, k) of values whose derivatives by the coefficients are (n, k, p)."""
+        n, k, p = per_coefficient.shape
+        # One product of whole matrices: numpy takes n products of k rows many times slower.
+        through = (per_coefficient.reshape(n * k, p) @ self.covariance).reshape(n, k, p)
+        return np.einsum("nip,njp->nij", through, per_coefficient)
 
     def noise(self) -> tuple[Array, Array]:
         """Each reading's estimated noise (n,) and its relative variance (n,): sum(noise^2) / sum(variance) estimates sigma^2."""
@@ -187,7 +202,7 @@ def _solve(system: DriftSystem, problem: _Problem) -> DriftFit:
     if vanishing.size:
         raise DriftModelError(f"columns {vanishing.tolist()} of the design vanish; leave them out")
     scale_all = np.concatenate([[1.0], scale])
-    swept, log_normal, dependent = kalman.sweep(gram / np.outer(scale_all, scale_all), _DEPENDENCE_TOLERANCE)
+    swept, log_normal, dependent = _sweep(gram / np.outer(scale_all, scale_all))
     if dependent >= 0:
         raise DriftModelError(f"column {dependent} of the design depends linearly on those before it; leave it out")
     freedom = int(system.observed.sum()) - scale.size
@@ -209,6 +224,23 @@ def _solve(system: DriftSystem, problem: _Problem) -> DriftFit:
         log_likelihood=float(log_likelihood),
         rss=rss,
     )
+
+
+def _sweep(gram: Array) -> tuple[Array, float, int]:
+    """Sweep a scaled Gram matrix as `kalman.sweep` does; one of many columns by its Cholesky factor, which takes a tenth of the time."""
+    if gram.shape[0] >= MANY_COLUMNS:
+        lower, failed = lapack.dpotrf(gram[1:, 1:], lower=1)
+        pivots = np.diag(lower) ** 2
+        if not failed and pivots.min() >= _DEPENDENCE_TOLERANCE:
+            inverse, _ = lapack.dpotri(lower, lower=1)
+            inverse = np.tril(inverse) + np.tril(inverse, -1).T
+            along = linalg.solve_triangular(lower, gram[1:, 0], lower=True)
+            swept = np.empty_like(gram)
+            swept[0, 0], swept[0, 1:], swept[1:, 1:] = gram[0, 0] - along @ along, 0.0, inverse
+            swept[1:, 0] = linalg.solve_triangular(lower, along, lower=True, trans="T")
+            return swept, float(np.log(pivots).sum()), -1
+    swept, log_determinant, dependent = kalman.sweep(gram, _DEPENDENCE_TOLERANCE)
+    return swept, log_determinant, dependent
 
 
 def _maximise(system: DriftSystem, response: Array, design: Array, start: Array | None) -> DriftFit:

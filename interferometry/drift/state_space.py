@@ -18,6 +18,11 @@ from interferometry.errors import InterferometryError
 
 Order = Literal[1, 2]
 
+#: From so many columns on their products are formed block by block, by products of whole matrices; fewer are multiplied on the way.
+MANY_COLUMNS = 64
+#: Readings of a block.
+_ROWS_AT_ONCE = 256
+
 
 class DriftModelError(InterferometryError):
     """The readings or columns cannot be fitted; the message names what is wrong and what to do."""
@@ -100,6 +105,8 @@ class DriftSystem:
 
     def normal_equations(self, columns: Array) -> tuple[Array, float]:
         """Gram matrix (p, p) of the whitened columns (n, p) of the observed readings, and the log-determinant of their covariance."""
+        if columns.shape[1] >= MANY_COLUMNS:
+            return self._normal_equations_by_blocks(columns)
         return kalman.normal_equations(
             self.seconds,
             self.loadings,
@@ -110,6 +117,15 @@ class DriftSystem:
             self.observed,
             np.ascontiguousarray(columns),
         )
+
+    def _normal_equations_by_blocks(self, columns: Array) -> tuple[Array, float]:
+        whitening = self.whitening(columns.shape[1])
+        gram = np.zeros((columns.shape[1], columns.shape[1]))
+        for start in range(0, columns.shape[0], _ROWS_AT_ONCE):
+            rows = slice(start, start + _ROWS_AT_ONCE)
+            whitened = whitening.whiten(columns[rows].copy())[self.observed[rows]]
+            gram += whitened.T @ whitened
+        return gram, 2.0 * float(np.log(whitening.roots[self.observed]).sum())
 
     def whiten(self, columns: Array) -> tuple[Array, float]:
         """Standardised innovations of the observed readings (n_observed, p), and the log-determinant of their covariance."""

@@ -200,3 +200,30 @@ def test_an_even_choice_of_very_many_sites_knows_the_variances_of_the_drift(rng,
     np.testing.assert_allclose(np.sqrt(some.system.ratios / every.system.ratios), 1.0, atol=0.5)
     assert np.abs(some.coefficients - every.coefficients).max() < 0.2 * every.coefficients_u.min()
     assert some.sigma == pytest.approx(every.sigma, rel=0.03)
+
+
+def test_many_columns_are_fitted_as_few_are(rng, monkeypatch):
+    system, y, x = drift_and_columns(rng)
+    few = fit_fixed_effects(system, y, x)
+    monkeypatch.setattr("interferometry.drift.gls.MANY_COLUMNS", 2)
+    many = fit_fixed_effects(system, y, x)
+    for name in ("coefficients", "covariance", "sigma", "log_likelihood", "rss"):
+        np.testing.assert_allclose(getattr(many, name), getattr(few, name), rtol=1e-9, atol=1e-12)
+    with pytest.raises(DriftModelError, match="column 3 of the design depends linearly"):
+        fit_fixed_effects(system, y, np.column_stack([x, x[:, 1]]))
+
+
+def test_the_covariance_of_values_follows_from_their_derivatives(rng):
+    system, y, x = drift_and_columns(rng)
+    fit = fit_fixed_effects(system, y, x)
+    derivatives = rng.standard_normal((4, 2, 3))
+    expected = [one @ fit.covariance @ one.T for one in derivatives]
+    np.testing.assert_allclose(fit.covariance_of(derivatives), expected, rtol=1e-12)
+
+
+def drift_and_columns(rng):
+    n = 40
+    loadings = np.ones((n, 1))
+    system = drift_system(np.arange(40.0), loadings, order=1, ratios=np.array([0.05]))
+    x = np.column_stack([loadings, rng.standard_normal((n, 2))])
+    return system, x @ [1.0, 2.0, -3.0] + rng.standard_normal(n), x

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from interferometry.drift.state_space import DriftModelError, drift_system, start_columns
+from interferometry.drift.state_space import DriftModelError, DriftSystem, drift_system, start_columns
 
 
 def test_start_columns_are_levels_and_rates_per_hour() -> None:
@@ -48,3 +48,35 @@ def test_smoothed_drift_and_noise_make_up_the_reading(rng: np.random.Generator) 
 def test_bad_input_is_named(seconds: list[float], loadings: np.ndarray, message: str) -> None:
     with pytest.raises(DriftModelError, match=message):
         drift_system(np.array(seconds), loadings, order=1, ratios=np.ones(1))
+
+
+def uneven(rng: np.random.Generator, n: int) -> DriftSystem:
+    """A smooth drift with a stretch, every fifth reading held out."""
+    return drift_system(
+        np.sort(rng.uniform(0, 900, n)),
+        np.column_stack([np.ones(n), rng.random(n)]),
+        order=2,
+        ratios=np.array([1e-4, 1e-3]),
+        variance=rng.uniform(0.5, 2.0, n),
+        observed=np.arange(n) % 5 != 0,
+    )
+
+
+def test_readings_that_are_whitened_some_after_others_are_those_whitened_at_once(rng: np.random.Generator) -> None:
+    n = 23
+    system, columns = uneven(rng, n), rng.normal(size=(n, 3))
+    whitening = system.whitening(3)
+    parts = [whitening.whiten(columns[rows].copy()) for rows in (slice(0, 7), slice(7, 8), slice(8, n))]
+    innovations, variances = system.innovations(columns)
+    np.testing.assert_allclose(np.vstack(parts), innovations / np.sqrt(variances)[:, None], atol=1e-13)
+    assert whitening.done == n
+
+
+def test_products_of_many_columns_are_those_of_few(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    n = 700
+    system, columns = uneven(rng, n), rng.normal(size=(n, 5))
+    gram, log_determinant = system.normal_equations(columns)
+    monkeypatch.setattr("interferometry.drift.state_space.MANY_COLUMNS", 5)
+    by_blocks, determinant = system.normal_equations(columns)
+    np.testing.assert_allclose(by_blocks, gram, rtol=1e-11, atol=1e-11)
+    assert determinant == pytest.approx(log_determinant, rel=1e-12)
