@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from fusion._typing import Array
 from fusion.alignment.readings import Readings
@@ -26,13 +27,49 @@ class Prior:
     u: float
 
 
+@dataclass(frozen=True, eq=False)
+class Separable:
+    """Columns that are courses in time, each weighed by the place of a reading, multiplied out at the readings that are asked for.
+
+    A search tries thousands of columns of few courses, or of few places: what they have in common is held, and computed with, once.
+    Where an array is expected it is one.
+
+    Attributes
+    ----------
+    courses : tuple of ndarray
+        (n,) each, one per column; candidates that follow the same course share the array.
+    place : (n,) ndarray of int
+        Place of every reading, a row of the weights; shared by candidates too.
+    weights : (places, q) ndarray
+    """
+
+    courses: tuple[Array, ...]
+    place: NDArray[np.int64]
+    weights: Array
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Readings and columns."""
+        return self.place.size, len(self.courses)
+
+    def __array__(self, dtype: DTypeLike = None, copy: bool | None = None) -> Array:
+        """All columns, (n, q)."""
+        return np.asarray(self[:], dtype)
+
+    def __getitem__(self, index: Any) -> Array:
+        """As of an array; some readings, a slice or an array of them, are multiplied out alone."""
+        rows, *columns = index if isinstance(index, tuple) else (index,)
+        here = np.stack([course[rows] for course in self.courses], axis=-1) * self.weights[self.place[rows]]
+        return np.asarray(here[..., columns[0]] if columns else here)
+
+
 @dataclass(frozen=True)
 class Candidate:
     """One way an effect could enter a model.
 
     Attributes
     ----------
-    columns : (n, q) ndarray
+    columns : (n, q) ndarray or Separable
         um per unit of each coefficient, one row per reading.
     parameters : mapping
         Values of the nonlinear parameters that made the columns, each name with its unit.
@@ -46,7 +83,7 @@ class Candidate:
         The last so many columns may be present without the effect; what they explain is no evidence for it.
     """
 
-    columns: Array
+    columns: Array | Separable
     parameters: Mapping[str, float | str]
     units: tuple[str, ...]
     event_s: float | None = None

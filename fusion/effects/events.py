@@ -8,7 +8,7 @@ import numpy as np
 
 from fusion._typing import Array
 from fusion.alignment.readings import Readings
-from fusion.effects.effect import Candidate, Effect
+from fusion.effects.effect import Candidate, Effect, Separable
 from fusion.effects.jumps import cycle_starts, event_instants, instants_near
 
 #: Periods that are tried at most: all down to 3 min in a record of 7.5 h, down to 11 min in one of 28 h.
@@ -18,9 +18,10 @@ _MOST_PERIODS = 300
 def _step_event(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
     """Steps at the instants that can be tried."""
     tried = event_instants(readings) if near is None or near.event_s is None else instants_near(readings, near.event_s)
+    place, alike = np.zeros(readings.seconds.size, int), np.ones((1, 1))
     for instant in tried:
-        late = (readings.seconds >= instant).astype(float)
-        yield Candidate(late[:, None], {"time_s": float(instant)}, ("um",), instant)
+        late = Separable((readings.seconds >= instant,), place, alike)
+        yield Candidate(late, {"time_s": float(instant)}, ("um",), instant)
 
 
 def periods_min(readings: Readings) -> Array:
@@ -71,12 +72,15 @@ def _periodic_disturbance(readings: Readings, _: Mapping[str, float], near: Cand
         if near is None
         else _close_periods(readings, float(near.parameters["period_min"]))
     )
+    place, share = readings.target_index, readings.positions_mm / readings.span_mm
+    weights = {"flat": np.ones((share.size, 2)), "linear": np.column_stack([share, share])}
     for period in periods:
         phase = 2 * np.pi * readings.seconds / (60.0 * period)
-        waves = np.column_stack([np.cos(phase), np.sin(phase)])
-        yield Candidate(waves, {"period_min": float(period), "shape": "flat"}, ("um", "um"))
-        linear = waves * readings.share[:, None]
-        yield Candidate(linear, {"period_min": float(period), "shape": "linear"}, ("um", "um"))
+        waves = (np.cos(phase), np.sin(phase))
+        for shape, weight in weights.items():
+            yield Candidate(
+                Separable(waves, place, weight), {"period_min": float(period), "shape": shape}, ("um", "um")
+            )
 
 
 def _close_periods(readings: Readings, chosen_min: float) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 
 from fusion._typing import Array
 from fusion.alignment.readings import Readings
-from fusion.effects.effect import Candidate, Effect, Parameters
+from fusion.effects.effect import Candidate, Effect, Parameters, Separable
 from fusion.effects.states import thermal_states, unit_of_state, unmeasured_expansion
 
 #: Shortest lead of a screw that is tried where the targets are spaced unevenly.
@@ -94,18 +94,21 @@ def _pitch_error(readings: Readings, _: Mapping[str, float], near: Candidate | N
         close = 1.0 / float(near.parameters["period_mm"]) + np.linspace(-0.25, 0.25, 5) / np.ptp(readings.positions_mm)
         # A wave longer than half the travel is a bending, not a screw's.
         frequencies = close[(close > 0.999 * frequencies[0]) & (close < 1.001 * frequencies[-1])]
+    place = readings.target_index
+    measured = np.unique(place)
     for frequency in frequencies:
-        phase = 2 * np.pi * frequency * readings.position_mm
+        phase = 2 * np.pi * frequency * readings.positions_mm
         waves = np.column_stack([np.cos(phase), np.sin(phase)])
         # Targets at every half wave show one phase only; what is left of the other is rounding.
-        waves = waves[:, np.abs(waves).max(axis=0) > _VISIBLE]
+        waves = waves[:, np.abs(waves[measured]).max(axis=0) > _VISIBLE]
         for state, followed in states:
             parameters: Parameters = {
                 **followed,
                 "period_mm": float(1 / frequency),
                 "possible_leads": _aliased_lead_mm(readings, frequency),
             }
-            yield Candidate(waves * state[:, None], parameters, (unit_of_state(readings, followed),) * waves.shape[1])
+            along = Separable((state,) * waves.shape[1], place, waves)
+            yield Candidate(along, parameters, (unit_of_state(readings, followed),) * waves.shape[1])
 
 
 def _hidden_leads(readings: Readings) -> str:

@@ -342,7 +342,7 @@ def declare(readings: Readings, declared: Sequence[str], effects: Mapping[str, E
                 f"declared effect {name!r} has parameters that are not known beforehand; leave it out of [model] declared, the "
                 "search tries it anyway"
             )
-        if not candidates[0].columns.any():
+        if not np.any(candidates[0].columns):
             raise LoopError(
                 f"declared effect {name!r} is zero at every reading: what it follows does not change during the test; check that the "
                 "frames are not copies of one (camera frozen) and that the logs move, or leave it out of [model] declared"

@@ -95,7 +95,7 @@ def _beside(model: ModelFit, candidates: Sequence[Candidate]) -> tuple[Array, Ar
     q, _ = np.linalg.qr(model.fit.design)
     own, left, spread = np.empty((3, len(candidates)))
     for k, candidate in enumerate(candidates):
-        column = candidate.columns[model.used, 0]
+        column = candidate.columns[model.used][:, 0]
         own[k] = np.sqrt(np.mean((column - (np.bincount(site, column) / number)[site]) ** 2))
         left[k] = np.sqrt(np.mean((column - q @ (q.T @ column)) ** 2))
         spread[k] = column.std()
@@ -105,7 +105,7 @@ def _beside(model: ModelFit, candidates: Sequence[Candidate]) -> tuple[Array, Ar
 def _smallest(sums: Sequence[Products], spread: Array, wanted: Array) -> Array:
     """Coefficient of every first column at which its expected gain is as wanted, the drift being free with it and without it."""
     n, energy, noise, penalty = sums[0].readings, [], [], []
-    for products in sums:
+    for products in (held.of_candidates() for held in sums):
         freed = beside_design(products)
         noise.append(np.mean(freed.squares[1 : 1 + _DRAWS]))
         first = np.empty(wanted.size)
@@ -136,9 +136,10 @@ def _alike(
 ) -> list[set[str]]:
     """For every effect's typical candidate the effects of which some candidate explains nearly all that is visible of it."""
     design = scorer.fit.design
-    shown = np.column_stack([candidates[k].columns[scorer.used, 0] for k in typical])
+    shown = np.column_stack([candidates[k].columns[scorer.used][:, 0] for k in typical])
     shown = shown - design @ np.linalg.lstsq(design, shown, rcond=None)[0]
-    (products,) = sum_products([scorer.fit.system], shown, design, by_width(candidates, scorer.used))
+    (held,) = sum_products([scorer.fit.system], shown, design, by_width(candidates, scorer.used))
+    products = held.of_candidates()
     freed = beside_design(products)
     reduced, given, _ = reductions(products, freed)
     alike = reduced - given > _ALIKE_SHARE * np.maximum(freed.squares, 1e-300)[:, None]

@@ -178,7 +178,7 @@ class LoopResult:
         others = [score for score in scores if score.candidate and score.name not in added]
         if not self.remainder.shape or not others:
             return {"nearest": "", "nearest_p": None, "nearest_share": None}
-        shares = [self.remainder.share_of(score.best.columns) for score in others]
+        shares = [self.remainder.share_of(np.asarray(score.best.columns)) for score in others]
         best = int(np.argmax(shares))
         return {
             "nearest": others[best].name,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.effects.effect import Candidate
+from fusion.effects.effect import Candidate, Separable
 from fusion.loop.decisions import Decision, Reason
 from fusion.loop.parameter_ranges import DERIVED_WORDS, parameter_ranges
 from fusion.loop.state import Score, SearchError
@@ -84,11 +84,13 @@ def collect_candidates(
 def _check_columns(candidates: Sequence[Candidate], rows: int) -> None:
     """Refuse columns that are not one finite number per row."""
     for candidate in candidates:
-        columns = np.asarray(candidate.columns)
-        if columns.ndim != 2 or columns.shape[0] != rows:
+        columns = candidate.columns if isinstance(candidate.columns, Separable) else np.asarray(candidate.columns)
+        if len(columns.shape) != 2 or columns.shape[0] != rows:
             raise SearchError(f"columns have shape {columns.shape}; expected ({rows}, columns)")
-        if not np.isfinite(columns).all():
-            not_finite = int((~np.isfinite(columns)).sum())
+        # Of columns that share courses these are looked at, and all columns only where one is not finite.
+        parts = (*columns.courses, columns.weights) if isinstance(columns, Separable) else (columns,)
+        if not all(np.isfinite(part).all() for part in parts):
+            not_finite = int((~np.isfinite(np.asarray(columns))).sum())
             raise SearchError(f"{not_finite} values are not finite at {dict(candidate.parameters)}")
         if len(candidate.units) != columns.shape[1]:
             raise SearchError(

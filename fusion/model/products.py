@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.effects.effect import Candidate
+from fusion.effects.effect import Candidate, Separable
 from fusion.model.least_squares import Moments, PriorRows
 from interferometry.drift.state_space import DriftSystem
 
@@ -44,8 +44,13 @@ class Group:
     candidates: tuple[Candidate, ...]
     readings: NDArray[np.int64]
 
+    @property
+    def held(self) -> int:
+        """Number of columns whose products are summed."""
+        return self.width * self.places.size
+
     def columns(self, rows: slice) -> Array:
-        """Columns at some readings of the fit, (rows, width * size): the first of each candidate, then the second of each.
+        """Columns at some readings of the fit, (rows, held): the first of each candidate, then the second of each.
 
         Those that are no evidence stand before the others.
         """
@@ -56,6 +61,58 @@ class Group:
             stacked[:, self.beside :, k] = own[:, : self.width - self.beside]
             stacked[:, : self.beside, k] = own[:, self.width - self.beside :]
         return stacked.reshape(here.size, -1)
+
+    def none(self) -> Array:
+        """Products of each candidate's columns with one another over no readings, (size, width, width)."""
+        return np.zeros((self.places.size, self.width, self.width))
+
+    def add_within(self, within: Array, columns: Array) -> None:
+        """Add the products of each candidate's columns with one another, over some readings."""
+        slots = np.split(columns, self.width, axis=1)
+        for i, first in enumerate(slots):
+            for j, second in enumerate(slots[: i + 1]):
+                within[:, i, j] += np.einsum("nm,nm->m", first, second)
+                within[:, j, i] = within[:, i, j]
+
+
+@dataclass(frozen=True)
+class PlacedGroup(Group):
+    """Candidates of more columns than they have courses in time at single places: products of these tell all others.
+
+    Attributes
+    ----------
+    courses : (n,) each, of all readings, the different ones
+    place : (n,) place of every reading of the fit
+    combination : (held, width * size) the candidates' columns as combinations of every course at every place alone
+    """
+
+    courses: tuple[Array, ...]
+    place: NDArray[np.int64]
+    combination: Array
+
+    @property
+    def held(self) -> int:
+        """Number of columns whose products are summed."""
+        return int(self.combination.shape[0])
+
+    def columns(self, rows: slice) -> Array:
+        """Every course at every place alone, (rows, held)."""
+        at_place = self.place[rows, None] == np.arange(self.held // len(self.courses))
+        return np.concatenate([at_place * course[self.readings[rows], None] for course in self.courses], axis=1)
+
+    def none(self) -> Array:
+        """Products of the courses over no readings, (held, held)."""
+        return np.zeros((self.held, self.held))
+
+    def add_within(self, within: Array, columns: Array) -> None:
+        """Add the products of the courses with one another, over some readings."""
+        within += columns.T @ columns
+
+    def within_of(self, products: Array) -> Array:
+        """Products of each candidate's columns with one another (size, width, width) by those of the courses."""
+        through = products @ self.combination
+        slots = [np.split(matrix, self.width, axis=1) for matrix in (self.combination, through)]
+        return np.stack([[np.einsum("km,km->m", a, b) for b in slots[1]] for a in slots[0]]).transpose(2, 0, 1)
 
 
 def by_width(candidates: Sequence[Candidate], used: NDArray[np.bool_]) -> list[Group]:
@@ -70,13 +127,36 @@ def by_width(candidates: Sequence[Candidate], used: NDArray[np.bool_]) -> list[G
     -------
     list of Group
     """
-    kinds = np.array([(candidate.columns.shape[1], candidate.beside) for candidate in candidates]).reshape(-1, 2)
+    kinds: dict[tuple[int, int, int], list[int]] = {}
+    for k, one in enumerate(candidates):
+        counted = id(one.columns.place) if isinstance(one.columns, Separable) else 0
+        kinds.setdefault((one.columns.shape[1], one.beside, counted), []).append(k)
+    readings = np.flatnonzero(used)
     groups = []
-    for width, beside in np.unique(kinds, axis=0):
-        places = np.flatnonzero((kinds == (width, beside)).all(axis=1))
-        chosen = tuple(candidates[k] for k in places)
-        groups.append(Group(places, int(width), int(beside), chosen, np.flatnonzero(used)))
+    for (width, beside, counted), places in sorted(kinds.items(), key=lambda kind: (*kind[0][:2], kind[1])):
+        group = Group(np.array(places), width, beside, tuple(candidates[k] for k in places), readings)
+        groups.append((_by_places(group) if counted and not beside else None) or group)
     return groups
+
+
+def _by_places(group: Group) -> PlacedGroup | None:
+    """The same group by courses at single places, or None where that would be no fewer columns."""
+    parts = [one.columns for one in group.candidates if isinstance(one.columns, Separable)]
+    courses = {id(course): course for part in parts for course in part.courses}
+    count = parts[0].weights.shape[0]
+    if len(courses) * count >= group.held:
+        return None
+    number = {key: k for k, key in enumerate(courses)}
+    combination = np.zeros((len(courses), count, group.width, group.places.size))
+    for k, part in enumerate(parts):
+        for column, course in enumerate(part.courses):
+            combination[number[id(course)], :, column, k] = part.weights[:, column]
+    return PlacedGroup(
+        **vars(group),
+        courses=tuple(courses.values()),
+        place=parts[0].place[group.readings],
+        combination=combination.reshape(len(courses) * count, -1),
+    )
 
 
 @dataclass
@@ -88,8 +168,8 @@ class Products:
     groups : the candidates
     basis : (columns of the model, p) of the columns that are the design here
     design, cross, squares : (p, p), (p, r), (r,) of the design with itself, with the responses, and of each response with itself
-    with_responses, with_design : (r, columns), (p, columns) of the candidates' columns by group with responses and design
-    within : for every group the products of each candidate's columns with one another, (size, width, width)
+    with_responses, with_design : (r, held), (p, held) of the columns that the groups hold with responses and design
+    within : of these columns with one another, as each group needs them
     readings : number of readings
     log_spread : sum of the logarithms of the innovation variances
     """
@@ -108,7 +188,7 @@ class Products:
     @classmethod
     def none(cls, groups: Sequence[Group], basis: Array, responses: int) -> Products:
         """Sums over no readings, for so many responses."""
-        columns, design = sum(group.width * group.places.size for group in groups), basis.shape[1]
+        columns, design = sum(group.held for group in groups), basis.shape[1]
         return cls(
             groups,
             basis,
@@ -117,7 +197,7 @@ class Products:
             np.zeros(responses),
             np.zeros((responses, columns)),
             np.zeros((design, columns)),
-            [np.zeros((group.places.size, group.width, group.width)) for group in groups],
+            [group.none() for group in groups],
         )
 
     def add(self, rows: Array, roots: Array) -> None:
@@ -130,13 +210,39 @@ class Products:
         products = rows[:, :known].T @ c
         self.with_responses += products[: y.shape[1]]
         self.with_design += products[y.shape[1] :]
-        for within, slots in zip(self.within, self.slots(), strict=True):
-            for i, first in enumerate(slots):
-                for j, second in enumerate(slots[: i + 1]):
-                    within[:, i, j] += np.einsum("nm,nm->m", c[:, first], c[:, second])
-                    within[:, j, i] = within[:, i, j]
+        start = known
+        for group, within in zip(self.groups, self.within, strict=True):
+            group.add_within(within, rows[:, start : start + group.held])
+            start += group.held
         self.readings += rows.shape[0]
         self.log_spread += 2.0 * float(np.log(roots).sum())
+
+    def of_candidates(self) -> Products:
+        """The same of the candidates' own columns, where groups hold others that tell them."""
+        if not any(isinstance(group, PlacedGroup) for group in self.groups):
+            return self
+        ends = np.cumsum([group.held for group in self.groups])[:-1]
+        responses, design, within = [], [], []
+        for group, y, x, own in zip(
+            self.groups,
+            np.split(self.with_responses, ends, axis=1),
+            np.split(self.with_design, ends, axis=1),
+            self.within,
+            strict=True,
+        ):
+            if isinstance(group, PlacedGroup):
+                y, x, own = y @ group.combination, x @ group.combination, group.within_of(own)
+            responses.append(y)
+            design.append(x)
+            within.append(own)
+        whole = [Group(one.places, one.width, one.beside, one.candidates, one.readings) for one in self.groups]
+        return replace(
+            self,
+            groups=whole,
+            with_responses=np.concatenate(responses, axis=1),
+            with_design=np.concatenate(design, axis=1),
+            within=within,
+        )
 
     def slots(self) -> list[list[slice]]:
         """For every group the places of the first column of each candidate, of the second of each, and so on."""
@@ -225,7 +331,10 @@ def sum_products_apart(
         For every system: of the part, of the others.
     """
     bases = [np.eye(design.shape[1])] * len(systems)
-    return [(one, other) for one, other in _sums_over(systems, responses, design, groups, bases, [part, ~part])]
+    return [
+        (one.of_candidates(), other.of_candidates())
+        for one, other in _sums_over(systems, responses, design, groups, bases, [part, ~part])
+    ]
 
 
 def _sums_over(
@@ -236,7 +345,7 @@ def _sums_over(
     bases: Sequence[Array],
     parts: Sequence[NDArray[np.bool_]],
 ) -> list[list[Products]]:
-    columns = responses.shape[1] + sum(group.width * group.places.size for group in groups)
+    columns = responses.shape[1] + sum(group.held for group in groups)
     whitenings = [system.whitening(columns + basis.shape[1]) for system, basis in zip(systems, bases, strict=True)]
     sums = [[Products.none(groups, basis, responses.shape[1]) for _ in parts] for basis in bases]
     at_once = max(1, _VALUES_AT_ONCE // (columns + design.shape[1]))

@@ -82,7 +82,7 @@ def gains_by_products(sums: Sequence[Products], priors: PriorRows | None = None)
     without, best = np.full(count, -np.inf), np.full((count, size), -np.inf)
     best_started = np.full((count, started.size), -np.inf)
     drift_place, separable = np.zeros(size, int), np.zeros(size, bool)
-    for place, products in enumerate(sums):
+    for place, products in enumerate(held.of_candidates() for held in sums):
         n, log_determinant = products.readings, products.log_spread
         freed = beside_design(products, priors)
         reduced, given, separate = reductions(products, freed)

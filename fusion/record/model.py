@@ -88,7 +88,7 @@ def fit_record(record: Record, terms: Sequence[Term], used: NDArray[np.bool_]) -
         if a channel has too few blocks for the columns.
     """
     most = int(used.sum()) // _PER_COLUMN
-    parts = [_leading(term.candidate.columns, used, most) for term in terms]
+    parts = [_leading(np.asarray(term.candidate.columns), used, most) for term in terms]
     columns = np.concatenate([columns_of(record, []), *parts], axis=1)
     columns = columns[:, independent(columns[used])]
     rng = np.random.default_rng(0)

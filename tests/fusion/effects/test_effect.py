@@ -7,7 +7,7 @@ from dataclasses import FrozenInstanceError
 import numpy as np
 import pytest
 
-from fusion.effects.effect import Candidate, Effect, Prior
+from fusion.effects.effect import Candidate, Effect, Prior, Separable
 from tests.fusion.small_campaign import campaign
 
 
@@ -41,3 +41,17 @@ def test_a_candidate_keeps_all_but_its_rows_at_some_of_the_readings():
     assert candidate.columns.shape == (3, 2)
     with pytest.raises(FrozenInstanceError):
         candidate.beside = 0
+
+
+def test_separable_columns_are_courses_weighed_by_place():
+    courses = (np.array([1.0, 2.0, 3.0]), np.array([False, True, True]))
+    columns = Separable(courses, np.array([0, 1, 0]), np.array([[2.0, 3.0], [10.0, 20.0]]))
+    whole = [[2.0, 0.0], [20.0, 20.0], [6.0, 3.0]]
+    assert columns.shape == (3, 2)
+    np.testing.assert_array_equal(np.asarray(columns), whole)
+    np.testing.assert_array_equal(columns[np.array([2, 1])], [whole[2], whole[1]])
+    np.testing.assert_array_equal(columns[np.array([True, False, True])], [whole[0], whole[2]])
+    np.testing.assert_array_equal(columns[1:, 1], [20.0, 3.0])
+    np.testing.assert_array_equal(np.column_stack([columns, columns]), np.hstack([whole, whole]))
+    on_some = Candidate(columns, {}, ("um", "um")).on(np.array([False, True, False]))
+    np.testing.assert_array_equal(on_some.columns, [whole[1]])

@@ -40,7 +40,7 @@ def test_a_wave_has_its_period_in_minutes_flat_or_along_the_axis():
     period = flat.parameters["period_min"]
     phase = 2.0 * np.pi * readings.seconds / 60.0 / period
     np.testing.assert_allclose(flat.columns, np.column_stack([np.cos(phase), np.sin(phase)]), atol=1e-9)
-    np.testing.assert_allclose(linear.columns, flat.columns * readings.position_mm[:, None] / 400.0, atol=1e-12)
+    np.testing.assert_allclose(linear.columns, flat.columns[:] * readings.position_mm[:, None] / 400.0, atol=1e-12)
     assert (flat.parameters["shape"], linear.parameters["shape"]) == ("flat", "linear")
     assert flat.units == linear.units == ("um", "um")
     assert linear.parameters["period_min"] == period

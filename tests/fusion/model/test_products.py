@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from fusion.effects.effect import Candidate
+from fusion.effects.effect import Candidate, Separable
 from fusion.model.least_squares import PriorRows, moments_of
 from fusion.model.products import (
     beside_design,
@@ -185,3 +187,35 @@ def test_a_candidate_with_a_column_of_zeros_explains_nothing(rng, width):
     assert separable.tolist() == [False, True]
     assert reduced[0, 0] == 0.0
     assert reduced[0, 1] == pytest.approx(y[:, 0] @ y[:, 0] - squares_beside(y[:, 0], candidates[1].columns))
+
+
+def waves(rng: np.random.Generator, n: int, count: int) -> list[Candidate]:
+    """Candidates of two columns that follow two courses in time at three places, in different shares."""
+    place, courses = np.resize([0, 1, 2], n), tuple(rng.standard_normal((2, n)))
+    return [
+        Candidate(Separable((courses[k % 2],) * 2, place, rng.standard_normal((3, 2))), {}, ("um", "um"))
+        for k in range(count)
+    ]
+
+
+def test_few_courses_at_few_places_tell_the_products_of_many_candidates(rng):
+    n, used = 60, np.arange(60) % 4 > 0
+    candidates = [*candidates_of_three_kinds(rng, n), *waves(rng, n, 9)]
+    plain = [replace(one, columns=np.asarray(one.columns)) for one in candidates]
+    y, x = rng.standard_normal((45, 2)), rng.standard_normal((45, 3))
+    placed, whole = (by_width(some, used) for some in (candidates, plain))
+    # Two courses at three places are six columns, those of nine candidates eighteen.
+    assert sum(group.held for group in whole) - sum(group.held for group in placed) == 12
+    (told,), (expected,) = (sum_products([drifting(45)], y, x, groups) for groups in (placed, whole))
+    for one, other in zip(
+        reductions(told.of_candidates(), beside_design(told.of_candidates())),
+        reductions(expected.of_candidates(), beside_design(expected)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-8)
+
+
+def test_few_candidates_are_not_told_by_places(rng):
+    few = by_width(waves(rng, 60, 3), np.ones(60, bool))
+    assert [group.held for group in few] == [6]
+    assert sum_products([still(60)], np.ones((60, 1)), np.ones((60, 1)), few)[0].of_candidates().groups is few
