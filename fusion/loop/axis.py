@@ -7,9 +7,11 @@ no held-out error any more.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from operator import is_
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,6 +147,7 @@ class AxisProblem:
         self, readings: Readings, used: NDArray[np.bool_], effects: Mapping[str, Effect], rng: np.random.Generator
     ) -> None:
         self.readings, self.used, self.effects, self.rng = readings, used, effects, rng
+        self._fits: deque[ModelFit] = deque(maxlen=2 * MOST_EFFECTS)
 
     def start(self, declared: Sequence[Term]) -> AxisState:
         """The state before the search: the declared model, and the effects that these readings cannot show."""
@@ -153,7 +156,7 @@ class AxisProblem:
             name: effect.needs(self.readings) or (None if name in present else effect.masked_by(self.readings))
             for name, effect in self.effects.items()
         }
-        return AxisState(fit_model(self.readings, declared, used=self.used)).decide(
+        return AxisState(self.fitted(declared)).decide(
             *(
                 Decision(name, Reason.NOT_AVAILABLE, {"because": because})
                 for name, because in missing.items()
@@ -161,8 +164,18 @@ class AxisProblem:
             )
         )
 
+    def fitted(self, terms: Sequence[Term]) -> ModelFit:
+        """The model of these terms on the training part, fitted once: the search and the hold-out set ask for the same ones."""
+        for model in self._fits:
+            if len(model.terms) == len(terms) and all(map(is_, model.terms, terms)):
+                return model
+        self._fits.append(fit_model(self.readings, terms, used=self.used))
+        return self._fits[-1]
+
     def refit(self, model: ModelFit, terms: Sequence[Term]) -> ModelFit:
         """Fit other terms to the readings that a model was fitted to."""
+        if model.used is self.used:
+            return self.fitted(terms)
         return fit_model(self.readings, terms, used=model.used)
 
     def score(self, state: AxisState) -> Round:
@@ -215,7 +228,7 @@ class AxisProblem:
     def hold_out_errors(self, terms: Sequence[Term]) -> Array:
         """Open-loop errors on the hold-out cycles, um; an event among them is sized on one half of the targets, tested on the other."""
         if not any(self.is_late(term) for term in terms):
-            return fit_model(self.readings, terms, used=self.used).open_loop_errors()[0]
+            return self.fitted(terms).open_loop_errors()[0]
         half = self.readings.target_index % 2 == 0
         errors = np.full(self.used.size, np.nan)
         for fitted in (half, ~half):
