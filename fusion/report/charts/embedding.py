@@ -12,7 +12,7 @@ from pathlib import Path
 import bokeh
 import numpy as np
 from bokeh.document import Document
-from bokeh.models import ColumnDataSource, LayoutDOM, Plot
+from bokeh.models import ColumnDataSource, GlyphRenderer, LayoutDOM, Plot
 from markupsafe import Markup
 
 from fusion.report.charts.style import Chart
@@ -59,26 +59,40 @@ def embed(charts: Mapping[str, Chart]) -> dict[str, EmbeddedChart]:
     The columns for download travel in the Bokeh document, as the first tag of the figure, compressed like every array in it; text in
     them is protected against being read as a formula when the file is written.
     """
-    return {name: _embedded(name, chart) for name, chart in charts.items()}
+    for chart in charts.values():
+        _prepare(chart)
+    return {
+        name: EmbeddedChart(name, chart.seen, _height(chart), _in_script(json.dumps(item, separators=(",", ":")), "</"))
+        for (name, chart), item in zip(charts.items(), _items(charts), strict=True)
+    }
 
 
-def _embedded(name: str, chart: Chart) -> EmbeddedChart:
+def _prepare(chart: Chart) -> None:
+    """Take from a chart what no page needs, and add what it lets the reader download."""
+    for renderer in (renderer for plot in _plots(chart) for renderer in plot.renderers):
+        if isinstance(renderer, GlyphRenderer):
+            # Looks of what is not selected or muted, which Bokeh adds to every mark: a page has no tool that selects or mutes.
+            renderer.update(nonselection_glyph=None, muted_glyph=None)
     columns = {heading: _compact(np.asarray(values)) for heading, values in chart.columns.items()}
     chart.figure.tags = [ColumnDataSource(columns), *chart.figure.tags]
-    text = json.dumps(_item(chart.figure, f"drawing-{name}"), separators=(",", ":"))
-    return EmbeddedChart(name, chart.seen, _height(chart), _in_script(text, "</"))
 
 
-def _item(drawn: LayoutDOM, target: str) -> dict[str, object]:
-    """Return what `bokeh.embed.json_item` returns; it also looks for mistakes in every drawing, for a third of the time."""
+def _items(charts: Mapping[str, Chart]) -> list[dict[str, object]]:
+    """Return what `bokeh.embed.json_item` returns of every chart; it also looks for mistakes in every drawing, for most of the time."""
     document = Document(title="")
-    document.add_root(drawn)
-    return {
-        "target_id": target,
-        "root_id": drawn.id,
-        "doc": document.to_json(deferred=False),
-        "version": bokeh.__version__,
-    }
+    with document.models.freeze():
+        for chart in charts.values():
+            document.add_root(chart.figure)
+    content = document.to_json(deferred=False)
+    return [
+        {
+            "target_id": f"drawing-{name}",
+            "root_id": chart.figure.id,
+            "doc": {**content, "roots": [root]},
+            "version": bokeh.__version__,
+        }
+        for (name, chart), root in zip(charts.items(), content["roots"], strict=True)
+    ]
 
 
 def _compact(values: np.ndarray) -> np.ndarray:
@@ -88,10 +102,15 @@ def _compact(values: np.ndarray) -> np.ndarray:
     return values.astype(str).astype(object)
 
 
+def _plots(chart: Chart) -> list[Plot]:
+    """Return the figure of a chart, or those of a layout."""
+    return [chart.figure] if isinstance(chart.figure, Plot) else list(chart.figure.select({"type": Plot}))
+
+
 def _height(chart: Chart) -> int:
     """Return the height of a chart in CSS px: its own, or the sum of what a column of charts holds."""
     own = chart.figure.height
-    return int(own) if own is not None else sum(int(part.height or 0) for part in chart.figure.select({"type": Plot}))
+    return int(own) if own is not None else sum(int(plot.height or 0) for plot in _plots(chart))
 
 
 @cache

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from bokeh import palettes
 from bokeh.models import (
     BoxAnnotation,
     ColorBar,
@@ -36,6 +37,8 @@ BEFORE = "#76858c"
 MARKERS = {"positive": "triangle", "negative": "inverted_triangle"}
 #: Perceptually uniform scale for quantities, and a diverging one with its middle at zero; both hold for colour-blind readers.
 SEQUENTIAL, DIVERGING = "inferno", "RdBu_r"
+#: Colours of the scales by name, from low to high, as Bokeh brings them.
+_SCALES = {SEQUENTIAL: palettes.Inferno256, DIVERGING: palettes.RdBu11, "PuOr_r": palettes.PuOr11}
 #: Share of the scale of ordered lines that is dark enough to be read on white (contrast of at least 3 : 1).
 _DARK_SHARE = 0.58
 #: Labels of logarithmic axes: 1, 2 and 5 of every decade.
@@ -333,13 +336,11 @@ def palette(name: str = SEQUENTIAL, steps: int = 256) -> list[str]:
     Parameters
     ----------
     name : str
-        Name of a matplotlib colour map.
+        `SEQUENTIAL`, `DIVERGING` or "PuOr_r"; what matplotlib calls by the same name.
     steps : int
         Number of colours.
     """
-    import matplotlib as mpl
-
-    return [mpl.colors.to_hex(colour) for colour in mpl.colormaps[name](np.linspace(0.0, 1.0, steps))]
+    return list(palettes.interp_palette(_SCALES[name], steps))
 
 
 def ordered_colours(count: int) -> list[str]:
@@ -354,10 +355,8 @@ def ordered_colours(count: int) -> list[str]:
     -----
     The first 58 % of viridis: the rest is too pale for a line on white (contrast below 3 : 1, WCAG 2.2, 1.4.11).
     """
-    import matplotlib as mpl
-
-    shades = mpl.colormaps["viridis"](np.linspace(0.0, _DARK_SHARE, count))
-    return [mpl.colors.to_hex(shade) for shade in shades]
+    dark = palettes.Viridis256[: round(_DARK_SHARE * 256)]
+    return list(palettes.interp_palette(dark, count))
 
 
 def shared_range(*values: np.ndarray, symmetrical: bool = False) -> tuple[float, float]:
