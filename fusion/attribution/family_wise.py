@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from types import MappingProxyType
 
 import numpy as np
@@ -290,7 +291,8 @@ class _Tally:
 
     def add(self, channel: int, cells: slice, ratio: Array32, chosen: NDArray[np.int64], effects: Array) -> None:
         """Enter ratios (1 + simulated, cells, lags) of one channel, the chosen lags (cells,) and the effects there (3, cells)."""
-        best = ratio.max(axis=2)
+        # Lag after lag: over an axis as short as that of the lags `max` takes six times as long.
+        best = reduce(np.maximum, np.moveaxis(ratio, 2, 0))
         self.statistic[channel, cells] = best[0]
         self.lag_index[channel, cells] = chosen
         self.effects[:, channel, cells] = effects

@@ -89,6 +89,8 @@ class Run:
         Start of the run, UTC.
     address : str or None
         Where the campaign file was fetched from.
+    depends : tuple
+        What every stage depends on beside campaign and files, as it was at the start.
     parts, notices : dict, list
         Parts of results.json and notices of the stages so far.
     seconds, keys : dict
@@ -105,6 +107,7 @@ class Run:
     seen: Mapping[str, FileState]
     started: datetime
     address: str | None = None
+    depends: tuple[Any, ...] = field(default_factory=dependencies)
     parts: dict[str, Any] = field(default_factory=dict)
     notices: list[Notice] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
@@ -160,7 +163,7 @@ class Run:
         asked = self.campaign.model_dump(mode="json", include=set(tables))
         files = {file: self.inputs[file] for table in tables for file in self.campaign.files_of(table)}
         zone = self.campaign.campaign.time_zone
-        return digest(name, *dependencies(), zone, asked, files, [self.keys[earlier] for earlier in after])
+        return digest(name, *self.depends, zone, asked, files, [self.keys[earlier] for earlier in after])
 
     def checkpoint(self, key: str) -> Path:
         """Return the folder that keeps the finished cycles of a long recording; folders of other inputs are removed."""
