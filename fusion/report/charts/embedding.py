@@ -12,7 +12,7 @@ from pathlib import Path
 import bokeh
 import numpy as np
 from bokeh.document import Document
-from bokeh.models import ColumnDataSource, GlyphRenderer, LayoutDOM, Plot
+from bokeh.models import ColumnDataSource, GlyphRenderer, Plot
 from markupsafe import Markup
 
 from fusion.report.charts.style import Chart
