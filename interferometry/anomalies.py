@@ -39,6 +39,8 @@ BLOCK_CYCLES = 5
 #: Shortest test and shortest series that are examined for motion over the cycles.
 SHORTEST_TEST_CYCLES = 15
 MOST_ANOMALIES = 4
+#: Frequencies of a periodogram that are looked at together.
+_WAVES_AT_ONCE = 128
 #: Levels of the tests whether a target stands out from the others: by its scatter, both directions together and either alone, and by its
 #: motion over the cycles. Scatter that differs naturally is significant by permutation, so that the first two must share 0.05.
 ESD_LEVELS = {"together": 0.035, "single": 0.01, "motion": 0.02}
@@ -300,7 +302,8 @@ def _series_anomalies(
     values = memory.innovations(values)
     orders = np.array([rng.permutation(values.shape[1]) for _ in range(permutations)])
     periodogram = _Periodogram(_cycle_seconds(deviations))
-    tests = {"periodic": (periodogram.power(values).max(axis=-1), periodogram.p_values(values))}
+    largest = periodogram.power(values).max(axis=-1)
+    tests = {"periodic": (largest, periodogram.p_values(largest))}
     for kind, statistic in (("slow", _slowness), ("step", _largest_step)):
         tests[kind] = _permutation_test(values, statistic, orders)
     significant: dict[str, dict[int, tuple[float, int]]] = {}
@@ -409,24 +412,24 @@ class _Periodogram:
     """Normalised power of series (series, cycle) at periods from three cycles to a third of the test, at the cycles' own times (s)."""
 
     def __init__(self, seconds: Array) -> None:
-        length = float(seconds[-1] - seconds[0])
-        self.frequency = np.arange(3.0, seconds.size / 3.0) / length
-        phase = 2 * np.pi * np.outer(seconds, self.frequency)
-        self._basis = np.concatenate([np.cos(phase), np.sin(phase)], axis=1)
+        self._seconds = seconds
+        self.frequency = np.arange(3.0, seconds.size / 3.0) / float(seconds[-1] - seconds[0])
 
     def power(self, values: Array) -> Array:
-        projected = values @ self._basis
-        half = self.frequency.size
-        energy = projected[..., :half] ** 2 + projected[..., half:] ** 2
-        return energy * 2 / values.shape[-1] / values.var(axis=-1)[..., None]
+        # A long test has as many waves as cycles: some are made at a time.
+        energy = np.empty((*values.shape[:-1], self.frequency.size))
+        for start in range(0, self.frequency.size, _WAVES_AT_ONCE):
+            some = slice(start, start + _WAVES_AT_ONCE)
+            phase = 2 * np.pi * np.outer(self._seconds, self.frequency[some])
+            energy[..., some] = (values @ np.cos(phase)) ** 2 + (values @ np.sin(phase)) ** 2
+        return np.asarray(energy * 2 / values.shape[-1] / values.var(axis=-1)[..., None])
 
-    def p_values(self, values: Array) -> Array:
+    def p_values(self, largest: Array) -> Array:
         """Return the p-value of each series' largest power, corrected for all frequencies and series (Bonferroni).
 
         The power of a winsorised series without period follows chi-square with two degrees of freedom: no permutation needed.
         """
-        largest = self.power(values).max(axis=-1)
-        return np.minimum(1.0, np.exp(-largest / 2) * self.frequency.size * values.shape[0])
+        return np.minimum(1.0, np.exp(-largest / 2) * self.frequency.size * largest.size)
 
 
 def _one_kind_per_target(significant: dict[str, dict[int, tuple[float, int]]], values: Array) -> list[tuple[str, int]]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import xarray as xr
-from scipy import stats
+from scipy import sparse, stats
 
 from fusion._typing import Array
 from fusion.consistency.checks import Check, Severity
@@ -20,6 +21,8 @@ _LEAST_NOISE_UM = 0.002
 _LEAST_TRAVEL_SHARE = 0.03
 #: Share of equal readings from which two cycles are copies, and the share that ordinary cycles may have.
 _COPIED_SHARE, _ORDINARY_SHARE = 0.8, 0.3
+#: Cycles that are compared with all others at once.
+_CYCLES_AT_ONCE = 256
 #: Standard deviations of its own position and approach beyond which a reading is an error of reading: no process of a machine that repeats
 #: scatters as far, and Student's t with 4 degrees of freedom, heavier than any laser's noise, does so once in some 2,000 readings.
 _GROSS_SIGMAS = 10.0
@@ -160,21 +163,18 @@ def _travel(deviations: xr.Dataset, plan_extent_mm: float) -> Check:
 def _copied_cycles(deviations: xr.Dataset) -> Check:
     """Two cycles that agree digit for digit are one cycle, entered twice."""
     values = deviations["deviation"].values.reshape(deviations.sizes["cycle"], -1)
-    present = np.isfinite(values)
-    count, pairs = values.shape[0], []
-    shares = np.zeros((count, count))
-    for first in range(count):
-        both = present[first] & present
-        equal = (values[first] == values) & both
-        shares[first] = equal.sum(axis=1) / np.maximum(both.sum(axis=1), 1)
-    upper = shares[np.triu_indices(count, 1)]
+    largest, following, copies = 0.0, [], []
+    for start, shares in _equal_shares(values):
+        later = np.triu(shares, start + 1)
+        largest = max(largest, float(later.max(initial=0.0)))
+        following.append(np.diagonal(shares, start + 1).copy())
+        copies.append(np.argwhere(later >= _COPIED_SHARE) + np.array([start, 0]))
+    pairs = []
     # Coarsely rounded readings agree from cycle to cycle; then agreement says nothing.
-    if count > 1 and np.median(np.diagonal(shares, 1)) <= _ORDINARY_SHARE:
-        places = np.argwhere(np.triu(shares, 1) >= _COPIED_SHARE)
+    if values.shape[0] > 1 and np.median(np.concatenate(following)) <= _ORDINARY_SHARE:
         number = deviations["cycle"].values
-        pairs = [f"{number[a]} and {number[b]}" for a, b in places]
+        pairs = [f"{number[a]} and {number[b]}" for a, b in np.concatenate(copies)]
     named = ", ".join(pairs[:5]) + (f" and {len(pairs) - 5} more" if len(pairs) > 5 else "")
-    largest = float(upper.max(initial=0.0))
     return Check(
         "copied_cycles",
         largest,
@@ -184,6 +184,22 @@ def _copied_cycles(deviations: xr.Dataset) -> Check:
         "Leave one of the two cycles out of the file." if pairs else "",
         "scatter, repeatability, p-values",
     )
+
+
+def _equal_shares(values: Array) -> Iterator[tuple[int, Array]]:
+    """Yield the share of readings that cycles have equal digit for digit: first cycle of a few, and theirs with every cycle (few, cycle).
+
+    Of values (cycle, site), NaN where there is no reading. Equal readings are found by sorting them, so that cycles without any in common
+    are never compared.
+    """
+    present = np.isfinite(values)
+    cycle, site = np.nonzero(present)
+    _, number = np.unique(np.column_stack([site, values[present]]), axis=0, return_inverse=True)
+    holds = sparse.csr_array((np.ones(cycle.size), (cycle, number.ravel())))
+    for start in range(0, values.shape[0], _CYCLES_AT_ONCE):
+        rows = slice(start, start + _CYCLES_AT_ONCE)
+        both = present[rows].astype(float) @ present.T.astype(float)
+        yield start, (holds[rows] @ holds.T).toarray() / np.maximum(both, 1.0)
 
 
 def _means(values: Array) -> Array:

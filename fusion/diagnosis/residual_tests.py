@@ -107,8 +107,10 @@ def examine_residual(model: ModelFit, rng: np.random.Generator) -> ResidualTests
     clipped = np.clip(innovations, -_CLIP, _CLIP)
     window = max(2, round(readings.seconds.size / np.unique(readings.cycle).size))
     periods = _periods_min(readings.seconds)
-    phases = 2 * np.pi * readings.seconds[:, None] / (60.0 * periods)
-    waves = np.hstack([np.cos(phases), np.sin(phases)]).astype(np.float32)
+    waves = np.empty((readings.seconds.size, 2 * periods.size), np.float32)
+    for k, period in enumerate(periods):
+        phase = 2 * np.pi * readings.seconds / (60.0 * period)
+        waves[:, k], waves[:, periods.size + k] = np.cos(phase), np.sin(phase)
     memory, shift, power = _time_statistics(clipped[None, :], window, waves)
     null = [_time_statistics(_permutations_of(clipped, rng), window, waves) for _ in range(_PERMUTATIONS // _BATCH)]
     strongest = np.concatenate([powers.max(axis=1) for _, _, powers in null])

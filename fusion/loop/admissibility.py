@@ -218,9 +218,14 @@ def _smoothed_copy(readings: Readings, minutes: float) -> Candidate:
 
 def _centred_mean(series: Series, half_width_s: float) -> Series:
     """Mean over a window centred at each sample."""
-    weights = np.abs(series.seconds[:, None] - series.seconds[None, :]) <= half_width_s
-    smoothed = (weights @ series.values.reshape(series.seconds.size, -1)) / weights.sum(axis=1, keepdims=True)
-    return Series(series.seconds, smoothed.reshape(series.values.shape), series.units)
+    seconds, values = series.seconds, series.values.reshape(series.seconds.size, -1)
+    first = np.searchsorted(seconds, seconds - half_width_s, side="left")
+    after = np.searchsorted(seconds, seconds + half_width_s, side="right")
+    mean = values.mean(axis=0)
+    # Sums about the mean, so that differences of long sums lose nothing.
+    total = np.vstack([np.zeros(values.shape[1]), np.cumsum(values - mean, axis=0)])
+    smoothed = mean + (total[after] - total[first]) / (after - first)[:, None]
+    return Series(seconds, smoothed.reshape(series.values.shape), series.units)
 
 
 def _gain(model: ModelFit, candidate: Candidate, beside: Array | None) -> float:

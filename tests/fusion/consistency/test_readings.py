@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from fusion.consistency.checks import Check, Severity
-from fusion.consistency.readings import check_readings, find_gross_readings, random_part_um
+from fusion.consistency.readings import _equal_shares, check_readings, find_gross_readings, random_part_um
 from interferometry.deviations import build_deviations
 
 CYCLES, TARGETS = 40, 12
@@ -147,3 +147,17 @@ def test_a_laser_that_is_zeroed_in_every_cycle_is_named() -> None:
     # Coarse digits make every reading repeat; that says nothing of the zero.
     coarse = deviations["deviation"].copy(data=10.0 * np.round(deviations["deviation"].values / 10.0))
     assert "zeroed_cycles" not in failed(deviations.assign(deviation=coarse))
+
+
+def test_shares_of_equal_readings_are_those_of_every_pair_of_cycles(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = np.round(rng.normal(size=(30, 6)), 1)
+    values[rng.random(values.shape) < 0.2] = np.nan
+    values[4] = np.nan
+    monkeypatch.setattr("fusion.consistency.readings._CYCLES_AT_ONCE", 7)
+    told = np.vstack([shares for _, shares in _equal_shares(values)])
+    both = (np.isfinite(values)[:, None] & np.isfinite(values)).sum(axis=2)
+    expected = (values[:, None] == values).sum(axis=2) / np.maximum(both, 1)
+    np.testing.assert_allclose(told, expected, rtol=1e-12)
+    assert [start for start, _ in _equal_shares(values)] == [0, 7, 14, 21, 28]

@@ -10,7 +10,7 @@ import pytest
 from fusion.alignment.readings import Readings, Series
 from fusion.effects.effect import Candidate
 from fusion.effects.states import warm_up
-from fusion.loop.admissibility import AxisGrounds, noise_share, refuse, warm_up_share
+from fusion.loop.admissibility import AxisGrounds, _centred_mean, noise_share, refuse, warm_up_share
 from fusion.loop.decisions import Decision, Reason
 from tests.fusion.small_campaign import campaign, logged, model_of, term
 
@@ -277,3 +277,13 @@ def test_only_the_readings_of_the_fit_count():
     column = np.where(used, warm_up(readings, 20.0), np.sin(readings.seconds))
     grounds = AxisGrounds(model_of(readings, used=used))
     assert grounds.noise_of_lag(Candidate(column[:, None], {}, ("um/K",)))[2] == 0.003
+
+
+def test_a_centred_mean_is_that_of_all_samples_in_its_window(rng):
+    seconds = np.sort(rng.uniform(0.0, 900.0, 40))
+    values = 1e6 + rng.standard_normal((40, 2))
+    told = _centred_mean(Series(seconds, values, "K"), 100.0)
+    expected = [values[np.abs(seconds - at) <= 100.0].mean(axis=0) for at in seconds]
+    np.testing.assert_allclose(told.values, expected, rtol=1e-13)
+    alone = _centred_mean(Series(seconds, values[:, 0], "K"), 100.0)
+    np.testing.assert_array_equal(alone.values, told.values[:, 0])
