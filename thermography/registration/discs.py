@@ -89,26 +89,28 @@ def detect_discs(temperature: NDArray[np.floating], *, limit: int = 40) -> list[
     their background; connected components above half their peak are compared with the ellipse of their second moments.
     """
     smooth = cv2.GaussianBlur(np.nan_to_num(temperature).astype(np.float32), (0, 0), 0.8)
-    spots: list[Spot] = []
+    found: list[tuple[bool, Spot]] = []
     for width in _KERNEL_WIDTHS_PX:
         kernel = np.ones((width, width), np.uint8)
         black_hat = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, kernel) - smooth
         white_hat = smooth - cv2.morphologyEx(smooth, cv2.MORPH_OPEN, kernel)
         for top_hat, sign in ((black_hat, -1.0), (white_hat, 1.0)):
-            spots.extend(_spots_in(top_hat, sign, width))
-    spots.sort(key=lambda spot: -abs(spot.contrast_K))
+            found.extend(_spots_in(top_hat, sign, width))
+    # Of one spot at several widths that with the strongest contrast is kept, and one that is cut only where no other is whole.
+    found.sort(key=lambda item: (item[0], -abs(item[1].contrast_K)))
     distinct: list[Spot] = []
-    for spot in spots:
+    for _, spot in found:
         reach = 0.6 * np.sqrt(spot.area_px / np.pi)
         if all(np.hypot(spot.column_px - s.column_px, spot.row_px - s.row_px) > reach for s in distinct):
             distinct.append(spot)
-    return distinct[:limit]
+    return sorted(distinct, key=lambda spot: -abs(spot.contrast_K))[:limit]
 
 
-def _spots_in(top_hat: NDArray[np.float32], sign: float, width: int) -> list[Spot]:
-    """Elliptic spots of a top-hat transform with a structuring element of `width` px."""
+def _spots_in(top_hat: NDArray[np.float32], sign: float, width: int) -> list[tuple[bool, Spot]]:
+    """Elliptic spots of a top-hat transform with a structuring element of `width` px, and whether the noise cuts them above half height."""
     noise = float(median_abs_deviation(top_hat, axis=None, scale="normal"))
-    marked = (top_hat > float(np.median(top_hat)) + 6 * max(noise, 1e-3)).astype(np.uint8)
+    least = float(np.median(top_hat)) + 6 * max(noise, 1e-3)
+    marked = (top_hat > least).astype(np.uint8)
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(marked, connectivity=4)
     rows, columns = top_hat.shape
     spots = []
@@ -122,7 +124,8 @@ def _spots_in(top_hat: NDArray[np.float32], sign: float, width: int) -> list[Spo
         peak = float(np.percentile(values[values > 0], 80))
         spot = _ellipse(values > peak / 2, sign * peak)
         if spot is not None:
-            spots.append(Spot(spot.column_px + left, spot.row_px + top, spot.area_px, spot.contrast_K))
+            placed = Spot(spot.column_px + left, spot.row_px + top, spot.area_px, spot.contrast_K)
+            spots.append((least > peak / 2, placed))
     return spots
 
 
