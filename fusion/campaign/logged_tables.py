@@ -281,9 +281,9 @@ def _times(path: Path, column: pd.Series, record: RecordTable) -> tuple[np.ndarr
         time[~np.isfinite(elapsed)] = np.datetime64("NaT")
     else:
         time = np.full(len(column), np.datetime64("NaT", "ns"))
-        for at, text in enumerate(column.astype(str)):
+        for at, value in enumerate(column):
             try:
-                time[at], zone = parse_time(text)
+                time[at], zone = parse_time("" if pd.isna(value) else str(value))
             except BadReading:
                 continue
             zones.setdefault(zone, int(column.index[at]) + 2)

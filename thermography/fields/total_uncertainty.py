@@ -55,7 +55,7 @@ def compare_with_monte_carlo(
     Parameters
     ----------
     temperature, rise : (n,) ndarray, degC and K
-        Of its cells in all cycles, finite.
+        Of its cells in all cycles, finite; the rise is NaN where the first cycle does not show the cell, and counts as none.
     parameters : CameraParameters
         With the emissivity of the surface.
     inputs : InputUncertainty
@@ -71,6 +71,7 @@ def compare_with_monte_carlo(
     RadiometryError
         Where an input is too uncertain for a temperature to be stated.
     """
+    rise = np.where(np.isfinite(rise), rise, 0.0)
     start = float(np.mean(temperature - rise))
     # Without a rise there is nothing to compare; one of 1 K stands for what would be measured.
     far = start + max(float(rise.max()), 1.0) if rise.max() >= -rise.min() else start + min(float(rise.min()), -1.0)

@@ -117,6 +117,15 @@ def test_lines_of_a_record_that_do_not_fit_its_header_are_listed(tmp_path: Path)
     ]
 
 
+def test_a_time_of_day_that_is_missing_is_listed(tmp_path: Path) -> None:
+    rows = "".join(f"2026-03-09 06:3{k}:00,20,1,0\n" for k in range(6))
+    data = read_record(
+        load_campaign(record(tmp_path, f"time,t1 [degC],ch1 [um],spindle [rpm]\n,20,1,0\n{rows}", time="time"))
+    )
+    assert data.sizes["time"] == 6
+    assert [(one["line"], one["reason"]) for one in json.loads(data.attrs["left_out"])] == [(2, "is not a time")]
+
+
 @pytest.mark.parametrize(
     ("content", "time", "message"),
     [

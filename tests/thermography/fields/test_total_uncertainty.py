@@ -136,3 +136,13 @@ def test_surfaces_that_do_not_warm_can_be_compared() -> None:
     still = np.full(4, 22.0)
     compared = compare_with_monte_carlo(still, still - 22.0, CAMERA, InputUncertainty())
     assert compared.rise_ratio == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_cell_that_the_first_cycle_does_not_show_does_not_hide_how_far_first_order_is_right() -> None:
+    temperature = np.array([22.0, 30.0, 40.0])
+    compared = compare_with_monte_carlo(temperature, np.array([np.nan, 8.0, 18.0]), CAMERA, InputUncertainty())
+    assert (
+        compared.rise_ratio
+        == compare_with_monte_carlo(temperature, np.array([0.0, 8.0, 18.0]), CAMERA, InputUncertainty()).rise_ratio
+    )
+    assert np.isfinite(compared.rise_ratio)
