@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -22,6 +23,8 @@ from interferometry.io.workbook import is_workbook, read_sheets
 #: Marks that may stand between fields.
 DELIMITERS = ";\t,|"
 _LINE_ENDS = re.compile(r"\r\n|\n|\r")
+#: Columns of the widest sheet of a spreadsheet; a text with more is no table of readings, and takes long to be found none.
+_MOST_COLUMNS = 16_384
 #: Longest part of a line of the file that a message repeats, characters.
 _SHOWN = 160
 
@@ -143,8 +146,14 @@ def split_lines(path: Path, lines: Sequence[str], delimiter: str) -> list[tuple[
     Raises
     ------
     LaserFormatError
-        A line is longer than a field may be, or holds what no table does.
+        A field is longer than one may be, a line has more than 16,384 of them, or it holds what no table does.
     """
+    wide = next((number for number, line in enumerate(lines, start=1) if line.count(delimiter) >= _MOST_COLUMNS), None)
+    if wide is not None:
+        raise LaserFormatError(
+            f"{path}, line {wide}: more than {_MOST_COLUMNS} columns, which no spreadsheet has; the file is damaged or no table, export it "
+            "again with a line for each reading"
+        )
     reader = csv.reader((f"{line}\n" for line in lines), delimiter=delimiter, skipinitialspace=True)
     try:
         rows = [(reader.line_num, [text.strip() for text in fields]) for fields in reader]
@@ -216,7 +225,7 @@ def table_below(grid: Grid, at: int) -> DelimitedTable:
     """
     line, fields = grid.rows[at]
     names = tuple(fields[: max(i for i, name in enumerate(fields) if name) + 1])
-    repeated = sorted({name for name in names if names.count(name) > 1})
+    repeated = sorted(name for name, count in Counter(names).items() if count > 1)
     if repeated:
         raise LaserFormatError(
             f"{grid.place}, line {line}: column {', '.join(map(repr, repeated))} occurs more than once; keep one"

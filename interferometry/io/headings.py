@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from dataclasses import dataclass
+from functools import lru_cache
 
 #: What a column holds -> its usual headings in English, German, French, Spanish and Chinese.
 _TABLE: dict[str, tuple[str, str, str, str, str]] = {
@@ -210,6 +211,7 @@ def find_unit(text: str) -> str | None:
     return cleaned if cleaned in UNITS else None
 
 
+@lru_cache(1 << 16)
 def read_heading(text: str) -> Heading:
     """Return what a heading names and the unit that it carries.
 

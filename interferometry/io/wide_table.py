@@ -18,6 +18,8 @@ from interferometry.io.readings import FINE, Kind, Reading, Readings, number_tar
 _ROWS_ABOVE, _ROWS_BELOW = 2, 3
 #: Fewest targets and runs by which a table is recognised.
 _FEWEST_TARGETS = 2
+#: More than any table of positions by run has; rows are given the width of the widest one, which must not fill the memory.
+_MOST_CELLS = 5_000_000
 _UNIT_WORDS = {"unit", "units", "einheit", "einheiten", "unite", "unites", "unidad", "unidades", "单位"}
 
 
@@ -84,6 +86,8 @@ def find_wide_table(grid: Grid) -> WideTable | None:
     grid : Grid
     """
     width = max(len(fields) for _, fields in grid.rows)
+    if width * len(grid.rows) > _MOST_CELLS:
+        return None
     cells = [[*fields, *[""] * (width - len(fields))] for _, fields in grid.rows]
     lines = [line for line, _ in grid.rows]
     numerals = grid.numerals

@@ -20,6 +20,8 @@ _MOST_MISSING = 0.25
 _LONGEST = 4
 #: A text frame of a large camera has about 10 MB.
 _MOST_BYTES = 1 << 28
+#: No sensor has more columns, or with the lines around its numbers more lines: a longer table is no frame, and is not read to see that.
+_MOST_COLUMNS, _MOST_LINES = 16_384, 131_072
 
 
 class TextReader(TemperatureReader):
@@ -90,7 +92,7 @@ class TextReader(TemperatureReader):
         content = path.read_bytes()
         utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         lines = content.decode("utf-16" if utf16 else "utf-8-sig", errors="replace").splitlines()
-        for delimiter in _DELIMITERS:
+        for delimiter in _DELIMITERS if len(lines) <= _MOST_LINES else ():
             block = _longest_block(lines, delimiter)
             if _is_a_frame(block):
                 return np.array(block)
@@ -123,7 +125,7 @@ def _longest_block(lines: list[str], delimiter: str) -> list[list[float]]:
 def _numbers(line: str, delimiter: str) -> list[float] | None:
     """Return the numbers of a line, NaN for a field that is empty or a word for none; None where the line is no row of a frame."""
     fields = line.split() if delimiter == " " else line.rstrip().removesuffix(delimiter).split(delimiter)
-    if len(fields) < _FEWEST:
+    if not _FEWEST <= len(fields) <= _MOST_COLUMNS:
         return None
     if delimiter != ",":
         fields = [field.replace(",", ".") for field in fields]

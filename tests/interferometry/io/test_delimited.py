@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from interferometry.io.delimited import delimiter_of, find_header, read_table, read_timed_rows
+from interferometry.io.delimited import delimiter_of, find_header, read_grids, read_table, read_timed_rows
 from interferometry.io.faults import LaserFormatError
 
 
@@ -54,3 +54,12 @@ def test_timed_rows_are_sorted_and_repeated_times_left_out(tmp_path: Path) -> No
     assert series["value"].values.tolist() == [1.0, 2.0]
     assert series["value"].attrs["units"] == "K"
     assert '"line": 4' in series.attrs["left_out"]
+
+
+def test_a_line_of_more_columns_than_a_sheet_has_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        LaserFormatError, match=r"t\.csv, line 2: more than 16384 columns, .* export it again with a line for each"
+    ):
+        read_grids(written(tmp_path, "time,x\n" + "1," * 100_000))
+    (grid,) = read_grids(written(tmp_path, "x," * 16_383 + "x\n"))
+    assert len(grid.rows[0][1]) == 16_384

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ import openpyxl
 import pytest
 import xarray as xr
 
+from interferometry.io.delimited import read_grids
 from interferometry.io.faults import LaserFormatError
 from interferometry.io.readers import read_deviations
+from interferometry.io.wide_table import find_wide_table
 from tests.interferometry.io.test_workbook import write_ods
 
 EXPECTED = np.array([[[1.25, 1.5, 1.75], [0.75, 0.5, 0.25]], [[2.25, 2.5, 2.75], [1.75, 1.5, 1.25]]])
@@ -120,3 +123,13 @@ def test_what_a_table_lacks_is_named(tmp_path: Path, text: str, message: str) ->
         return
     with pytest.raises(LaserFormatError, match=message):
         read(tmp_path, text)
+
+
+def test_one_wide_line_above_many_short_ones_does_not_fill_the_memory(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("Position [mm]" + "," * 16_000 + "\n" + "1\n" * 100_000)
+    tracemalloc.start()
+    (grid,) = read_grids(path)
+    assert find_wide_table(grid) is None
+    assert tracemalloc.get_traced_memory()[1] < 4 * path.stat().st_size + 200e6
+    tracemalloc.stop()

@@ -79,3 +79,13 @@ def test_an_export_of_the_vendors_program_is_its_picture(real_file: Callable[[st
     frame = read_frame(real_file(f"{folder}/test_image.jpg"))
     # The program prints three decimals, and calculates in single precision.
     assert values == pytest.approx(calibrate(frame.counts, frame.parameters), abs=5e-3)
+
+
+@pytest.mark.parametrize("text", ["1," * 20_000, ";" * 20_000, "\n" * 200_000], ids=["numbers", "marks", "lines"])
+def test_a_line_or_a_table_longer_than_a_frame_is_passed_over(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(text + "\n" + "1,2,3,4,5,6,7,8\n" * 8)
+    if text.startswith("\n"):
+        assert not TextReader().holds_a_frame(path)
+    else:
+        assert TextReader().read_values(path, 0, StackOptions()).shape == (8, 8)
