@@ -177,10 +177,14 @@ def _run_or_keep(campaign: Path | str, folder: Path, *, resume: bool, scheduler:
         from fusion.campaign.config import load_campaign
         from fusion.pipeline.provenance import kept_results
 
-        kept = kept_results(load_campaign(campaign), folder)
+        loaded = load_campaign(campaign)
+        kept = kept_results(loaded, folder)
         if kept is not None:
             report("run (kept)", 1, 1)
             return kept
+        from fusion.pipeline.run import run_loaded
+
+        return run_loaded(loaded, folder, resume=True, scheduler=scheduler, report=report)
     from fusion.pipeline.run import run_campaign
 
     return run_campaign(campaign, folder, resume=resume, scheduler=scheduler, report=report)

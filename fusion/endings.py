@@ -41,7 +41,7 @@ class ExitCode(IntEnum):
     """What the process returns.
 
     The codes are those of shells and of sysexits.h: 2 for wrong use, 70 for a fault of the program, 128 and the signal's number where one
-    ended it.
+    ended it. A signal that comes when everything is written and said changes nothing any more: the code is then that of the work, 0.
     """
 
     DONE = 0
@@ -183,7 +183,8 @@ def leave(code: int) -> NoReturn:
     """End the process with an exit code; one that a signal has stopped at once.
 
     The interpreter waits for threads and takes every library down one by one when it ends, which takes a second on a busy machine. After a
-    signal nobody waits for that: every product is whole, and the message is out.
+    signal nobody waits for that: every product is whole, and the message is out. From here on signals are passed over, so that the code is
+    that of what was done.
 
     Parameters
     ----------
@@ -195,6 +196,8 @@ def leave(code: int) -> NoReturn:
     SystemExit
         Where no signal has stopped the process.
     """
+    for number in _STOPPING:
+        signal.signal(number, signal.SIG_IGN)
     if code in (ExitCode.INTERRUPTED, ExitCode.TERMINATED):
         sys.stdout.flush()
         sys.stderr.flush()

@@ -11,7 +11,10 @@ from pathlib import Path
 from fusion.campaign.config import load_campaign
 from fusion.errors import FusionError
 from fusion.pipeline.provenance import kept_results
+from fusion.products.folder import MANIFEST
 
+#: Names in the folder of a fleet that are its own, in lower case: not every file system tells case apart.
+RESERVED = frozenset({"logs", "fleet.json", "fleet.csv", "fleet.html", MANIFEST, ".stages"})
 #: Campaign files that are looked for in a folder and in all folders in it.
 CAMPAIGN_FILE = "campaign.toml"
 
@@ -52,7 +55,7 @@ def find_members(paths: Sequence[Path]) -> list[Member]:
     Raises
     ------
     FleetError
-        If a path is not there, a folder holds no campaign, or two campaigns would have one name.
+        If a path is not there, a folder holds no campaign, two campaigns would have one name, or one that the fleet keeps for itself.
     """
     files: list[Path] = []
     for path in paths:
@@ -75,6 +78,11 @@ def find_members(paths: Sequence[Path]) -> list[Member]:
         place = path.parent.relative_to(common)
         if in_folder[path.parent] > 1 or place == Path():
             place = place / (path.stem if in_folder[path.parent] > 1 else path.parent.name)
+        if place.parts[0].lower() in RESERVED:
+            raise FleetError(
+                f"{path}: its results would stand in the folder {place.parts[0]}, which the fleet keeps for itself; rename the folder of "
+                "this campaign, or name another one above it"
+            )
         members.append(Member(place.as_posix(), path))
     _refuse_nested(members)
     return sorted(members, key=lambda member: member.name)

@@ -227,11 +227,36 @@ def run_campaign(
 def _run_file(
     path: Path, folder: Path, address: str | None, *, resume: bool, scheduler: str | None, report: Report
 ) -> Results:
-    """Run a campaign file of this machine, which may have been fetched from an address."""
+    """Run a campaign file of this machine, which may have been fetched from an address; keep a run that is whole."""
     campaign = load_campaign(path)
     if resume and (kept := kept_results(campaign, folder)) is not None:
         report("run (kept)", 1, 1)
         return kept
+    return run_loaded(campaign, folder, address, resume=resume, scheduler=scheduler, report=report)
+
+
+def run_loaded(
+    campaign: Campaign,
+    folder: Path,
+    address: str | None = None,
+    *,
+    resume: bool = False,
+    scheduler: str | None = None,
+    report: Report = silent,
+) -> Results:
+    """Run a campaign that was read, of which no whole run is in the folder, see `run_campaign`.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        The campaign file.
+    folder : Path
+        Results folder.
+    address : str, optional
+        Where the campaign file was fetched from.
+    resume, scheduler, report
+        As for `run_campaign`.
+    """
     seen = input_states(campaign)
     report("reading and checking", 0, 1)
     if campaign.record is not None:

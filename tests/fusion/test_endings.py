@@ -119,6 +119,24 @@ def test_a_stopped_command_does_not_wait_for_its_threads() -> None:
     assert time.monotonic() - begun < 40.0
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT that can be sent to a process")
+def test_a_signal_that_comes_when_everything_is_done_changes_nothing() -> None:
+    """The interpreter still waits for a thread when two signals come."""
+    code = (
+        "import threading, time; from fusion import cli\n"
+        "def done():\n"
+        "    with cli.answering(cli.errors):\n"
+        "        threading.Thread(target=lambda: (time.sleep(0.5), print('done', flush=True), time.sleep(1.0))).start()\n"
+        "cli.app.command('done')(done)\n"
+        "import sys; sys.argv = ['thermofuse', 'done']; cli.main()"
+    )
+    run = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert run.stdout is not None and run.stdout.readline() == "done\n"
+    run.send_signal(signal.SIGINT)
+    run.send_signal(signal.SIGTERM)
+    assert (run.communicate(timeout=30)[1], run.returncode) == ("", 0)
+
+
 def _indented(code: str) -> str:
     return "\n".join(f"    {line}" for line in code.splitlines())
 

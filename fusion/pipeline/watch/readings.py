@@ -84,6 +84,7 @@ class ArrivingReadings:
     _next_whole: float = -np.inf
     _last: int = 0
     _counted: int = 0
+    _first: list[float] = field(default_factory=list)
     _told: set[str] = field(default_factory=set)
 
     def poll(self, *, final: bool = False) -> Arrived:
@@ -194,7 +195,17 @@ class ArrivingReadings:
             deviations = self.read_whole(self.path)
         finally:
             self._next_whole = self.clock() + (self.clock() - now) / _READING_SHARE
-        return self._give(deviations, final=final)
+        first = np.sort(deviations["deviation"].values[0], axis=None)
+        values = first[np.isfinite(first)].tolist()
+        if self._first and (values != self._first or deviations["cycle"].values[-1] < self._last):
+            return Arrived(
+                faults=self._new(
+                    [f"{self.path}: its first cycle is another one, it was begun anew; watch the test anew"]
+                )
+            )
+        arrived = self._give(deviations, final=final)
+        self._first = values if self._last else []
+        return arrived
 
     def _give(self, deviations: xr.Dataset, *, final: bool) -> Arrived:
         """Return the finished cycles that were not given before, with the open one, and note that they were."""

@@ -37,3 +37,14 @@ def test_what_is_no_fleet_is_refused(tmp_path):
         FleetError, match=r"old/campaign.toml: lies in the folder of .*m1/campaign.toml, so their results"
     ):
         find_members([tmp_path / "n"])
+
+
+@pytest.mark.parametrize("name", ["logs", "Logs", "fleet.html"])
+def test_a_campaign_does_not_take_a_name_of_the_fleet(tmp_path, name):
+    for folder in (name, "x"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "campaign.toml").write_text("")
+    with pytest.raises(
+        FleetError, match=rf"{name}.campaign\.toml: its results would stand in the folder {name}, .*; rename the folder"
+    ):
+        find_members([tmp_path])

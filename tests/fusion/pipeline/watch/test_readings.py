@@ -165,3 +165,24 @@ def test_readings_of_a_test_begun_anew_are_not_mixed_with_those_before(tmp_path:
     arrived += [laser.poll(), laser.poll(final=True)]
     assert all(one.cycles is None for one in arrived)
     assert "was begun anew" in "".join(fault for one in arrived for fault in one.faults)
+
+
+@pytest.mark.parametrize("runs", [2, 9], ids=["shorter", "longer"])
+def test_a_file_read_as_a_whole_that_is_begun_anew_is_told_by_its_first_cycle(tmp_path: Path, runs: int) -> None:
+    """Cycle numbers alone would let cycles of a new test follow those of the old one."""
+    path = tmp_path / "laser.csv"
+    laser = ArrivingReadings(path, clock=lambda: 0.0)
+
+    def write_runs(count: int, zero: float) -> None:
+        head = ",".join(f"{run}+ [um],{run}- [um]" for run in range(1, count + 1))
+        rows = [f"{100 * at}," + ",".join([f"{zero + at},{zero - at}"] * count) for at in range(3)]
+        path.write_text("\n".join([f"Position [mm],{head}", *rows]) + "\n")
+
+    write_runs(4, 1.0)
+    assert given([laser.poll()]) == [1, 2, 3]
+    write_runs(5, 1.0)
+    assert given([laser.poll()]) == [4]
+    write_runs(runs, 2.0)
+    arrived = laser.poll()
+    assert arrived.cycles is None
+    assert arrived.faults == (f"{path}: its first cycle is another one, it was begun anew; watch the test anew",)
