@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,7 +84,7 @@ def _existing(name: str, info: ValidationInfo) -> str:
     """Accept the name of a file that exists."""
     if isinstance(info.context, _Surroundings):
         path = (info.context.folder / name).resolve()
-        if not path.is_file():
+        if not os.path.isfile(path):  # noqa: PTH113 - a name that is too long raises there, and is told here
             text = f"no such file {path}; {near_file(path)}paths are relative to the campaign file"
             raise PydanticCustomError("file", "{text}", {"text": text})
     return name

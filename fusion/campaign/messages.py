@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import os
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -28,6 +29,8 @@ _REMEDIES = {
     "too_short": "this list is empty; fill it in",
     "model_type": "this is a table; write it as [name] with its keys below",
 }
+#: Characters of a name that a file may have.
+_LONGEST_NAME = 255
 #: Faults of one file that are told one by one.
 _MOST_FAULTS = 30
 
@@ -65,7 +68,7 @@ def near_file(path: Path) -> str:
     path : Path
         What was named, and is not there.
     """
-    if not path.parent.is_dir():
+    if len(path.name) > _LONGEST_NAME or not os.path.isdir(path.parent):  # noqa: PTH112 - as for the file, a name that is too long
         return ""
     names = [item.name for item in path.parent.iterdir() if item.is_file()]
     return suggest(path.name, names)

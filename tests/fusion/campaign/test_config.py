@@ -175,6 +175,12 @@ def test_an_unknown_effect_is_answered_with_the_nearest(folder: Path) -> None:
         load(folder, TEXT.replace("table_offset", "table_ofset"))
 
 
+@pytest.mark.parametrize("name", ["l" * 5000, f"{'l' * 5000}/laser.csv"])
+def test_a_name_longer_than_a_file_may_have_is_no_file(folder: Path, name: str) -> None:
+    with pytest.raises(CampaignError, match=r"no such file .*l; paths|no such file .*/laser\.csv; paths"):
+        load(folder, TEXT.replace('"laser.csv"', f'"{name}"'))
+
+
 def test_all_faults_come_in_one_message(folder: Path) -> None:
     with pytest.raises(CampaignError) as error:
         load(folder, TEXT.replace("0.97", "97").replace('"5 mm"', "5").replace("axis =", "axes ="))
