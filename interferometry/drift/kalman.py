@@ -316,8 +316,13 @@ def whiten_rows(
     for row in range(rows.shape[0]):
         k = first + row
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
-        predict_state(state, order, step)
         innovation = rows[row]
+        if loadings.shape[1] == 2 and order == 2:
+            _whiten_under_two(
+                state[0], state[1], state[2], state[3], innovation, step, loadings[k], gains[k], 1.0 / roots[k]
+            )
+            continue
+        predict_state(state, order, step)
         for c in range(loadings.shape[1]):
             loading, level = loadings[k, c], state[c * order]
             for j in range(p):
@@ -328,6 +333,34 @@ def whiten_rows(
                 expected[j] += gain * innovation[j]
         for j in range(p):
             innovation[j] /= roots[k]
+
+
+@njit(cache=True)
+def _whiten_under_two(
+    level: Array,
+    rate: Array,
+    other_level: Array,
+    other_rate: Array,
+    reading: Array,
+    step: float,
+    loadings: Array,
+    gains: Array,
+    precision: float,
+) -> None:
+    """Prediction, update and standardised innovation of one reading under two integrated random walks, in one pass over the columns.
+
+    The usual drift of a test, a common shift and a stretch; state and reading are loaded once, not once for every term.
+    """
+    loading, other_loading = loadings[0], loadings[1]
+    a, b, c, d = gains[0], gains[1], gains[2], gains[3]
+    for j in range(reading.size):
+        first, second = level[j] + step * rate[j], other_level[j] + step * other_rate[j]
+        innovation = reading[j] - loading * first - other_loading * second
+        level[j] = first + a * innovation
+        rate[j] += b * innovation
+        other_level[j] = second + c * innovation
+        other_rate[j] += d * innovation
+        reading[j] = innovation * precision
 
 
 @njit(cache=True)

@@ -136,22 +136,16 @@ class DriftSystem:
     def smooth(self, columns: Array) -> Smoothed:
         """Smooth the drift that columns (n, p) imply, and the noise of every reading."""
         gains, innovation_variances, covariances = self._filter_covariance(True)
-        innovations, states = kalman.filter_columns(
-            self.seconds, self.loadings, self.order, gains, np.ascontiguousarray(columns), True
-        )
-        return Smoothed(
-            *kalman.smooth(
-                self.seconds,
-                self.loadings,
-                self.order,
-                gains,
-                innovation_variances,
-                self.observed,
-                innovations,
-                states,
-                covariances,
+        filtered = self.seconds, self.loadings, self.order, gains
+        parts = []
+        # The states of all columns at all readings are needed on the way back, not afterwards: some columns at a time.
+        for some in np.array_split(columns, max(1, columns.shape[1] // MANY_COLUMNS), axis=1):
+            innovations, states = kalman.filter_columns(*filtered, np.ascontiguousarray(some), True)
+            parts.append(
+                kalman.smooth(*filtered, innovation_variances, self.observed, innovations, states, covariances)
             )
-        )
+        levels, covariance, u, variance = zip(*parts, strict=True)
+        return Smoothed(np.concatenate(levels, axis=2), covariance[0], np.concatenate(u, axis=1), variance[0])
 
 
 @dataclass

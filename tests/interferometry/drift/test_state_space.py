@@ -80,3 +80,12 @@ def test_products_of_many_columns_are_those_of_few(rng: np.random.Generator, mon
     by_blocks, determinant = system.normal_equations(columns)
     np.testing.assert_allclose(by_blocks, gram, rtol=1e-11, atol=1e-11)
     assert determinant == pytest.approx(log_determinant, rel=1e-12)
+
+
+def test_many_columns_are_smoothed_as_few_are(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    n = 30
+    system, columns = uneven(rng, n), rng.normal(size=(n, 5))
+    at_once = system.smooth(columns)
+    monkeypatch.setattr("interferometry.drift.state_space.MANY_COLUMNS", 2)
+    for told, expected in zip(system.smooth(columns), at_once, strict=True):
+        np.testing.assert_array_equal(told, expected)
