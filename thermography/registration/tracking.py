@@ -196,7 +196,7 @@ def _refine(counts: NDArray[np.uint16], tracker: TableTracker, predicted_mm: Arr
     return TablePosition(mean, math.hypot(own, common), kept, own)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True)
 def _discs_in_view(discs: Array, shift: Array, margin_px: Array, lens: Array, shape: tuple[int, int]) -> int:
     """Number of discs that lie far enough within the frame when the table is displaced."""
     inside = 0
@@ -207,7 +207,7 @@ def _discs_in_view(discs: Array, shift: Array, margin_px: Array, lens: Array, sh
     return inside
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True)
 def _agreement(shifts: Array) -> tuple[Array, float, int]:
     """Mean of the displacements, (n, 2) mm, without outliers; their standard deviation along either coordinate, and their number."""
     middle_x, middle_y = np.median(shifts[:, 0]), np.median(shifts[:, 1])
