@@ -147,6 +147,26 @@ def test_moving_table(film: Path, registration) -> None:
     )
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_film_of_three_minutes(film: Path, registration) -> None:
+    """5,000 frames in 20 cycles: what the set-up costs is spread over ten times as many frames."""
+    references = played_again(index_frames([film])[0], 10)
+    frames = len(references)
+    bounds = bounds_of(frames, 20)
+    still, moving, peer, limit = take_turns(
+        lambda: reduce_frames(references, registration, GRID, bounds),
+        lambda: reduce_moving_frames(references, registration, GRID, bounds, direction=(-1, 0)),
+        lambda: flirpy_reads(film, 60),
+        lambda: map_and_sum(film),
+        rounds=5,
+    )[0]
+    print(
+        f"\n{frames} frames: still {median_of(frames / still)} frames/s, {median_of(peer / 60 * frames / still)} x flirpy, "
+        f"{median_of(limit / FRAMES * frames / still)} of summing the mapped file; moving {median_of(frames / moving)} frames/s, "
+        f"{median_of(peer / 60 * frames / moving)} x"
+    )
+
+
 def test_cold_file(film: Path, registration) -> None:
     references, _ = index_frames([film])
 
