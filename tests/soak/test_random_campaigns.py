@@ -13,6 +13,7 @@ import signal
 import tempfile
 import time
 import traceback
+import warnings
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -36,9 +37,19 @@ def ran(number: int, folder: Path) -> dict[str, Any]:
     campaign = write_random_campaign(number, folder / "campaign")
     said: dict[str, Any] = {"number": number}
     try:
-        run_campaign(campaign, folder / "results")
+        with warnings.catch_warnings(record=True) as heard:
+            warnings.simplefilter("always", RuntimeWarning)
+            run_campaign(campaign, folder / "results")
+        said["warned"] = sorted(
+            {
+                f"{one.message} in {Path(one.filename).name}:{one.lineno}"
+                for one in heard
+                if one.category is RuntimeWarning
+            }
+        )
         results = strict(folder / "results" / "results.json")
         faults = broken_invariants(results)
+        faults += [f"a warning that a user would see: {text}" for text in said["warned"]]
         said |= {"ended": "broken" if faults else "results", "text": "; ".join(faults[:5])}
         said["verdict"] = (results.get("loop") or {}).get("verdict", "none")
     except (FusionError, ThermographyError, InterferometryError) as error:

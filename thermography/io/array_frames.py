@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ _UNITS = {
     **dict.fromkeys(("degC", "deg_C", "celsius", "Celsius", "degree_Celsius", "degrees_Celsius", "degrees_C", "°C", "C"), "degC"),
     **dict.fromkeys(("K", "kelvin", "Kelvin", "degK"), "K"),
 }  # fmt: skip
+#: Kinds of NumPy's types that can be temperatures: floating point and whole numbers.
+_NUMBERS = "fiu"
 #: Files that a Zarr store of version 3 or 2 begins with; each stands for the whole store.
 _ZARR_METADATA = ("zarr.json", ".zgroup")
 
@@ -64,7 +67,12 @@ class TiffReader(TemperatureReader):
                 stamp = str(first.tags["DateTime"].value) if "DateTime" in first.tags else ""
         except Exception as error:
             raise ThermographyError(f"{path}: damaged TIFF ({error}); export it again") from None
-        if len(shape) != 2 or not all(isinstance(side, int) for side in shape) or kind is None:
+        if (
+            len(shape) != 2
+            or not all(isinstance(side, int) for side in shape)
+            or kind is None
+            or kind.kind not in _NUMBERS
+        ):
             raise ThermographyError(
                 f"{path}: pixels of shape {shape}: a picture in colours holds no temperatures; export the radiometric TIFF"
             )
@@ -87,7 +95,12 @@ class TiffReader(TemperatureReader):
             The page is damaged.
         """
         try:
-            return np.asarray(tifffile.imread(path, key=index))
+            with tifffile.TiffFile(path) as file:
+                page: Any = file.pages[index]
+                # Read as they are, a million strips that the file does not hold take the memory of a million strips.
+                if page.dtype is None or page.dtype.kind not in _NUMBERS or prod(page.chunked) != len(page.dataoffsets):
+                    raise ValueError("its size, its kind of values and its list of strips contradict one another")
+                return np.asarray(page.asarray())
         except Exception as error:
             raise ThermographyError(f"{path}: page {index} is damaged ({error}); export it again") from None
 
@@ -114,7 +127,7 @@ class NumpyReader(TemperatureReader):
         # The header is text that NumPy parses as Python: a damaged one raises errors of many kinds.
         except Exception as error:
             raise ThermographyError(f"{path}: damaged NumPy file ({error}); save it again with numpy.save") from None
-        if array.ndim not in (2, 3) or array.dtype.kind not in "fiu":
+        if array.ndim not in (2, 3) or array.dtype.kind not in _NUMBERS:
             raise ThermographyError(
                 f"{path}: an array of shape {array.shape} and type {array.dtype}; save numbers as (row, column) or (frame, row, column)"
             )

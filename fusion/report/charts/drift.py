@@ -196,7 +196,8 @@ def plot_position_scatter(drift: xr.Dataset, position: xr.DataArray, flagged: se
         )  # fmt: skip
         columns[f"scatter, {ARROWS[direction]} / µm"] = value
         columns[f"95 % interval ±, {ARROWS[direction]} / µm"] = 2 * half
-    fix_range(drawn, 0.0, 1.06 * float(np.nanmax(drift["scatter"] + 2 * drift["scatter_u"])))
+    highest = float((drift["scatter"] + 2 * drift["scatter_u"]).max())
+    fix_range(drawn, 0.0, 1.06 * highest if np.isfinite(highest) else 1.0)
     places = join([f"{float(position.sel(target=target)):g} mm" for target in sorted(flagged)])
     seen = f"Random scatter of {x.size} positions: {span_words(drift['scatter'], 'µm')}; " + (
         f"marked as standing out: {places}." if flagged else "none is marked as standing out."

@@ -46,7 +46,7 @@ def plot_cycles(deviations: xr.Dataset, direction: str, *, quantity: str = "devi
     )
     add_ordered_lines(drawn, [place] * len(lines), list(lines), cycles, "cycle")
     add_zero_line(drawn)
-    mean = np.nanmean(lines, axis=0)
+    mean = every.sel(direction=direction).mean("cycle").values[order]
     seen = (
         f"{quantity.capitalize()} of {len(lines)} cycles, {ARROWS[direction]}: {span_words(lines, 'µm')}; the mean over the cycles goes "
         f"from {number(float(mean[0]), 2)} µm at {place[0]:g} mm to {number(float(mean[-1]), 2)} µm at {place[-1]:g} mm."

@@ -99,3 +99,23 @@ def test_what_is_no_stack_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.nc").write_bytes(b"\x89HDF\r\n\x1a\n")
     with pytest.raises(ThermographyError, match=r"cannot be opened .* write it again"):
         NetcdfReader().contents(tmp_path / "a.nc", EVERY_10_S)
+
+
+def test_a_tiff_whose_strips_do_not_fill_its_page_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, STACK[0], photometric="minisblack")
+    with tifffile.TiffFile(path) as file:
+        at = file.pages[0].tags["ImageLength"].valueoffset
+    content = bytearray(path.read_bytes())
+    content[at : at + 2] = (60_000).to_bytes(2, "little")
+    path.write_bytes(content)
+    with pytest.raises(
+        ThermographyError, match=r"a\.tif: page 0 is damaged \(.*contradict one another\); export it again"
+    ):
+        TiffReader().read_values(path, 0, EVERY_10_S)
+
+
+def test_complex_values_are_no_temperatures(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", STACK[0].astype(np.complex64), photometric="minisblack")
+    with pytest.raises(ThermographyError, match="holds no temperatures"):
+        TiffReader().contents(tmp_path / "a.tif", EVERY_10_S)
