@@ -35,6 +35,7 @@ from fusion.attribution.likelihood_ratio import (
     whiten_series,
 )
 from fusion.attribution.warm_up import Excitation, nuisance_columns
+from fusion.model.side_by_side import side_by_side
 
 #: Time constants of the first-order lags between temperature and drift, s.
 LAGS_S = (0.0, 600.0, 1200.0, 2400.0, 3600.0, 5400.0)
@@ -289,13 +290,12 @@ class _Tally:
             false_alarm_rate=false_alarm_rate,
         )
 
-    def add(self, channel: int, cells: slice, ratio: Array32, chosen: NDArray[np.int64], effects: Array) -> None:
-        """Enter ratios (1 + simulated, cells, lags) of one channel, the chosen lags (cells,) and the effects there (3, cells)."""
-        # Lag after lag: over an axis as short as that of the lags `max` takes six times as long.
-        best = reduce(np.maximum, np.moveaxis(ratio, 2, 0))
+    def add(self, channel: int, cells: slice, shown: _Channel) -> None:
+        """Enter what a tile of cells shows in one channel."""
+        best = shown.best
         self.statistic[channel, cells] = best[0]
-        self.lag_index[channel, cells] = chosen
-        self.effects[:, channel, cells] = effects
+        self.lag_index[channel, cells] = shown.chosen
+        self.effects[:, channel, cells] = shown.effects
         if best.shape[0] > 1:
             self.maxima[channel] = np.maximum(self.maxima[channel], best[1:].max(axis=1))
             bins = np.minimum((best[1:] / _BINS[1]).astype(np.int64), _BINS.size - 2)
@@ -307,33 +307,56 @@ def _lagged_sampling(series: DriftSeries, operators: Sequence[Array]) -> Array32
     return np.stack([series.sampling @ operator for operator in operators]).astype(np.float32)
 
 
+@dataclass(frozen=True)
+class _Channel:
+    """What a tile of cells shows in one channel.
+
+    Attributes
+    ----------
+    best : (1 + simulated, cells) largest ratio over the lags
+    chosen : (cells,) lag of the largest ratio of the measured series
+    effects : (3, cells) coefficient, its uncertainty, and that under the fitted null model, at that lag
+    """
+
+    best: Array32
+    chosen: NDArray[np.int64]
+    effects: Array
+
+
 def _test_field(sources: Sequence[_Source], field: FieldSeries, lags: int, tally: _Tally) -> Iterator[slice]:
     """Test a set tile by tile; yields each slice of columns that is done."""
     values = field.values.astype(np.float32)
-    for tile in tiles(values.shape[1] * lags, lags):
-        cells = slice(tile.start // lags, tile.stop // lags)
-        _test_tile(sources, values[:, cells], cells, lags, tally)
+    joint = tally.statistic.shape[0] > len(sources)
+    places = [slice(tile.start // lags, tile.stop // lags) for tile in tiles(values.shape[1] * lags, lags)]
+    tested = side_by_side(lambda cells: _test_tile(sources, values[:, cells], lags, joint), places)
+    for cells, channels in zip(places, tested, strict=True):
+        for channel, shown in enumerate(channels):
+            tally.add(channel, cells, shown)
         yield cells
 
 
-def _test_tile(sources: Sequence[_Source], field: Array32, cells: slice, lags: int, tally: _Tally) -> None:
-    """Test a tile of cells against every series, and the first two together where the tally has room for that."""
-    count = cells.stop - cells.start
+def _test_tile(sources: Sequence[_Source], field: Array32, lags: int, joint: bool) -> list[_Channel]:
+    """Test a tile of temperatures (frames, cells) against every series, and against the first two together where asked for."""
+    count = field.shape[1]
     regressors = [_respond_tile(source.response, field) for source in sources]
     ratios = [
         likelihood_ratios(source.bank, source.whitened, columns).reshape(-1, count, lags)
         for source, columns in zip(sources, regressors, strict=True)
     ]
     summed = [[k] for k in range(len(sources))]
-    if tally.statistic.shape[0] > len(sources):
+    if joint:
         ratios.append(ratios[0] + ratios[1])
         # The joint effect is that at the far end of travel: common plus proportional at +1.
         summed.append([0, 1])
-    for channel, (ratio, together) in enumerate(zip(ratios, summed, strict=True)):
+    channels = []
+    for ratio, together in zip(ratios, summed, strict=True):
         chosen = ratio[0].argmax(axis=1)
         columns = np.arange(count) * lags + chosen
         parts = np.stack([_stack(estimate_effects(sources[k].bank, regressors[k][:, columns])) for k in together])
-        tally.add(channel, cells, ratio, chosen, np.stack([parts[:, 0].sum(axis=0), *np.hypot.reduce(parts[:, 1:])]))
+        effects = np.stack([parts[:, 0].sum(axis=0), *np.hypot.reduce(parts[:, 1:])])
+        # Lag after lag: over an axis as short as that of the lags `max` takes six times as long.
+        channels.append(_Channel(reduce(np.maximum, ratio.transpose(2, 0, 1)), chosen, effects))
+    return channels
 
 
 def _stack(estimate: Estimate) -> Array:
