@@ -18,12 +18,15 @@ from fusion.attribution.randomised_duty import randomisation_test
 from fusion.attribution.thermal_modes import Region, cluster_cells, disc
 from fusion.campaign.sources import Source
 from fusion.pipeline.rise_scale import place_scale_u, scaled
+from fusion.pipeline.sizes import average_cycles
 from fusion.products.progress import Report
 from fusion.products.results import Outcome
 from thermography.fields.cycle_fields import plan_unit
 from thermography.fields.hotspots import Hotspot, detect_hotspots
 
 _CORRELATION_CELL_MM = 10.0
+#: Frames that are brought to these cells together.
+_FRAMES_AT_ONCE = 1000
 #: Hotspots are tested on cells that are seen in more than this share of the frames.
 _SEEN_SHARE = 0.8
 
@@ -53,9 +56,10 @@ def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, re
     Cells are averaged to about 10 mm first: within one cycle heat spreads further than that in steel, so that only noise and computing
     time are reduced.
     """
-    cell_mm = float(np.median(np.diff(fields["x"])))
-    block = max(1, int(_CORRELATION_CELL_MM / cell_mm))
-    field = fields["frame_temperature"].coarsen(x=block, y=block, boundary="trim").mean()
+    field = _coarse(fields)
+    # What the parts of results.json say of targets needs all readings as they are.
+    readings = fused
+    fused, field, averaged = average_cycles(fused, field)
     spots = detect_hotspots(fields["temperature_rise"].isel(cycle=-1))
     report("correlation", 0, 100)
     regions = [*source.regions, *_hotspot_regions(spots, field)]
@@ -77,10 +81,21 @@ def correlate_field(source: Source, fields: xr.Dataset, fused: xr.Dataset, *, re
     areas = _region_areas(regions, field)
     named = {f"hotspot {k}": spot for k, spot in enumerate(spots, start=1)}
     parts = {
-        "hotspots": [_hotspot_part(name, spot, maps, fused, fields) for name, spot in named.items()],
+        "hotspots": [_hotspot_part(name, spot, maps, readings, fields) for name, spot in named.items()],
         "correlation": _correlation_part(maps, find_source(maps), fields, areas),
     }
-    return Outcome(maps, parts)
+    return Outcome(maps, parts, tuple(averaged))
+
+
+def _coarse(fields: xr.Dataset) -> xr.DataArray:
+    """The field of every frame on cells of about 10 mm; frames are averaged some at a time, as there may be very many."""
+    frames = fields["frame_temperature"]
+    block = max(1, int(_CORRELATION_CELL_MM / float(np.median(np.diff(fields["x"])))))
+    parts = [
+        frames.isel(time=slice(start, start + _FRAMES_AT_ONCE)).coarsen(x=block, y=block, boundary="trim").mean()
+        for start in range(0, frames.sizes["time"], _FRAMES_AT_ONCE)
+    ]
+    return xr.concat(parts, "time")
 
 
 def describe_hotspots(fields: xr.Dataset) -> list[dict[str, Any]]:

@@ -12,6 +12,8 @@ from fusion.products.results import Notice
 LEAST_CYCLES, LEAST_TARGETS, LEAST_FRAMES = 12, 3, 12
 #: So many targets take part in the model of the drift at most: they share their drift, and the work grows with the cube of their number.
 MOST_TARGETS = 64
+#: So many values over the cycles are correlated with the field at most: memory and work grow with the square of their number and faster.
+MOST_CYCLES = 500
 
 
 def lacks_for_model(deviations: xr.Dataset) -> list[Notice]:
@@ -63,6 +65,53 @@ def choose_targets(deviations: xr.Dataset) -> tuple[xr.Dataset, list[Notice]]:
             "",
         )
     ]
+
+
+def average_cycles(fused: xr.Dataset, field: xr.DataArray) -> tuple[xr.Dataset, xr.DataArray, list[Notice]]:
+    """Return readings and field as they are correlated: as they are, or means of successive cycles and frames of a very long test.
+
+    Parameters
+    ----------
+    fused : Dataset
+        ``deviation`` (um) and ``time`` over cycle, direction and target, and ``position`` (mm) over target.
+    field : (time, y, x) DataArray
+        Field of every frame.
+
+    Returns
+    -------
+    Dataset, DataArray
+        Means of so many cycles that at most :data:`MOST_CYCLES` are left, each at the mean time of its readings, and of as many frames as
+        were taken in them.
+    list of Notice
+        What was averaged; empty where nothing was.
+    """
+    cycles, frames = fused.sizes["cycle"], field.sizes["time"]
+    together = int(np.ceil(cycles / MOST_CYCLES))
+    if together == 1:
+        return fused, field, []
+    start = field["time"].values[0]
+    present = fused["deviation"].notnull() & fused["time"].notnull()
+    seconds = ((fused["time"] - start) / np.timedelta64(1, "s")).where(present)
+    means = xr.Dataset({"deviation": fused["deviation"].where(present), "seconds": seconds})
+    means = means.coarsen(cycle=together, boundary="trim").mean()
+    milliseconds = (1000.0 * means["seconds"]).round().fillna(0.0)
+    time = (start + milliseconds.astype(np.int64).astype("timedelta64[ms]")).where(means["seconds"].notnull())
+    averaged = means.drop_vars("seconds").assign(time=time.astype("datetime64[ns]"), position=fused["position"])
+    averaged["deviation"].attrs = fused["deviation"].attrs
+    at_once = max(1, frames * together // cycles)
+    of_frames = field if at_once == 1 else field.coarsen(time=at_once, boundary="trim").mean()
+    return (
+        averaged.assign_coords(cycle=averaged["cycle"].astype(int)),
+        of_frames,
+        [
+            Notice(
+                "cycles_averaged",
+                f"Field and drift are correlated by means of {together} successive cycles ({averaged.sizes['cycle']} of {cycles}): a part "
+                "that responds within less is seen as one that responds at once.",
+                "",
+            )
+        ],
+    )
 
 
 def lacks_for_correlation(fields: xr.Dataset) -> list[Notice]:

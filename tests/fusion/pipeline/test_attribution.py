@@ -124,3 +124,16 @@ def test_the_twin_switches_by_the_law_that_it_states() -> None:
     assert holds.min() >= 300.0
     # About 1,300 holds of spread 25 min: standard error 0.7 min; 4 sigma.
     assert holds.mean() / 60.0 == pytest.approx(30.0, abs=2.8)
+
+
+def test_a_very_long_test_is_correlated_by_means_of_its_cycles(
+    campaign: Path, results_folder: Path, outcome, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = read_source(load_campaign(campaign / "campaign.toml"))
+    fields = read_dataset(results_folder / "fields.nc")
+    monkeypatch.setattr("fusion.pipeline.sizes.MOST_CYCLES", 12)
+    found = correlate_field(source, fields, outcome[2], report=silent)
+    (notice,) = found.notices
+    assert notice.code == "cycles_averaged" and "(12 of 24)" in notice.message
+    parts = [one["name"] for one in found.parts["correlation"]["regions"]]
+    assert parts == [one["name"] for one in outcome[1]["correlation"]["regions"]]
