@@ -19,7 +19,7 @@ from functools import partial
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
 from typing import Any
-from urllib.parse import quote, unquote, urlsplit
+from urllib.parse import quote, unquote, urljoin, urlsplit
 
 import filelock
 import pooch
@@ -76,6 +76,24 @@ def cache_folder() -> Path:
     return Path(named) if named else Path(pooch.os_cache("thermofuse")) / "remote"
 
 
+def require_outside_cache(folder: Path) -> None:
+    """Refuse results among what is fetched, where they would be mixed with files that are replaced and removed.
+
+    Parameters
+    ----------
+    folder : Path
+        Results folder.
+
+    Raises
+    ------
+    RemoteError
+    """
+    if folder.resolve().is_relative_to(cache_folder().resolve()):
+        raise RemoteError(
+            f"{folder} lies in {cache_folder()}, which keeps what is fetched; name another folder with --out"
+        )
+
+
 @dataclass(frozen=True)
 class Mirror:
     """Files of an address in a folder of this machine.
@@ -130,7 +148,7 @@ def fetch_file(address: str, *, report: Report = silent) -> Mirror:
         If it is not there, may not be read, or the connection is lost again and again.
     """
     base, _, name = _checked(address).rpartition("/")
-    store = _Store(base)
+    store = _Store(base, name)
     with store.open() as stamps:
         fetched = store.fetch([name], stamps, report)
     return Mirror(address, store.folder / name, base, store.folder, 1, *fetched)
@@ -158,7 +176,7 @@ def fetch_campaign(address: str, *, report: Report = silent) -> Mirror:
         connection is lost again and again.
     """
     base, _, name = _checked(address).rpartition("/")
-    store = _Store(base)
+    store = _Store(base, name)
     with store.open() as stamps:
         first = store.fetch([name], stamps, report)
         names = store.find(_file_names(store.folder / name, address))
@@ -232,11 +250,11 @@ def _file_names(campaign: Path, address: str) -> list[str]:
 
 
 class _Store:
-    """A folder at an address, and the folder of this machine that mirrors it."""
+    """A folder at an address, and the folder of this machine that mirrors it for the one file that was named."""
 
-    def __init__(self, base: str) -> None:
+    def __init__(self, base: str, name: str) -> None:
         self.base = base
-        self.folder = cache_folder() / sha256(base.encode()).hexdigest()[:16]
+        self.folder = cache_folder() / sha256(f"{base}/{name}".encode()).hexdigest()[:16]
         self.system = _file_system(base)
 
     @contextmanager
@@ -345,6 +363,8 @@ class _Store:
                 return ask()
             except Exception as error:
                 fault = _root(error)
+                if isinstance(fault, RemoteError):
+                    raise fault from None
                 if isinstance(fault, FileNotFoundError) or getattr(fault, "status", None) == 404:
                     raise _NotThereError(f"{address}: there is no such file or bucket; check the address") from error
                 told = _describe(fault)
@@ -399,8 +419,22 @@ def _file_system(base: str) -> Any:
 
         # A file of hours of video takes as long as it takes; only silence ends it.
         limits = aiohttp.ClientTimeout(total=None, sock_connect=20, sock_read=60)
+        watched = aiohttp.TraceConfig()
+        watched.on_request_redirect.append(_stay_on_the_server)
+        options = {"timeout": limits, "trace_configs": [watched]}
         return fsspec.filesystem(
-            "http", skip_instance_cache=True, use_listings_cache=False, client_kwargs={"timeout": limits}, encoded=True
+            "http", skip_instance_cache=True, use_listings_cache=False, client_kwargs=options, encoded=True
         )
     except ImportError as error:
         raise RemoteError(f"{base}: {error.name} is not installed; pip install thermofuse[remote]") from error
+
+
+async def _stay_on_the_server(session: Any, context: Any, answer: Any) -> None:
+    """Refuse to be sent from the server that the user named to another one, or from https to http."""
+    target = urlsplit(urljoin(str(answer.url), answer.response.headers.get("Location", "")))
+    named = urlsplit(str(answer.url))
+    if target.hostname != named.hostname or (named.scheme == "https" and target.scheme != "https"):
+        raise RemoteError(
+            f"{answer.url}: the server sends to {target.scheme}://{target.netloc}, which is not the one that was named; name the address "
+            "there if you trust it"
+        )

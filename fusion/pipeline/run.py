@@ -51,7 +51,7 @@ from fusion.products.store import (
     write_json,
     write_text,
 )
-from fusion.remote import fetched_campaign, is_address
+from fusion.remote import fetched_campaign, is_address, require_outside_cache
 
 #: Where each stage keeps its Dataset; what ends up in fusion.nc is kept apart while it may have to be resumed.
 FILES = {
@@ -219,6 +219,7 @@ def run_campaign(
         accuracy, verdict = results.iso230.A_um, results.loop.verdict
     """
     if is_address(path):
+        require_outside_cache(Path(out))
         with fetched_campaign(str(path), report=report) as mirror:
             return _run_file(mirror.path, Path(out), str(path), resume=resume, scheduler=scheduler, report=report)
     return _run_file(Path(path), Path(out), None, resume=resume, scheduler=scheduler, report=report)

@@ -1,13 +1,16 @@
 """Campaigns of a plain web server and of an S3 server of this machine: fetched once, kept, and refused with the address and the remedy."""
 
+import asyncio
 import json
 import os
 import shutil
 import socket
 import threading
+from contextlib import nullcontext
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from types import SimpleNamespace
 from typing import ClassVar
 
 import pytest
@@ -33,12 +36,19 @@ class Shelf(SimpleHTTPRequestHandler):
 
     given: ClassVar[list[str]] = []
     breaks: ClassVar[dict[str, int]] = {}
+    sends: ClassVar[dict[str, str]] = {}
 
     def log_message(self, *arguments):
         pass
 
     def do_GET(self):
         Shelf.given.append(self.path)
+        if self.path in Shelf.sends:
+            self.send_response(302)
+            self.send_header("Location", Shelf.sends[self.path])
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+            return
         name = self.path.rsplit("/", 1)[-1]
         if Shelf.breaks.get(name, 0) > 0:
             Shelf.breaks[name] -= 1
@@ -86,7 +96,7 @@ def shelf(campaign_folder, tmp_path_factory):
 def cache(tmp_path, monkeypatch):
     monkeypatch.setenv(remote.CACHE_VARIABLE, str(tmp_path / "cache"))
     monkeypatch.setattr(remote, "_PAUSE_S", 0.01)
-    Shelf.given, Shelf.breaks = [], {}
+    Shelf.given, Shelf.breaks, Shelf.sends = [], {}, {}
     return tmp_path / "cache"
 
 
@@ -210,6 +220,55 @@ def test_what_is_not_there_or_may_not_be_read_is_named(shelf, tmp_path):
     (day / "outside.toml").write_text('[plan]\nfiducials = "../../secret.csv"\n')
     with pytest.raises(RemoteError, match=r'outside.toml: "../../secret.csv" lies outside the folder of the campaign'):
         fetch_campaign(f"{server}/day%201/outside.toml")
+
+
+def test_a_server_is_followed_on_itself_only(shelf):
+    address, _ = shelf
+    Shelf.sends = {
+        "/here.csv": "/day%201/laser.csv",
+        "/away.csv": f"{address.replace('127.0.0.1', 'localhost')}/day%201/laser.csv",
+    }
+    assert fetch_file(f"{address}/here.csv").path.read_text().startswith("cycle")
+    with pytest.raises(
+        RemoteError, match=r"away\.csv: the server sends to http://localhost:\d+, which is not the one that was named"
+    ):
+        fetch_file(f"{address}/away.csv")
+
+
+@pytest.mark.parametrize(
+    ("named", "location", "refused"),
+    [
+        ("https://a.org/x", "https://a.org/y", False),
+        ("https://a.org/x", "y", False),
+        ("http://a.org/x", "https://a.org/x", False),
+        ("https://a.org/x", "http://a.org/x", True),
+        ("https://a.org/x", "//b.org/x", True),
+        ("https://a.org/x", "file:///etc/passwd", True),
+    ],
+)
+def test_where_a_server_may_send(named, location, refused):
+    answer = SimpleNamespace(url=named, response=SimpleNamespace(headers={"Location": location}))
+    with pytest.raises(RemoteError, match="sends to") if refused else nullcontext():
+        asyncio.run(remote._stay_on_the_server(None, None, answer))
+
+
+def test_two_campaigns_of_one_folder_keep_their_files(shelf):
+    address, day = shelf
+    shutil.copy(day / "laser.csv", day / "other.csv")
+    (day / "second.toml").write_text((day / "laser.toml").read_text().replace("laser.csv", "other.csv"))
+    first = fetch_campaign(f"{address}/day%201/laser.toml")
+    second = fetch_campaign(f"{address}/day%201/second.toml")
+    assert (first.folder / "laser.csv").is_file() and (second.folder / "other.csv").is_file()
+    assert fetch_campaign(f"{address}/day%201/laser.toml").fetched == 0
+
+
+def test_results_are_not_written_into_the_cache(shelf, cache):
+    address, _ = shelf
+    with pytest.raises(
+        RemoteError, match=r"lies in .*cache, which keeps what is fetched; name another folder with --out"
+    ):
+        run_campaign(f"{address}/day%201/laser.toml", cache / "a" / "results")
+    assert not cache.exists()
 
 
 def test_a_disk_that_is_too_small_is_refused_before_anything_is_fetched(shelf, monkeypatch):
