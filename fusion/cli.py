@@ -587,7 +587,8 @@ def report(
         bool, typer.Option("--pdf", help="Print it to PDF with an installed Chrome, Chromium or Edge.")
     ] = False,
     out: Annotated[
-        Path | None, typer.Option(help="File to write; left out: report.html or report.pdf in RESULTS.")
+        Path | None,
+        typer.Option(help="File to write, which must not exist; left out: report.html or report.pdf in RESULTS."),
     ] = None,
     full: Annotated[
         bool, typer.Option("--full", help="With --pdf: also the parts that are folded on the screen.")
@@ -597,16 +598,15 @@ def report(
     ] = None,
 ) -> None:
     """Make the report of a finished run anew, or print it to PDF."""
+    from fusion.products.folder import claim_file
     from fusion.products.store import write_text
     from fusion.report.html import report_of
     from fusion.report.pdf import print_pdf
 
     with _answering():
+        file = claim_file(results, "report.pdf" if pdf else "report.html", out)
         page = report_of(results)
-        if pdf:
-            written = print_pdf(page, out or results / "report.pdf", browser=browser, full=full)
-        else:
-            written = write_text(out or results / "report.html", page)
+        written = print_pdf(page, file, browser=browser, full=full) if pdf else write_text(file, page)
         console.print(str(written), soft_wrap=True)
 
 

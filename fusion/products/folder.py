@@ -97,6 +97,33 @@ def claim(folder: Path, *names: str) -> None:
         write_json(folder / MANIFEST, {"software": "thermofuse", "written": dict(sorted(entries.items()))})
 
 
+def claim_file(folder: Path, name: str, asked: Path | None) -> Path:
+    """Return where a file is written that is made from a results folder later: where it was asked for, or in the folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Results folder of a finished run.
+    name : str
+        Name of the file in it.
+    asked : Path or None
+        Another place, where nothing stands yet; None for the folder, in which what thermofuse wrote is replaced.
+
+    Raises
+    ------
+    OutputError
+        If something stands there that thermofuse did not write, or may not have written.
+    """
+    if asked is None:
+        # Earlier versions wrote no manifest, and their results are read all the same.
+        if (folder / MANIFEST).exists() or not (folder / name).exists():
+            claim(folder, name)
+        return folder / name
+    if asked.exists():
+        raise OutputError(f"{asked} exists already; name another file with --out, or remove it")
+    return asked
+
+
 def discard(folder: Path, *names: str) -> None:
     """Remove files that an earlier run wrote and that the results do not hold any more, with their entries in the manifest.
 

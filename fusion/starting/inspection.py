@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fusion.errors import FusionError
-from fusion.products.store import write_atomically
+from fusion.products.store import OutputError, write_atomically
 from fusion.starting.folder import input_files
 from fusion.starting.kinds import Kind, recognise
 from interferometry.errors import InterferometryError
@@ -109,6 +109,11 @@ def write_thumbnails(paths: Sequence[Path], folder: Path) -> Iterator[Path]:
     ------
     Path
         Each picture, when it is written.
+
+    Raises
+    ------
+    OutputError
+        If a picture exists already.
     """
     written: set[str] = set()
     for path in filter(_is_thermal, _files(paths)):
@@ -117,6 +122,8 @@ def write_thumbnails(paths: Sequence[Path], folder: Path) -> Iterator[Path]:
         except ThermographyError:
             continue
         name = f"{path.name}.png" if f"{path.name}.png" not in written else f"{path.parent.name}_{path.name}.png"
+        if name not in written and (folder / name).exists():
+            raise OutputError(f"{folder / name} exists already; name another folder with --thumbnails, or remove it")
         written.add(name)
         yield _write_picture(folder / name, picture)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import filelock
 import pytest
 
-from fusion.products.folder import MANIFEST, claim, open_folder, read_manifest
+from fusion.products.folder import MANIFEST, claim, claim_file, open_folder, read_manifest
 from fusion.products.store import OutputError, write_text
 
 
@@ -102,3 +102,18 @@ def test_a_folder_that_cannot_be_written_to_is_named(tmp_path: Path, monkeypatch
         str(error.value)
         == f"{tmp_path / 'out'}: cannot be written to (Permission denied); name another folder with --out"
     )
+
+
+def test_a_file_that_is_made_later_replaces_nothing_of_others(tmp_path: Path) -> None:
+    results, mine = tmp_path / "results", tmp_path / "mine.html"
+    results.mkdir()
+    assert claim_file(results, "report.html", None) == results / "report.html"
+    (results / "report.html").write_text("of thermofuse")
+    assert claim_file(results, "report.html", None) == results / "report.html"
+    (results / "report.pdf").write_text("of somebody")
+    with pytest.raises(OutputError, match=r"report\.pdf was not written by thermofuse"):
+        claim_file(results, "report.pdf", None)
+    assert claim_file(results, "report.html", mine) == mine
+    mine.write_text("of somebody")
+    with pytest.raises(OutputError, match=r"mine\.html exists already; name another file with --out"):
+        claim_file(results, "report.html", mine)

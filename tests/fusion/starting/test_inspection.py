@@ -6,6 +6,9 @@ import json
 import os
 from pathlib import Path
 
+import pytest
+
+from fusion.products.store import OutputError
 from fusion.starting.inspection import inspect_paths, write_thumbnails
 from fusion.starting.kinds import Kind
 
@@ -51,6 +54,8 @@ def test_thumbnails_of_the_same_name_are_kept_apart(campaign_folder: Path, tmp_p
     (tmp_path / "a" / "damaged.jpg").write_bytes(frame.read_bytes()[:300])
     written = list(write_thumbnails([tmp_path / "a", tmp_path / "b"], tmp_path / "out"))
     assert [path.name for path in written] == ["x.jpg.png", "b_x.jpg.png"]
+    with pytest.raises(OutputError, match=r"x\.jpg\.png exists already; name another folder with --thumbnails"):
+        list(write_thumbnails([tmp_path / "a"], tmp_path / "out"))
 
 
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
