@@ -6,6 +6,7 @@ messages and no paths, because these may hold what the user measured or who the 
 
 from __future__ import annotations
 
+import errno
 import os
 import platform
 import signal
@@ -33,6 +34,8 @@ from thermography.errors import ThermographyError
 _GRACE_S = 0.5
 _SIGNAL_BASE = 128
 _STOPPING = (signal.SIGINT, signal.SIGTERM)
+#: What a disk answers that takes no more; a file that is being written has no name in the answer.
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 #: Codes from here on count failed campaigns, up to the last that means nothing to a shell.
 _FAILED_BASE, _MOST_FAILED = 100, 25
 
@@ -114,6 +117,11 @@ def answering(console: Console, *, kept: Callable[[], str] = lambda: "") -> Iter
     except (typer.Exit, BrokenPipeError):
         raise
     except OSError as error:
+        if error.errno in _NO_ROOM:
+            say(
+                f"a file cannot be written ({error.strerror}); make room, or name a folder on another disk, and start again"
+            )
+            raise typer.Exit(ExitCode.BAD_INPUT) from None
         if error.filename is None:
             _report_fault(error, say)
             raise typer.Exit(ExitCode.FAULT) from None

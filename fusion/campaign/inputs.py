@@ -542,7 +542,8 @@ def _raise_if_clocks_disagree(
     frames = camera_on_laser_clock(frame_time, clock_offset_s or 0.0)
     covered = covered_share(readings, frames)
     shift = likely_zone_shift(readings, frames)
-    span = f"frames {_shown(frames[0])} to {_shown(frames[-1])}, readings {_shown(readings.min())} to {_shown(readings.max())}"
+    laser = f"readings of {deviations.attrs.get('source', 'the laser')}"
+    span = f"frames {_shown(frames[0])} to {_shown(frames[-1])}, {laser} {_shown(readings.min())} to {_shown(readings.max())}"
     if covered < _COVERED_NOW and shift is not None:
         raise AlignmentError(
             f"{source}: the clocks look {abs(shift) / 3600:g} h apart, as in two time zones ({span}, so {covered:.0%} of the readings lie "

@@ -31,6 +31,9 @@ def test_faults_of_input_end_with_their_message() -> None:
     assert ending(FusionError("laser.csv, line 3: x")) == (ExitCode.BAD_INPUT, "thermofuse: laser.csv, line 3: x\n")
     assert ending(MemoryError())[0] == ExitCode.BAD_INPUT and "memory of this machine" in ending(MemoryError())[1]
     missing = FileNotFoundError(errno.ENOENT, "No such file or directory", "IR_0007.jpg")
+    full = OSError(errno.ENOSPC, "No space left on device")
+    told = "thermofuse: a file cannot be written (No space left on device); make room, or name a folder on another disk, and start again\n"
+    assert ending(full) == (ExitCode.BAD_INPUT, told)
     assert ending(missing) == (ExitCode.BAD_INPUT, "thermofuse: IR_0007.jpg: No such file or directory\n")
 
 

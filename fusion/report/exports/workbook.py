@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -49,7 +50,10 @@ def write_workbook(path: Path, results: Results, deviations: xr.Dataset) -> None
         _add_sheet(
             book, title, columns, frame.itertuples(index=False), widths=[max(12, len(name) + 2) for name in columns]
         )
-    book.save(path)
+    # On a full disk the library's own file would be closed with a traceback for every sheet.
+    content = io.BytesIO()
+    book.save(content)
+    path.write_bytes(content.getvalue())
 
 
 def _add_sheet(
