@@ -315,7 +315,7 @@ def _displacements(
     return displacements[:located]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _disc_view(disc: Array, shift: Array, lens: Array) -> _DiscView:
     """A disc (x, y, radius) of a table displaced by `shift`, mm, as the lens images it."""
     x, y, radius = disc[0] + shift[0], disc[1] + shift[1], disc[2]
@@ -340,7 +340,14 @@ def _locate_disc(
     """Centroid (column, row) px of one disc by repeated centroids of its coverage, and whether it is located."""
     height, width = counts.shape
     column, row = view.column, view.row
+    half_columns, half_rows = view.outer_mm * view.columns_per_mm, view.outer_mm * view.rows_per_mm
     for _ in range(8):
+        # Also where the lens shows no such place: what is not a number, or too large for an integer, gives no patch.
+        if not (
+            0 <= column - half_columns <= column + half_columns < width
+            and 0 <= row - half_rows <= row + half_rows < height
+        ):
+            return column, row, False
         patch = _patch_around(column, row, view.outer_mm, view)
         if patch.left < 0 or patch.top < 0 or patch.right >= width or patch.bottom >= height:
             return column, row, False

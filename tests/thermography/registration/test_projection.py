@@ -13,8 +13,10 @@ from thermography.registration.projection import (
     fit_homography,
     fit_projection,
     leave_one_out_mm,
+    locate_point,
     parameter_covariance,
     parameter_jacobian,
+    project_point,
     select_lens_model,
     variance_factor,
 )
@@ -32,6 +34,13 @@ def test_distortion_is_that_of_opencv_and_can_be_undone():
     np.testing.assert_allclose(BENT.to_sensor(PLAN), peer[:, 0], atol=1e-9)
     np.testing.assert_allclose(BENT.undistort(BENT.to_sensor(PLAN)), undistorted, atol=1e-7)
     np.testing.assert_allclose(BENT.to_plan(BENT.to_sensor(PLAN)), PLAN, atol=1e-7)
+
+
+def test_a_point_is_located_where_it_was_projected_from():
+    for x, y in PLAN:
+        place = locate_point(*project_point(x, y, BENT.as_array), BENT.as_array, BENT.sensor_to_plan)
+        np.testing.assert_allclose(place, (x, y), atol=1e-7)
+        np.testing.assert_allclose(place, BENT.to_plan(BENT.to_sensor(np.array([x, y]))), atol=1e-12)
 
 
 def test_centroid_of_a_disc_is_the_centre_of_its_conic():

@@ -34,6 +34,13 @@ def test_displacement_is_found_without_and_despite_a_previous_one(rng, tracker, 
         assert position.discs >= 6
 
 
+@pytest.mark.parametrize("previous", [np.nan, np.inf, 1e9, 1e19, 1e30, 1e300])
+def test_a_previous_place_that_no_lens_shows_is_not_used(rng, tracker, previous):
+    counts = counts_of(HOME, rng)
+    position = locate_table(counts, tracker, np.array([previous, 0.0]))
+    assert position.shift_mm.tolist() == locate_table(counts, tracker).shift_mm.tolist()
+
+
 def test_direction_is_a_unit_vector_and_uncertainty_grows_along_it(tracker):
     assert tracker.direction.tolist() == [1.0, 0.0]
     middle = len(tracker.common_mm) // 2
