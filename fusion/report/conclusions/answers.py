@@ -214,7 +214,8 @@ def _least_drift(results: Results) -> str:
     assert drift is not None
     known = [k for k, value in enumerate(drift.range_um) if value is not None]
     at = min(known, key=lambda k: drift.range_um[k] or 0.0)
-    if (drift.range_um[at] or 0.0) < _SHARE_OF_SCATTER * float(np.median(drift.scatter_um.values())):
+    scatters = drift.scatter_um.values()
+    if scatters and (drift.range_um[at] or 0.0) < _SHARE_OF_SCATTER * float(np.median(scatters)):
         return f"and not noticeably at position {at + 1} ({drift.position_mm[at]:g} mm)"
     return f"and least by {_extreme_position(results, largest=False)}"
 

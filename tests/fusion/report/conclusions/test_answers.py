@@ -209,6 +209,10 @@ def test_how_much_names_the_position_with_the_largest_drift() -> None:
     still = {**drift, "range_um": [0.0, 11.127]}
     told = dict(answers.conclude(assemble("A", {**PARTS, "drift": still}, [])))["How much"]
     assert "and not noticeably at position 1 (0 mm) (± from" in told
+    # Too few readings for a scatter: the size is told as it is, and nothing warns.
+    unknown = {**still, "scatter_um": {"positive": [None, None], "negative": [None, None]}}
+    told = dict(answers.conclude(assemble("A", {**PARTS, "drift": unknown}, [])))["How much"]
+    assert "and least by 0.00 ± 0.20 µm at position 1 (0 mm)" in told
     told = dict(answers.conclude(assemble("A", {**PARTS, "drift": drift, "iso230": None}, [])))["How much"]
     assert told.endswith(
         "(± from scatter and estimate alone, without laser, material temperature and expansion coefficient)."
