@@ -198,7 +198,7 @@ def _stands_out(estimated: xr.Dataset, usable: NDArray[np.int64]) -> NDArray[np.
     together = np.log(estimated["scatter_position"].values[usable])
     marked[usable] = generalised_esd(together, most=MOST_ANOMALIES, level=ESD_LEVELS["together"], high_only=True)
     single = estimated["scatter"].values[:, usable]
-    if single.shape[0] == 2 and (single > 0).all():
+    if single.shape[0] == 2 and usable.size and (single > 0).all():
         logarithm = np.log(single)
         relative = logarithm - np.median(logarithm, axis=1, keepdims=True)
         outlier = generalised_esd(relative.ravel(), most=MOST_ANOMALIES, level=ESD_LEVELS["single"], high_only=True)

@@ -235,9 +235,10 @@ def _exchanged_approaches(deviations: xr.Dataset, noise_um: float) -> Check:
         return sound
     before, after = reversal[:place], reversal[place:]
     # Standard error of the sum of both means at every target; drift between the two readings of a target adds to the noise.
-    spread = np.sqrt(np.nanvar(before, axis=0) / before.shape[0] + np.nanvar(after, axis=0) / after.shape[0])
-    total = (np.nanmean(before, axis=0) + np.nanmean(after, axis=0)) / np.maximum(spread, 1e-12)
-    total = total[np.isfinite(total)]
+    both = np.isfinite(before).any(axis=0) & np.isfinite(after).any(axis=0)
+    early, late = before[:, both], after[:, both]
+    spread = np.sqrt(np.nanvar(early, axis=0) / early.shape[0] + np.nanvar(late, axis=0) / late.shape[0])
+    total = (np.nanmean(early, axis=0) + np.nanmean(late, axis=0)) / np.maximum(spread, 1e-12)
     opposite = float(stats.chi2.sf(float(total @ total), total.size))
     # An exchange happens from one cycle to the next, a reversal that drifts does not.
     near = np.nanmean(reversal[max(0, place - _LEAST_SIDE) : place]), np.nanmean(reversal[place : place + _LEAST_SIDE])
