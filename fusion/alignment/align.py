@@ -20,6 +20,8 @@ from fusion.errors import FusionError
 _DIMS = ("cycle", "direction", "target")
 #: Half the width of line and point averages, in plan cells: enough to halve the noise of a single cell.
 _HALF_WIDTH_CELLS = 1.5
+#: Frames that are brought to the line together: beside it they take many times the memory of what comes of them.
+_FRAMES_AT_ONCE = 256
 
 
 class AlignmentError(FusionError):
@@ -239,8 +241,8 @@ def _reduce_fields(fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -
     Where a patch of the field switches like a reflection, its shares in the mean rise and in the integral are given beside them. The
     rise counts from the first frame; cells that are not seen in every frame are left out of the mean.
     """
-    temperature = fields["frame_temperature"].values.astype(float)
-    rise = temperature - temperature[0]
+    rise = fields["frame_temperature"].values.astype(float)
+    rise -= rise[0].copy()
     seen = np.isfinite(rise).all(axis=0)
     if not seen.any():
         raise AlignmentError("no plan cell is seen by every frame; check the registration and the plan's size")
@@ -315,6 +317,10 @@ class MeasuredLine:
 
     def sample(self, frames: Array) -> Array:
         """Return frames (time, y, x) along the line, (time, sample), in their unit; gaps are interpolated along the line."""
+        starts = range(0, len(frames), _FRAMES_AT_ONCE)
+        return np.concatenate([self._sample_some(frames[start : start + _FRAMES_AT_ONCE]) for start in starts])
+
+    def _sample_some(self, frames: Array) -> Array:
         place = [self._row, self._column]
         samples = np.stack([ndimage.map_coordinates(frame, place, order=1, mode="nearest") for frame in frames])
         samples[:, self._outside] = np.nan

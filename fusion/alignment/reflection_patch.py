@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import linalg, stats
 
 from fusion._typing import Array
 
@@ -59,8 +59,9 @@ def find_switching_patch(rise: Array) -> SwitchingPatch | None:
         return None
     seen = np.isfinite(rise).all(axis=0)
     sudden = _sudden_changes(rise[:, seen])
-    _, _, components = np.linalg.svd(sudden, full_matrices=False)
-    component = components[0] * np.sign(components[0][np.argmax(np.abs(components[0]))])
+    if not sudden.any():
+        return None
+    component = _leading_component(sudden)
     score = sudden @ component / (component @ component)
     scatter = stats.median_abs_deviation(score, scale="normal")
     jumps = np.where(np.abs(score) > _JUMP_SIGMAS * max(scatter, 1e-9), score, 0.0)
@@ -71,6 +72,19 @@ def find_switching_patch(rise: Array) -> SwitchingPatch | None:
     pattern = np.zeros(seen.shape)
     pattern[seen] = component / height
     return SwitchingPatch(pattern, np.concatenate([[0.0], np.cumsum(jumps)]) * height)
+
+
+def _leading_component(changes: Array) -> Array:
+    """First principal component of changes (time, cell), of unit length and positive where it is largest, (cell,).
+
+    From the products of times or of cells, whichever are fewer: all components of very many frames would take hours.
+    """
+    by_cell = changes.shape[0] > changes.shape[1]
+    products = changes.T @ changes if by_cell else changes @ changes.T
+    last = products.shape[0] - 1
+    _, vectors = linalg.eigh(products, subset_by_index=(last, last), overwrite_a=True)
+    component = vectors[:, 0] if by_cell else changes.T @ vectors[:, 0]
+    return np.asarray(component / np.linalg.norm(component) * np.sign(component[np.argmax(np.abs(component))]))
 
 
 def _sudden_changes(values: Array) -> Array:

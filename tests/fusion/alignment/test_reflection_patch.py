@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fusion.alignment.reflection_patch import find_switching_patch
+from fusion.alignment.reflection_patch import _leading_component, find_switching_patch
 
 FRAMES, ROWS, COLUMNS = 60, 12, 20
 
@@ -43,3 +43,12 @@ def test_a_camera_offset_is_no_patch(warming):
 def test_a_short_recording_has_no_patch(warming):
     warming[4:, 3:6, 8:12] += 2.0
     assert find_switching_patch(warming[:8]) is None
+
+
+@pytest.mark.parametrize("shape", [(20, 70), (70, 20)])
+def test_the_leading_component_is_the_first_singular_vector(rng, shape):
+    changes = rng.standard_normal(shape) + 3.0 * np.outer(rng.standard_normal(shape[0]), rng.standard_normal(shape[1]))
+    _, _, components = np.linalg.svd(changes, full_matrices=False)
+    told = _leading_component(changes)
+    np.testing.assert_allclose(told, components[0] * np.sign(components[0] @ told), atol=1e-12)
+    assert told[np.argmax(np.abs(told))] > 0.0
