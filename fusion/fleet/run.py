@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -128,6 +129,8 @@ class _Fleet:
         self.started = _now()
         # Signals reach the main thread alone: a run that is being started when the fleet is stopped is known, and told to stop too.
         self.starter = ThreadPoolExecutor(1, "start")
+        # A signal may also come while the thread itself is being started, which nothing waits for then.
+        self.starting, self.stopped = threading.Lock(), False
 
     def run(self) -> list[Row]:
         """Run what is not kept, and write the summary whatever happens."""
@@ -168,7 +171,7 @@ class _Fleet:
         return float(psutil.virtual_memory().available) - to_come > self.largest
 
     def _start(self, name: str) -> None:
-        """Start the run of a campaign; everything that it says goes to its log."""
+        """Start the run of a campaign, unless the fleet is stopped; everything that it says goes to its log."""
         member, folder = self.campaigns[name], self.out / name
         log = f"{_LOGS}/{name}.log"
         (self.out / log).parent.mkdir(parents=True, exist_ok=True)
@@ -178,12 +181,20 @@ class _Fleet:
             command.append("--resume")
         threads = str(max((os.cpu_count() or 1) // self.jobs, 1))
         environment = dict.fromkeys(_THREAD_VARIABLES, threads) | os.environ | {"PYTHONUNBUFFERED": "1"}
-        with (self.out / log).open("wb") as stream:
-            # A session of its own: a Ctrl-C at the terminal is for the fleet, which tells its runs to stop.
-            process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=stream, stderr=stream, env=environment, start_new_session=True
-            )
-        self.running[name] = _Running(row, process, time.monotonic())
+        with self.starting:
+            if self.stopped:
+                return
+            with (self.out / log).open("wb") as stream:
+                # A session of its own: a Ctrl-C at the terminal is for the fleet, which tells its runs to stop.
+                process = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=stream,
+                    stderr=stream,
+                    env=environment,
+                    start_new_session=True,
+                )
+            self.running[name] = _Running(row, process, time.monotonic())
 
     def _collect(self) -> None:
         """Take over the results of the runs that have ended."""
@@ -222,6 +233,8 @@ class _Fleet:
 
     def _stop(self) -> None:
         """Tell runs that are left to stop, as when the fleet is; they keep their finished stages."""
+        with self.starting:
+            self.stopped = True
         self.starter.shutdown()
         for name, one in self.running.items():
             one.process.terminate()

@@ -121,3 +121,15 @@ def test_runs_wait_for_memory(monkeypatch):
         assert fleet._has_room() is room
     fleet.jobs = 1
     assert not fleet._has_room()
+
+
+def test_nothing_is_started_after_a_fleet_was_stopped(tmp_path, monkeypatch):
+    """A signal may end the wait for the thread that starts runs, which then comes to it later: its run would be left alone."""
+    (tmp_path / "x").mkdir()
+    (tmp_path / "x" / "campaign.toml").write_text("")
+    begun = []
+    monkeypatch.setattr(fleet_run.subprocess, "Popen", lambda *command, **options: begun.append(command))
+    fleet = fleet_run._Fleet(find_members([tmp_path / "x"]), tmp_path / "out", 1, False, None, None)
+    fleet._stop()
+    fleet._start("x")
+    assert not begun and not fleet.running
