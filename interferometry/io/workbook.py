@@ -21,6 +21,8 @@ _MAGIC = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
 _MOST_CELLS = 20_000_000
 #: Bytes that the parts of a spreadsheet may unpack to: that many cells take about 50 to 100 bytes of XML each.
 _MOST_BYTES = 2_000_000_000
+#: Above so many bytes, the most that a sheet of values is packed by: cells that repeat are packed by some tens, one byte alone by 1,000.
+_LARGE_BYTES, _MOST_PACKED = 100_000_000, 200
 #: Last row and column of a sheet (XFD1048576).
 _LAST_ROW, _LAST_COLUMN = 1_048_576, 16_384
 #: Place of a cell in the XML of a sheet, as in <c r="B7">.
@@ -102,8 +104,8 @@ def refuse_bomb(path: Path, archive: BinaryIO) -> None:
     Raises
     ------
     LaserFormatError
-        The parts state more than 2 GB in all, or a cell lies so far from the others that the sheet between them would have more than
-        20 million cells: a reader makes them all.
+        The parts state more than 2 GB in all, or more than 100 MB and 200 times what they are packed in; or a cell lies so far
+        from the others that the sheet between them would have more than 20 million cells: a reader makes them all.
     """
     try:
         with zipfile.ZipFile(archive) as parts:
@@ -111,6 +113,12 @@ def refuse_bomb(path: Path, archive: BinaryIO) -> None:
             if total > _MOST_BYTES:
                 raise LaserFormatError(
                     f"{path}: unpacks to {total / 1e9:.1f} GB, at most {_MOST_BYTES / 1e9:g} GB are read; "
+                    "save the sheet with the measured values alone"
+                )
+            packed = sum(part.compress_size for part in parts.infolist())
+            if total > max(_LARGE_BYTES, _MOST_PACKED * packed):
+                raise LaserFormatError(
+                    f"{path}: unpacks from {packed / 1e6:.1f} to {total / 1e6:.0f} MB, as no sheet of values does; "
                     "save the sheet with the measured values alone"
                 )
             for part in parts.infolist():

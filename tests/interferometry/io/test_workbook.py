@@ -103,6 +103,16 @@ def test_a_bomb_is_refused_by_the_size_that_it_states(tmp_path: Path) -> None:
     )
 
 
+def test_a_small_bomb_is_refused_by_how_much_it_is_packed(tmp_path: Path) -> None:
+    path = tmp_path / "laser.xlsx"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("xl/worksheets/sheet1.xml", b"1" * 150_000_000)
+    with pytest.raises(
+        LaserFormatError, match=r"laser\.xlsx: unpacks from 0\.1 to 150 MB, as no sheet of values does; save the sheet"
+    ):
+        read_sheets(path, path.read_bytes())
+
+
 @pytest.mark.parametrize(
     ("place", "told"),
     [
