@@ -361,7 +361,7 @@ class Loop(ResultPart):
     """The errors before and after with their intervals."""
     baselines: Baselines
     """Errors of plain predictions with their intervals."""
-    best_baseline: str
+    best_baseline: Literal["last_value", "mean", "least_squares", "ridge", "ridge_with_lags"]
     """Name of the plain prediction with the smallest error, chosen on the hold-out itself."""
     steps: tuple[StepPart, ...]
     """Effects that were added, in turn."""

@@ -116,6 +116,8 @@ def scatter_range(drift: DriftPart) -> str:
         The part ``drift`` of the results.
     """
     scatter = drift.scatter_um.values()
+    if not scatter:
+        return "not known: no position has readings enough"
     # A variance that comes out negative beside the drift is kept as zero: no position has no scatter.
     span = f"{min(scatter):.2f} to" if min(scatter) > 0.0 else "up to"
     return f"{span} {max(scatter):.2f} µm, median {np.median(scatter):.2f} µm"

@@ -22,6 +22,7 @@ import pytest
 
 from fusion.errors import FusionError
 from fusion.pipeline.run import run_campaign
+from fusion.report.terminal import summary_table
 from interferometry.errors import InterferometryError
 from tests.soak.random_campaigns import broken_invariants, strict, write_random_campaign
 from thermography.errors import ThermographyError
@@ -39,7 +40,7 @@ def ran(number: int, folder: Path) -> dict[str, Any]:
     try:
         with warnings.catch_warnings(record=True) as heard:
             warnings.simplefilter("always", RuntimeWarning)
-            run_campaign(campaign, folder / "results")
+            summary_table(run_campaign(campaign, folder / "results"))
         said["warned"] = sorted(
             {
                 f"{one.message} in {Path(one.filename).name}:{one.lineno}"

@@ -46,6 +46,8 @@ def test_scatter_leaves_out_what_is_not_determined() -> None:
     assert findings.scatter_range(drift) == "0.20 to 0.40 \u00b5m, median 0.30 \u00b5m"
     none = DriftPart.model_construct(scatter_um=ByDirection(positive=(0.4, 0.0), negative=(0.2, 0.3)))
     assert findings.scatter_range(none) == "up to 0.40 \u00b5m, median 0.25 \u00b5m"
+    few = DriftPart.model_construct(scatter_um=ByDirection(positive=(None,), negative=(None,)))
+    assert findings.scatter_range(few) == "not known: no position has readings enough"
 
 
 def test_of_one_approach_the_unidirectional_values_are_quoted() -> None:
