@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import xarray as xr
+from threadpoolctl import threadpool_limits
 
 from fusion.alignment.contact_log import describe_sensors, join_sensors
 from fusion.campaign.config import Campaign, load_campaign
@@ -236,6 +237,8 @@ def _run_file(
     return run_loaded(campaign, folder, address, resume=resume, scheduler=scheduler, report=report)
 
 
+# One thread for linear algebra: several give other last digits, and are many times slower on matrices of a hundred columns.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def run_loaded(
     campaign: Campaign,
     folder: Path,

@@ -20,6 +20,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 from scipy import stats
+from threadpoolctl import threadpool_limits
 
 from interferometry._typing import Array
 from interferometry.contract import check_dataset
@@ -51,6 +52,8 @@ class DriftDataError(InterferometryError):
     """The deviations cannot be fitted jointly; the message says what is missing."""
 
 
+# Threaded linear algebra is many times slower than one thread on matrices of a hundred columns, and gives other last digits.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def estimate_drift(
     deviations: xr.Dataset,
     *,
@@ -186,6 +189,7 @@ class JointFit:
         )
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def fit_joint(
     deviations: xr.Dataset,
     *,

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
+from threadpoolctl import threadpool_limits
 
-from interferometry.deviations import OUTLIER, sort_readings
+from interferometry.deviations import OUTLIER, build_deviations, sort_readings
 from interferometry.drift.estimate import DriftDataError, estimate_drift, flag_outliers, state_weights
 from interferometry.drift.gls import average_drift
 from interferometry.drift.state_space import drift_system
@@ -278,3 +280,17 @@ def test_noise_with_memory_over_the_cycles_widens_the_profile(rng: np.random.Gen
     ratio = estimate_drift(with_memory)["profile_relative_u"] / estimate_drift(plain)["profile_relative_u"]
     # The variance of a mean grows by (1 + 0.5) / (1 - 0.5) = 3; the fit takes a part of the memory for drift.
     assert 1.4 < float(ratio[:, 1:].mean()) < 2.0
+
+
+def test_many_targets_give_the_same_on_any_number_of_threads(rng: np.random.Generator) -> None:
+    """From 64 columns on the normal equations are products of matrices, which threads sum in another order, and a minute longer."""
+    seconds = 5.0 * np.arange(6 * 2 * 70).reshape(6, 2, 70)
+    seconds[:, 1] = seconds[:, 1, ::-1]
+    deviation = rng.normal(0.0, 0.4, seconds.shape) + 5.0 * (1.0 - np.exp(-seconds / 1800.0))
+    time = np.datetime64("2026-03-09T06:30") + (1e9 * seconds).astype("timedelta64[ns]")
+    test = build_deviations(range(1, 7), range(1, 71), 5.0 * np.arange(70), deviation, time)
+    estimated = []
+    for threads in (1, 2):
+        with threadpool_limits(threads, user_api="blas"):
+            estimated.append(estimate_drift(test))
+    xr.testing.assert_identical(*estimated)
