@@ -8,6 +8,7 @@ import re
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, BinaryIO
 
@@ -25,10 +26,11 @@ _MOST_BYTES = 2_000_000_000
 _LARGE_BYTES, _MOST_PACKED = 100_000_000, 200
 #: Last row and column of a sheet (XFD1048576).
 _LAST_ROW, _LAST_COLUMN = 1_048_576, 16_384
-#: Place of a cell in the XML of a sheet, as in <c r="B7">.
-_CELL = re.compile(rb"<(?:\w+:)?c\s[^<>]{0,200}?\br\s*=\s*[\"']([A-Za-z]{1,20})(\d{1,40})[\"']")
-#: Bytes of XML that are searched at a time, and the longest beginning of a cell.
-_PIECE, _OVERLAP = 1 << 20, 300
+#: A row or a cell in the XML of a sheet, with its attributes, and the place among these, as in <c r="B7" s="1">.
+_TAG = re.compile(rb"<(?:\w+:)?(row|c)(\s[^<>]*)?>")
+_PLACE = re.compile(rb"\sr\s*=\s*[\"']([A-Za-z]*)(\d+)[\"']")
+#: Bytes of XML that are searched at a time.
+_PIECE = 1 << 20
 
 Rows = list[tuple[int, list[str]]]
 
@@ -122,7 +124,7 @@ def refuse_bomb(path: Path, archive: BinaryIO) -> None:
                     "save the sheet with the measured values alone"
                 )
             for part in parts.infolist():
-                if part.filename.startswith("xl/worksheets/") and part.filename.endswith(".xml"):
+                if part.filename.startswith("xl/") and part.filename.endswith(".xml"):
                     with parts.open(part) as sheet:
                         _refuse_far_cells(path, part.filename, sheet)
     except LaserFormatError:
@@ -134,25 +136,40 @@ def refuse_bomb(path: Path, archive: BinaryIO) -> None:
         archive.seek(0)
 
 
-def _refuse_far_cells(path: Path, part: str, sheet: IO[bytes]) -> None:
-    """Refuse a sheet whose farthest cells span more than may be read; of each piece of XML the end is searched again with the next."""
-    rows = columns = 0
-    lowest = rightmost = b""
-    kept = b""
-    while piece := sheet.read(_PIECE):
-        text = kept + piece
-        for found in _CELL.finditer(text):
-            row, column = int(found[2]), _column_number(found[1])
-            if row > rows:
-                rows, lowest = row, found[1] + found[2]
-            if column > columns:
-                columns, rightmost = column, found[1] + found[2]
-        kept = text[-_OVERLAP:]
+def _refuse_far_cells(path: Path, part: str, xml: IO[bytes]) -> None:
+    """Refuse a sheet whose filled cells span more than may be read. Cells that only have a format cost a reader nothing."""
+    row = column = rows = columns = 0
+    for tag, attributes, is_empty in _tags(xml):
+        place = _PLACE.search(attributes)
+        if tag == b"row":
+            row, column = (row + 1 if place is None else int(place[2][:30])), 0
+            continue
+        # A cell without a place stands beside the one before it.
+        column = column + 1 if place is None else _column_number(place[1][:10])
+        row = row if place is None else int(place[2][:30])
+        if is_empty:
+            continue
+        rows, columns = max(rows, row), max(columns, column)
         if rows > _LAST_ROW or columns > _LAST_COLUMN or rows * columns > _MOST_CELLS:
             raise LaserFormatError(
-                f"{path}, {part}: its cells reach down to {lowest.decode()[:30]} and right to {rightmost.decode()[:30]}; delete the cells "
-                "that lie far from the table, and save the file again"
+                f"{path}, {part}: a cell in row {row} and column {column} lies far from the others; delete the cells that do not belong to "
+                "the table, and save the file again"
             )
+
+
+def _tags(xml: IO[bytes]) -> Iterator[tuple[bytes, bytes, bool]]:
+    """Yield rows and cells of a sheet, their attributes, and whether nothing stands in them; of what is no sheet, nothing."""
+    text = xml.read(_PIECE)
+    if b"sheetData" not in text:
+        return
+    while text:
+        following = xml.read(_PIECE)
+        # What follows the last bracket is searched with the next piece.
+        end = text.rfind(b"<") if following else len(text)
+        for found in _TAG.finditer(text, 0, max(end, 0)):
+            attributes = found[2] or b""
+            yield found[1], attributes, attributes.endswith(b"/") or text.startswith(b"</", found.end())
+        text = text[max(end, 0) :][-2 * _PIECE :] + following if following else b""
 
 
 def _column_number(letters: bytes) -> int:
