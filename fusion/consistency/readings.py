@@ -52,8 +52,11 @@ def check_readings(deviations: xr.Dataset, *, plan_extent_mm: float | None) -> l
     Returns
     -------
     list of Check
+        Empty where there is no reading, of which nothing can be said.
     """
     values = deviations["deviation"].values
+    if not np.isfinite(values).any():
+        return []
     noise_um = random_part_um(values)
     return [
         _largest_deviation(deviations),
@@ -82,8 +85,9 @@ def random_part_um(values: Array) -> float:
     if values.shape[0] < 3:
         return float("nan")
     second = values[2:] - 2.0 * values[1:-1] + values[:-2]
+    second = second[np.isfinite(second)]
     # The second difference of independent readings has six times their variance.
-    return float(stats.median_abs_deviation(second, axis=None, scale="normal", nan_policy="omit") / np.sqrt(6.0))
+    return float(stats.median_abs_deviation(second, scale="normal") / np.sqrt(6.0)) if second.size else float("nan")
 
 
 def find_gross_readings(standardised: xr.DataArray) -> xr.DataArray:
@@ -195,7 +199,7 @@ def _equal_shares(values: Array) -> Iterator[tuple[int, Array]]:
     present = np.isfinite(values)
     cycle, site = np.nonzero(present)
     _, number = np.unique(np.column_stack([site, values[present]]), axis=0, return_inverse=True)
-    holds = sparse.csr_array((np.ones(cycle.size), (cycle, number.ravel())))
+    holds = sparse.csr_array((np.ones(cycle.size), (cycle, number.ravel())), shape=(values.shape[0], cycle.size))
     for start in range(0, values.shape[0], _CYCLES_AT_ONCE):
         rows = slice(start, start + _CYCLES_AT_ONCE)
         both = present[rows].astype(float) @ present.T.astype(float)

@@ -161,3 +161,22 @@ def test_shares_of_equal_readings_are_those_of_every_pair_of_cycles(
     expected = (values[:, None] == values).sum(axis=2) / np.maximum(both, 1)
     np.testing.assert_allclose(told, expected, rtol=1e-12)
     assert [start for start, _ in _equal_shares(values)] == [0, 7, 14, 21, 28]
+
+
+def test_without_any_reading_there_is_nothing_to_check() -> None:
+    values = np.full((4, 2, 4), np.nan)
+    ((start, shares),) = _equal_shares(values.reshape(4, -1))
+    assert start == 0 and not shares.any() and shares.shape == (4, 4)
+    assert np.isnan(random_part_um(values))
+    test = sound()
+    assert (
+        check_readings(with_deviation(test, np.full_like(test["deviation"].values, np.nan)), plan_extent_mm=PLAN_MM)
+        == []
+    )
+
+
+def test_where_no_site_has_three_readings_in_a_row_the_random_part_is_unknown() -> None:
+    values = sound()["deviation"].values
+    values[::2] = np.nan
+    assert np.isnan(random_part_um(values))
+    assert failed(with_deviation(sound(), values)) == {}
