@@ -142,13 +142,18 @@ class CompareScreen:
         try:
             pairs = await asyncio.to_thread(compare_campaigns, [self._reference.value, *others])
             parts = comparison_parts(pairs)
-        except FusionError as error:
-            parts = [paragraph(str(error), kind="fault")]
-        in_turn(lambda: self._tell(parts))
+            in_turn(lambda: self._tell(parts))
+        except (FusionError, OSError) as error:
+            fault = paragraph(str(error), kind="fault")
+            in_turn(lambda: self._tell([fault]))
+        finally:
+            in_turn(self._end)
 
     def _tell(self, parts: list[pn.viewable.Viewable]) -> None:
         """Show a comparison, or why there is none."""
         self._found[:] = parts
+
+    def _end(self) -> None:
         self._compare.disabled = False
 
 

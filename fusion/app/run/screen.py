@@ -34,7 +34,7 @@ class RunScreen:
         self._taken: Path | None = None
         self._campaign = pn.widgets.TextInput(label="Campaign file", sizing_mode="stretch_width")
         self._results = pn.widgets.TextInput(label="Results folder", sizing_mode="stretch_width")
-        self._start = pn.widgets.Button(label="Run", button_type="primary")
+        self._start = pn.widgets.Button(label="Run", color="primary")
         self._cancel = pn.widgets.Button(label="Cancel", disabled=True)
         self._outcome = pn.Column(sizing_mode="stretch_width")
         self._stages = pn.pane.HTML("", sizing_mode="stretch_width")

@@ -177,7 +177,7 @@ class SetUpScreen:
         )
         self._regions = RegionsView(self._draw_plan)
         self._times = TimesView(lambda offset: self._form.write({"clock_offset": f"{offset:g} s"}))
-        self._save = pn.widgets.Button(label="Save campaign.toml and check it", button_type="primary")
+        self._save = pn.widgets.Button(label="Save campaign.toml and check it", color="primary")
         self._go = pn.widgets.Button(label="Go to Run", visible=False)
         self._checked = pn.Column(sizing_mode="stretch_width")
         self._work = pn.Column(sizing_mode="stretch_width", visible=False)
@@ -334,6 +334,7 @@ class SetUpScreen:
         """Write the campaign file and the list of fiducials, and check both."""
         if self._opened is None:
             return
+        in_turn(self._begin_save)
         try:
             campaign = self._write(self._opened)
             self._opened = Opened(**{**vars(self._opened), "campaign": campaign})
@@ -342,17 +343,24 @@ class SetUpScreen:
                 told = [paragraph("Saved. Before it can run, fill in:", kind="warning"), bullets(lacking)]
                 in_turn(lambda: self._tell_check(told))
                 return
-            in_turn(lambda: self._tell_check([paragraph("Checking ...", kind="note")], checking=True))
+            in_turn(lambda: self._tell_check([paragraph("Checking ...", kind="note")]))
             checked = await asyncio.to_thread(check_campaign, campaign.path)
+            in_turn(lambda: self._ready(campaign.path, checked))
         except _BAD_INPUT as error:
             faults = [paragraph(line, kind="fault") for line in str(error).splitlines()]
             in_turn(lambda: self._tell_check(faults))
-            return
-        in_turn(lambda: self._ready(campaign.path, checked))
+        finally:
+            in_turn(self._end_save)
 
-    def _tell_check(self, parts: Sequence[Any], *, checking: bool = False) -> None:
+    def _begin_save(self) -> None:
+        self._save.disabled = True
+        self._tell_check([])
+
+    def _end_save(self) -> None:
+        self._save.disabled = False
+
+    def _tell_check(self, parts: Sequence[Any]) -> None:
         """Show what became of saving."""
-        self._save.disabled = checking
         self._checked[:] = list(parts)
 
     def _ready(self, campaign: Path, checked: CampaignCheck) -> None:

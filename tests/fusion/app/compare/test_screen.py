@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -34,6 +35,22 @@ def test_with_fewer_than_two_results_nothing_is_compared(tmp_path: Path) -> None
     assert screen._compare.disabled
 
 
+def two_results(folder: Path) -> CompareScreen:
+    """The screen before two results folders, one of which is ticked."""
+    for name, seed in (("before", 31), ("later", 32)):
+        write_results(folder / name, readings_of(seed))
+    screen = CompareScreen(State(root=folder))
+    screen._others.value = [folder / "later"]
+    return screen
+
+
+def raising(error: Exception) -> Callable[..., Any]:
+    def fail(*args: object) -> None:
+        raise error
+
+    return fail
+
+
 def test_what_changed_comes_first(tmp_path: Path) -> None:
     before = write_results(tmp_path / "before", readings_of(31), title="<b>before</b>")
     after = write_results(tmp_path / "after", repaired(readings_of(33), -1.2))
@@ -46,6 +63,24 @@ def test_what_changed_comes_first(tmp_path: Path) -> None:
     assert not any(
         "<b>before" in str(pane.object) for part in parts for pane in part.select() if hasattr(pane, "object")
     )
+
+
+def test_a_product_that_may_not_be_read_is_told_and_the_button_comes_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    screen, denied = two_results(tmp_path), "[Errno 13] Permission denied: '/results/deviations.nc'"
+    monkeypatch.setattr("fusion.app.compare.screen.compare_campaigns", raising(PermissionError(denied)))
+    asyncio.run(screen._show(None))
+    assert denied in texts([screen.view])
+    assert not screen._compare.disabled
+
+
+def test_the_button_comes_back_whatever_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = two_results(tmp_path)
+    monkeypatch.setattr("fusion.app.compare.screen.compare_campaigns", raising(ZeroDivisionError()))
+    with pytest.raises(ZeroDivisionError):
+        asyncio.run(screen._show(None))
+    assert not screen._compare.disabled
 
 
 @pytest.mark.browser

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import shutil
 import tomllib
 from collections.abc import Callable, Iterator
@@ -11,8 +12,10 @@ from typing import Any
 import pytest
 
 from fusion.app.setup.campaign_text import open_campaign
-from fusion.app.setup.screen import grid_of, listed_fiducials, open_folder, told_of_check
+from fusion.app.setup.screen import SetUpScreen, grid_of, listed_fiducials, open_folder, told_of_check
+from fusion.app.state import State
 from fusion.starting.check import check_campaign
+from tests.fusion.app.texts import texts
 
 
 def test_a_folder_is_opened_with_its_frame_fiducials_and_times(campaign_folder: Path) -> None:
@@ -41,6 +44,30 @@ def test_a_check_is_told_with_its_faults_or_as_ready(copied: Path) -> None:
     (copied / "environment.csv").unlink()
     shown = "".join(part.object for part in told_of_check(check_campaign(copied / "campaign.toml")))
     assert "not ready to run" in shown and "environment.csv" in shown
+
+
+def test_saving_is_off_while_it_works_and_comes_back_whatever_fails(
+    copied: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    screen, seen = SetUpScreen(State(root=copied)), []
+    asyncio.run(screen.look())
+
+    def failing(error: Exception) -> None:
+        def check(path: Path) -> None:
+            seen.append(screen._save.disabled)
+            raise error
+
+        monkeypatch.setattr("fusion.app.setup.screen.check_campaign", check)
+
+    failing(PermissionError("laser.csv: permission denied"))
+    asyncio.run(screen._on_save(None))
+    assert "laser.csv: permission denied" in texts([screen.view])
+    assert not screen._save.disabled
+    failing(ZeroDivisionError())
+    with pytest.raises(ZeroDivisionError):
+        asyncio.run(screen._on_save(None))
+    assert seen == [True, True]
+    assert not screen._save.disabled
 
 
 @pytest.fixture
