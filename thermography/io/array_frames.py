@@ -57,7 +57,7 @@ class TiffReader(TemperatureReader):
         StackError
             The values are whole numbers and no scale is stated.
         ThermographyError
-            The file is damaged, or its pixels are colours.
+            The file is damaged, its pixels are colours, or its values are no real numbers.
         """
         try:
             with tifffile.TiffFile(path) as file:
@@ -67,14 +67,14 @@ class TiffReader(TemperatureReader):
                 stamp = str(first.tags["DateTime"].value) if "DateTime" in first.tags else ""
         except Exception as error:
             raise ThermographyError(f"{path}: damaged TIFF ({error}); export it again") from None
-        if (
-            len(shape) != 2
-            or not all(isinstance(side, int) for side in shape)
-            or kind is None
-            or kind.kind not in _NUMBERS
-        ):
+        if len(shape) != 2 or not all(isinstance(side, int) for side in shape):
             raise ThermographyError(
                 f"{path}: pixels of shape {shape}: a picture in colours holds no temperatures; export the radiometric TIFF"
+            )
+        if kind is None or kind.kind not in _NUMBERS:
+            stored = "an unknown type" if kind is None else f"type {kind}"
+            raise ThermographyError(
+                f"{path}: values of {stored} are no temperatures; export floating-point or whole numbers"
             )
         _require_scale(path, kind, options)
         return StackContents(count, (shape[0], shape[1]), times=_stamp(stamp) if count == 1 else None)

@@ -115,7 +115,9 @@ def test_a_tiff_whose_strips_do_not_fill_its_page_is_refused_before_memory_is_ta
         TiffReader().read_values(path, 0, EVERY_10_S)
 
 
-def test_complex_values_are_no_temperatures(tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "a.tif", STACK[0].astype(np.complex64), photometric="minisblack")
-    with pytest.raises(ThermographyError, match="holds no temperatures"):
+@pytest.mark.parametrize("kind", ["complex64", "bool"])
+def test_values_that_are_no_real_numbers_are_named_by_their_type(tmp_path: Path, kind: str) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", STACK[0].astype(kind), photometric="minisblack")
+    message = rf"a\.tif: values of type {kind} are no temperatures; export floating-point or whole numbers"
+    with pytest.raises(ThermographyError, match=message):
         TiffReader().contents(tmp_path / "a.tif", EVERY_10_S)
