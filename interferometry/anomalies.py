@@ -267,6 +267,9 @@ def _scatter_direction(estimated: xr.Dataset, target: int, others: NDArray[np.in
     if variance.size < 2 or not np.isfinite(variance).all():
         return str(names[int(np.isfinite(variance).argmax())])
     typical = np.nanmedian(estimated["scatter"].values[:, others] ** 2, axis=1)
+    # Noise with memory can leave the scatter of most positions at zero: there is nothing to compare a direction with.
+    if not (typical > 0).all():
+        return "both"
     weak = int(np.argmin(variance / typical))
     strong = 1 - weak
     weak_is_ordinary = stats.chi2.sf(variance[weak] / typical[weak] * freedom[weak], freedom[weak]) > 0.05
