@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,6 +33,9 @@ _NO_LINES = (b"PK", b"\xd0\xcf", b"\xff\xfe", b"\xfe\xff")
 _COMPARED_BYTES = 4096
 #: A file that can only be read as a whole is read during at most this share of the time.
 _READING_SHARE = 0.1
+#: What is told of a file that does not go on from what was read of it.
+_SHORTER = "has become shorter; watch the test anew if it was begun anew"
+_ANEW = "its first cycle is another one, it was begun anew; watch the test anew"
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +89,7 @@ class ArrivingReadings:
     _last: int = 0
     _counted: int = 0
     _first: list[float] = field(default_factory=list)
+    _shorter: bool = False
     _told: set[str] = field(default_factory=set)
 
     def poll(self, *, final: bool = False) -> Arrived:
@@ -107,9 +112,7 @@ class ArrivingReadings:
     def _poll_lines(self, *, final: bool) -> Arrived:
         """Read the lines that are new."""
         if self._size < self._offset:
-            return Arrived(
-                faults=self._new([f"{self.path}: has become shorter; watch the test anew if it was begun anew"])
-            )
+            return Arrived(faults=self._new([f"{self.path}: {_SHORTER}"]))
         with self.path.open("rb") as file:
             file.seek(self._offset - len(self._before))
             before, content = file.read(len(self._before)), file.read()
@@ -197,15 +200,23 @@ class ArrivingReadings:
             self._next_whole = self.clock() + (self.clock() - now) / _READING_SHARE
         first = np.sort(deviations["deviation"].values[0], axis=None)
         values = first[np.isfinite(first)].tolist()
-        if self._first and (values != self._first or deviations["cycle"].values[-1] < self._last):
-            return Arrived(
-                faults=self._new(
-                    [f"{self.path}: its first cycle is another one, it was begun anew; watch the test anew"]
-                )
-            )
+        if self._first and Counter(values) - Counter(self._first):
+            return Arrived(faults=self._new([f"{self.path}: {_ANEW}"]))
+        if len(values) < len(self._first) or deviations["cycle"].values[-1] < self._last:
+            return self._wait_or_tell(final=final)
+        self._shorter = False
+        # What is told of a file stands until the file is whole again; should it happen again, it is told again.
+        self._told -= {f"{self.path}: {_SHORTER}", f"{self.path}: {_ANEW}"}
         arrived = self._give(deviations, final=final)
         self._first = values if self._last else []
         return arrived
+
+    def _wait_or_tell(self, *, final: bool) -> Arrived:
+        """Wait for one more look at a file that has become shorter, which may just be being written; tell it where it stays so."""
+        if self._shorter or final:
+            return Arrived(faults=self._new([f"{self.path}: {_SHORTER}"]))
+        self._shorter, self._size = True, -1
+        return Arrived()
 
     def _give(self, deviations: xr.Dataset, *, final: bool) -> Arrived:
         """Return the finished cycles that were not given before, with the open one, and note that they were."""

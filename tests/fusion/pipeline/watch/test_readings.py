@@ -167,22 +167,55 @@ def test_readings_of_a_test_begun_anew_are_not_mixed_with_those_before(tmp_path:
     assert "was begun anew" in "".join(fault for one in arrived for fault in one.faults)
 
 
+def write_runs(path: Path, count: int, *, targets: int = 3, zero: float = 1.0) -> None:
+    """A table by run, which is read as a whole."""
+    head = ",".join(f"{run}+ [um],{run}- [um]" for run in range(1, count + 1))
+    rows = [f"{100 * at}," + ",".join([f"{zero + at},{zero - at}"] * count) for at in range(targets)]
+    path.write_text("\n".join([f"Position [mm],{head}", *rows]) + "\n")
+
+
 @pytest.mark.parametrize("runs", [2, 9], ids=["shorter", "longer"])
 def test_a_file_read_as_a_whole_that_is_begun_anew_is_told_by_its_first_cycle(tmp_path: Path, runs: int) -> None:
     """Cycle numbers alone would let cycles of a new test follow those of the old one."""
     path = tmp_path / "laser.csv"
     laser = ArrivingReadings(path, clock=lambda: 0.0)
-
-    def write_runs(count: int, zero: float) -> None:
-        head = ",".join(f"{run}+ [um],{run}- [um]" for run in range(1, count + 1))
-        rows = [f"{100 * at}," + ",".join([f"{zero + at},{zero - at}"] * count) for at in range(3)]
-        path.write_text("\n".join([f"Position [mm],{head}", *rows]) + "\n")
-
-    write_runs(4, 1.0)
+    write_runs(path, 4)
     assert given([laser.poll()]) == [1, 2, 3]
-    write_runs(5, 1.0)
+    write_runs(path, 5)
     assert given([laser.poll()]) == [4]
-    write_runs(runs, 2.0)
+    write_runs(path, runs, zero=2.0)
     arrived = laser.poll()
     assert arrived.cycles is None
     assert arrived.faults == (f"{path}: its first cycle is another one, it was begun anew; watch the test anew",)
+
+
+@pytest.mark.parametrize(("runs", "targets"), [(2, 3), (6, 2)], ids=["fewer cycles", "fewer targets"])
+def test_a_file_caught_while_it_is_rewritten_is_waited_for(tmp_path: Path, runs: int, targets: int) -> None:
+    path = tmp_path / "laser.csv"
+    laser = ArrivingReadings(path, clock=lambda: 0.0)
+    write_runs(path, 4)
+    assert given([laser.poll()]) == [1, 2, 3]
+    shorter = f"{path}: has become shorter; watch the test anew if it was begun anew"
+    for whole in (6, 8):
+        write_runs(path, runs, targets=targets)
+        caught = laser.poll()
+        assert (caught.readings, caught.cycles, caught.faults) == (0, None, ())
+        write_runs(path, whole)
+        arrived = laser.poll()
+        assert arrived.faults == () and given([arrived]) == [whole - 2, whole - 1]
+    for whole in (10, 12):
+        write_runs(path, runs, targets=targets)
+        assert [laser.poll().faults for _ in range(3)] == [(), (shorter,), ()]
+        write_runs(path, whole)
+        assert given([laser.poll()]) == [whole - 2, whole - 1]
+    write_runs(path, 3, zero=2.0)
+    assert "was begun anew; watch the test anew" in laser.poll().faults[0]
+
+
+def test_a_file_that_is_short_when_the_test_is_over_is_told_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "laser.csv"
+    laser = ArrivingReadings(path, clock=lambda: 0.0)
+    write_runs(path, 4)
+    laser.poll()
+    write_runs(path, 2)
+    assert "has become shorter" in laser.poll(final=True).faults[0]
