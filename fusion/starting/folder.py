@@ -31,7 +31,7 @@ class FolderContent:
     files : dict of Kind to tuple of Recognised
         All other files that are understood.
     unknown : tuple of Recognised
-        Files that are not.
+        Files that are not, and links whose file is gone.
     of_temperatures : bool
         Whether the frames hold temperatures of another camera and not FLIR counts.
     """
@@ -65,7 +65,7 @@ def scan_folder(folder: Path) -> FolderContent:
     FolderContent
     """
     paths = list(input_files(folder))
-    thermal = [path for path in paths if path.suffix.lower() != ".toml" and is_flir_file(path)]
+    thermal = [path for path in paths if path.suffix.lower() != ".toml" and path.is_file() and is_flir_file(path)]
     series: dict[tuple[Path, str], list[Path]] = {}
     for path in thermal:
         series.setdefault((path.parent, path.suffix), []).append(path)
@@ -82,7 +82,7 @@ def scan_folder(folder: Path) -> FolderContent:
     known: dict[Kind, list[Recognised]] = {}
     for one in found:
         known.setdefault(one.kind, []).append(one)
-    unknown = known.pop(Kind.UNKNOWN, [])
+    unknown = [*known.pop(Kind.UNKNOWN, []), *known.pop(Kind.UNREADABLE, [])]
     of_temperatures = not patterns and Kind.STACK in known
     if of_temperatures:
         frames = [one.path for one in known.pop(Kind.STACK)]
@@ -105,6 +105,8 @@ def _patterns(folder: Path, frames: list[Path], paths: list[Path]) -> list[str]:
 def input_files(folder: Path) -> Iterator[Path]:
     """Yield the files of a folder and its subfolders, sorted, without hidden ones and without results of a run.
 
+    A link whose file is gone is among them, so that it is missed.
+
     Parameters
     ----------
     folder : Path
@@ -123,5 +125,5 @@ def _files_below(folder: Path, seen: set[Path]) -> Iterator[Path]:
         if path.is_dir():
             if not any((path / name).is_file() for name in _RESULTS):
                 yield from _files_below(path, seen)
-        elif path.is_file():
+        elif path.is_file() or (path.is_symlink() and not path.exists()):
             yield path

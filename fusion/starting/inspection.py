@@ -152,7 +152,7 @@ def _inspect(path: Path, *, named: bool) -> Inspected:
     try:
         found = recognise(path)
         kind = found.kind
-        if kind is Kind.UNKNOWN:
+        if found.reason:
             return Inspected(str(path), kind, fault=found.reason, named=named)
         if kind is Kind.FRAMES:
             return Inspected(str(path), kind, tuple(inspect_file(path).lines()), named=named)

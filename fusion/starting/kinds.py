@@ -67,7 +67,7 @@ class Recognised:
     kind : Kind
         Its kind.
     reason : str
-        Why it is not understood; empty for every other kind.
+        Why it is not understood or cannot be opened; empty for every other kind.
     headings : tuple of str
         Of a table, the headings of its columns.
     """
@@ -84,13 +84,15 @@ def recognise(path: Path) -> Recognised:
     Parameters
     ----------
     path : Path
-        An existing file.
+        An existing file, or a link whose file is gone.
 
     Returns
     -------
     Recognised
         A table with the columns of a kind is of that kind, also where its rows are faulty: its reader says what is wrong.
     """
+    if path.is_symlink() and not path.exists():
+        return Recognised(path, Kind.UNREADABLE, f"a link to {path.readlink()}, where there is no file")
     if path.suffix.lower() == ".toml":
         return _toml(path)
     if is_flir_file(path):

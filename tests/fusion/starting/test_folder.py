@@ -40,3 +40,12 @@ def test_links_to_folders_above_are_not_followed_for_ever(tmp_path: Path) -> Non
     for name in ("self", "again", "more"):
         (tmp_path / name).symlink_to(".")
     assert list(input_files(tmp_path)) == [tmp_path / "a.csv"]
+
+
+def test_a_link_whose_file_is_gone_is_named_among_what_is_not_used(copied: Path) -> None:
+    (copied / "spindle.jpg").symlink_to("moved.jpg")
+    (copied / "ring.csv").symlink_to("ring.csv")
+    assert [(one.path.name, one.reason) for one in scan_folder(copied).unknown] == [
+        ("ring.csv", "a link to ring.csv, where there is no file"),
+        ("spindle.jpg", "a link to moved.jpg, where there is no file"),
+    ]

@@ -58,6 +58,15 @@ def test_thumbnails_of_the_same_name_are_kept_apart(campaign_folder: Path, tmp_p
         list(write_thumbnails([tmp_path / "a"], tmp_path / "out"))
 
 
+def test_a_link_in_a_folder_whose_file_is_gone_is_named(copied: Path) -> None:
+    (copied / "spindle.csv").symlink_to("moved/spindle.csv")
+    found = {Path(one.label).name: one for one in inspect_paths([copied])}
+    assert found["spindle.csv"].fails and len(found) == 7
+    assert found["spindle.csv"].shown(quiet=True) == [
+        f"{copied / 'spindle.csv'}: cannot be opened: a link to moved/spindle.csv, where there is no file"
+    ]
+
+
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     pipe = tmp_path / "x.jpg"
     os.mkfifo(pipe)
