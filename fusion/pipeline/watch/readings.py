@@ -112,7 +112,7 @@ class ArrivingReadings:
     def _poll_lines(self, *, final: bool) -> Arrived:
         """Read the lines that are new."""
         if self._size < self._offset:
-            return Arrived(faults=self._new([f"{self.path}: {_SHORTER}"]))
+            return self._wait_or_tell(final=final)
         with self.path.open("rb") as file:
             file.seek(self._offset - len(self._before))
             before, content = file.read(len(self._before)), file.read()
@@ -122,6 +122,7 @@ class ArrivingReadings:
                     [f"{self.path}: lines that were read stand there no more, it was begun anew; watch the test anew"]
                 )
             )
+        self._go_on()
         end = len(content) if final else content.rfind(b"\n") + 1
         if not self._header:
             return self._begin(content[:end], final=final)
@@ -204,9 +205,7 @@ class ArrivingReadings:
             return Arrived(faults=self._new([f"{self.path}: {_ANEW}"]))
         if len(values) < len(self._first) or deviations["cycle"].values[-1] < self._last:
             return self._wait_or_tell(final=final)
-        self._shorter = False
-        # What is told of a file stands until the file is whole again; should it happen again, it is told again.
-        self._told -= {f"{self.path}: {_SHORTER}", f"{self.path}: {_ANEW}"}
+        self._go_on()
         arrived = self._give(deviations, final=final)
         self._first = values if self._last else []
         return arrived
@@ -217,6 +216,11 @@ class ArrivingReadings:
             return Arrived(faults=self._new([f"{self.path}: {_SHORTER}"]))
         self._shorter, self._size = True, -1
         return Arrived()
+
+    def _go_on(self) -> None:
+        """Note that the file goes on from what was read of it: should it become shorter or begin anew after that, it is told again."""
+        self._shorter = False
+        self._told -= {f"{self.path}: {_SHORTER}", f"{self.path}: {_ANEW}"}
 
     def _give(self, deviations: xr.Dataset, *, final: bool) -> Arrived:
         """Return the finished cycles that were not given before, with the open one, and note that they were."""
