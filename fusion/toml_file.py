@@ -13,8 +13,14 @@ from fusion.errors import FusionError
 _MOST_BYTES = 1_000_000
 #: More levels than any key of a campaign or recipe has: ``table.key`` with lists of lists is four.
 _MOST_LEVELS = 32
-#: A key of more levels, wherever it stands; the parser's time grows with the square of their number.
-_DEEP_KEY = re.compile(r"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){%d}""" % _MOST_LEVELS)  # noqa: UP031
+_STRING = r"""(?:"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
+#: A key of more levels, wherever it stands; the parser's time grows with the square of their number. What stands in comments and strings is
+#: no key; a string without its end takes what it could, because the parser comes no further.
+_DEEP_KEY = re.compile(
+    r"""#[^\n]*+|"{3}(?:[^"\\]|\\[\s\S]|"(?!""))*+"{0,5}+|'{3}(?:[^']|'(?!''))*+'{0,5}+"""
+    rf"""|(?P<key>(?<![\w-])(?:(?:[\w-]++|{_STRING})[ \t]*+\.[ \t]*+){{{_MOST_LEVELS}}})"""
+    r"""|"(?:[^"\\\n]|\\.)*+"?+|'[^'\n]*+'?+"""
+)
 #: Whole numbers of TOML have 64 bits.
 _INTEGERS = range(-(2**63), 2**63)
 
@@ -62,7 +68,7 @@ def read_toml(path: Path) -> tuple[dict[str, Any], str]:
         raise TomlError(f"it is longer than {_MOST_BYTES // 1_000_000} MB; name many files by a pattern")
     # Line ends become one character, as of any text file; a byte order mark, with which editors of Windows begin UTF-8, is no text.
     text = content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
-    deep = _DEEP_KEY.search(text)
+    deep = next((found for found in _DEEP_KEY.finditer(text) if found["key"]), None)
     if deep is not None:
         line = text.count("\n", 0, deep.start()) + 1
         raise TomlError(f"line {line} has a key of more than {_MOST_LEVELS} levels; no key here needs more than four")

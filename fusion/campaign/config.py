@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,9 +19,18 @@ from pydantic import (
     ValidationInfo,
     model_validator,
 )
-from pydantic_core import ErrorDetails, PydanticCustomError
+from pydantic_core import PydanticCustomError
 
-from fusion.campaign.messages import describe, find_line, first_faults, is_text, key_lines, near_file, suggest
+from fusion.campaign.messages import (
+    as_written,
+    describe,
+    find_line,
+    first_faults,
+    is_text,
+    key_lines,
+    near_file,
+    suggest,
+)
 from fusion.campaign.needed_tables import check_tables
 from fusion.campaign.quantities import split_uncertainty
 from fusion.campaign.standard_test import AcceptanceTable, ReportTable, UncertaintyTable
@@ -83,7 +93,8 @@ class _Surroundings:
 def _existing(name: str, info: ValidationInfo) -> str:
     """Accept the name of a file that exists."""
     if isinstance(info.context, _Surroundings):
-        path = (info.context.folder / name).resolve()
+        path = info.context.folder / name
+        path = path if "\0" in name else Path(os.path.realpath(path))
         if not os.path.isfile(path):  # noqa: PTH113 - a name that is too long raises there, and is told here
             text = f"no such file {path}; {near_file(path)}paths are relative to the campaign file"
             raise PydanticCustomError("file", "{text}", {"text": text})
@@ -95,7 +106,7 @@ def _matching(pattern: str, info: ValidationInfo) -> str:
     if isinstance(info.context, _Surroundings):
         found = _matches(info.context.folder, pattern)
         lost = [path for path in found if not path.exists()]
-        unnamed = [path for path in found if not is_text(path.name)]
+        unnamed = [path for path in found if not is_text(str(path).removeprefix(str(info.context.folder)))]
         if lost or unnamed or not found:
             text = f"matches no file in {info.context.folder}; paths are relative to the campaign file"
             text = f"{str(unnamed[0])!a} has a name that is no text in UTF-8; rename it" if unnamed else text
@@ -660,27 +671,10 @@ def load_campaign(path: str | Path, *, effects: Mapping[str, Effect] | None = No
     except ValidationError as error:
         ordered = sorted(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
         details = [item for item in ordered if not (faults and item["type"] == "missing" and len(item["loc"]) == 1)]
-        faults += [describe(_as_written(item, content), Campaign, place) for item in details]
+        faults += [describe(as_written(item, content), Campaign, place) for item in details]
     if faults:
         raise CampaignError("\n".join(first_faults(faults, path)))
     return campaign
-
-
-def _as_written(item: ErrorDetails, content: Mapping[str, Any]) -> ErrorDetails:
-    """Return the fault of an uncertainty under the key that states it: ``emissivity = "0.97 +- 2"`` has no line ``emissivity_u``."""
-    *outer, name = item["loc"] or ("",)
-    if not isinstance(name, str) or not name.endswith("_u"):
-        return item
-    table: Any = content
-    try:
-        for part in outer:
-            table = table[part]
-        written = table if name in table else table[name.removesuffix("_u")]
-    except (KeyError, IndexError, TypeError):
-        return item
-    if written is table:
-        return item
-    return {**item, "loc": (*outer, name.removesuffix("_u")), "input": written}
 
 
 def _matches(folder: Path, pattern: str) -> list[Path]:
@@ -691,7 +685,12 @@ def _matches(folder: Path, pattern: str) -> list[Path]:
             "pattern", f"has more than {_MOST_PARTS} folders; name the files from a folder nearer to them"
         )
     found = Path(given.anchor).glob(str(given.relative_to(given.anchor))) if given.anchor else folder.glob(pattern)
-    there = [path for path in found if path.is_file() or (path.is_symlink() and not path.exists())]
+    try:
+        there = [path for path in found if path.is_file() or (path.is_symlink() and not path.exists())]
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            return []
+        raise
     return [path.resolve() if path.exists() and not given.anchor else path for path in there]
 
 

@@ -9,7 +9,7 @@ import difflib
 import json
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +119,31 @@ def describe(item: ErrorDetails, model: type[BaseModel], place: Place) -> str:
     if isinstance(item["input"], dict):
         return f"{where}: [{dotted}]: {remedy}"
     return f"{where}: {dotted} = {_shown(item['input'])}: {remedy}"
+
+
+def as_written(item: ErrorDetails, content: Mapping[str, Any]) -> ErrorDetails:
+    """Return the fault of an uncertainty under the key that states it: ``emissivity = "0.97 +- 2"`` has no line ``emissivity_u``.
+
+    Parameters
+    ----------
+    item : dict
+        Error of pydantic.
+    content : mapping
+        What was validated.
+    """
+    *outer, name = item["loc"] or ("",)
+    if not isinstance(name, str) or not name.endswith("_u"):
+        return item
+    table: Any = content
+    try:
+        for part in outer:
+            table = table[part]
+        written = table if name in table else table[name.removesuffix("_u")]
+    except (KeyError, IndexError, TypeError):
+        return item
+    if written is table:
+        return item
+    return {**item, "loc": (*outer, name.removesuffix("_u")), "input": written}
 
 
 def _shown(value: object) -> str:

@@ -45,14 +45,16 @@ def open_folder(folder: Path, *, resume: bool) -> Iterator[Path]:
     Raises
     ------
     OutputError
-        If the folder is a file, cannot be written to, is held by another run, holds something and `resume` is false, or holds something
-        that no run has written.
+        If the folder has a name that is no text, is a file, cannot be written to, is held by another run, holds something and `resume` is
+        false, or holds something that no run has written.
 
     Notes
     -----
     The operating system gives the lock free when its process ends, however it ends: a lock without a living holder is taken over. Only
     that of another machine is not, because not every network file system passes locks on.
     """
+    if any("\ud800" <= character <= "\udfff" for character in str(folder)):
+        raise OutputError(f"{str(folder)!a} is no text in UTF-8; name another folder for the results with --out")
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder} is a file; name a folder for the results with --out")
     content = {item.name for item in folder.iterdir()} if folder.is_dir() else set()

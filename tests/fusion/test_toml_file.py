@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
@@ -66,14 +67,71 @@ def test_very_many_faults_are_counted(tmp_path: Path) -> None:
     [
         ("*/" * 2_000 + "*", "has more than 64 folders"),
         ("*.jpg", r"IR_\\udcff\.jpg' has a name that is no text in UTF-8"),
+        ("th*/*.jpg", r"th\\udcff/a\.jpg' has a name that is no text in UTF-8; rename it"),
+        ("a" * 300 + "/*.jpg", "matches no file in"),
+        ("a" * 300 + ".jpg", "matches no file in"),
+        ("a\\u0000b.jpg", "matches no file in"),
+        ("a\\u0000b/*.jpg", "matches no file in"),
     ],
 )
 def test_patterns_without_end_and_names_that_are_no_text_are_refused(tmp_path: Path, pattern: str, reason: str) -> None:
     try:
         (tmp_path / "IR_\udcff.jpg").write_bytes(b"")
+        (tmp_path / "th\udcff").mkdir()
+        (tmp_path / "th\udcff" / "a.jpg").write_bytes(b"")
     except OSError:
         pytest.skip("this file system has no such names")
     path = tmp_path / "a.toml"
     path.write_text(f'[thermography]\nframes = ["{pattern}"]\n')
     with pytest.raises(CampaignError, match=rf"a\.toml, line 2: thermography\.frames = .*{reason}"):
         load_campaign(path)
+
+
+@pytest.mark.parametrize("name", ["a\\u0000b.csv", "a" * 300 + ".csv", "a" * 300 + "/b.csv"])
+def test_a_file_name_that_no_file_can_have_is_no_such_file(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text(f'[interferometry]\ndeviations = "{name}"\n')
+    with pytest.raises(CampaignError, match=r"a\.toml, line 2: interferometry\.deviations = .*: no such file "):
+        load_campaign(path)
+
+
+DOTTED = ".".join(["a"] * 40)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"# {DOTTED}",
+        f'x = "{DOTTED}"',
+        f"x = '{DOTTED}'  # \"{DOTTED}",
+        f'x = """\n{DOTTED} = 1\n"{DOTTED}"""""',
+        f"x = '''\n{DOTTED} = 1 \"'''",
+        f'x = ["\\"", "{DOTTED}"]',
+    ],
+    ids=["comment", "text", "text and comment", "lines", "lines as they are", "list"],
+)
+def test_dots_in_comments_and_text_are_no_levels(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text(text)
+    assert read_toml(path)[1] == text
+
+
+@pytest.mark.parametrize(
+    "before", ['x = 1 # "\n', 'x = "\\""\n', 'x = """a"""""\n', "x = '''a''''\n", "x = { y = '\"', "]
+)
+def test_keys_of_many_levels_behind_comments_and_text_are_found(tmp_path: Path, before: str) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text(f"{before}{DOTTED} = 1" + (" }" if "{" in before else ""))
+    with pytest.raises(TomlError, match=rf"line {1 + before.count(chr(10))} has a key of more than 32 levels"):
+        read_toml(path)
+
+
+@pytest.mark.parametrize("part", ['"\\', '"\\"', "'", '"""\\"', '"a".', "a.", "'''a"])
+def test_text_without_its_end_is_told_in_time(tmp_path: Path, part: str) -> None:
+    """The longest file of any such kind; the time would be minutes if it grew with the square of the length."""
+    path = tmp_path / "a.toml"
+    path.write_text("x = " + part * (900_000 // len(part)))
+    begun = time.process_time()
+    with pytest.raises(TomlError):
+        read_toml(path)
+    assert time.process_time() - begun < 10.0

@@ -56,6 +56,12 @@ def test_files_that_no_run_wrote_are_not_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "report.html").read_text() == "mine"
 
 
+def test_a_folder_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    """NetCDF takes names in UTF-8."""
+    with pytest.raises(OutputError, match="is no text in UTF-8"), open_folder(tmp_path / "th\udcff", resume=False):
+        pass
+
+
 def test_a_second_run_is_told_who_holds_the_folder(tmp_path: Path) -> None:
     with open_folder(tmp_path / "out", resume=False) as folder:
         holder = json.loads((folder / ".stages" / "holder.json").read_text())
