@@ -16,7 +16,7 @@ import tempfile
 import threading
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from enum import IntEnum
 from pathlib import Path
@@ -191,8 +191,8 @@ def leave(code: int) -> NoReturn:
     """End the process with an exit code; one that a signal has stopped at once.
 
     The interpreter waits for threads and takes every library down one by one when it ends, which takes a second on a busy machine. After a
-    signal nobody waits for that: every product is whole, and the message is out. From here on signals are passed over, so that the code is
-    that of what was done.
+    signal nobody waits for that: every product is whole, and the message is out. A signal that comes from here on ends the process at once
+    too, with the code of what was done.
 
     Parameters
     ----------
@@ -204,12 +204,18 @@ def leave(code: int) -> NoReturn:
     SystemExit
         Where no signal has stopped the process.
     """
-    for number in _STOPPING:
-        signal.signal(number, signal.SIG_IGN)
-    if code in (ExitCode.INTERRUPTED, ExitCode.TERMINATED):
-        sys.stdout.flush()
-        sys.stderr.flush()
+
+    def end(*_: object) -> NoReturn:
+        for stream in (sys.stdout, sys.stderr):
+            # A reader that is gone, or the signal came in the middle of this: there is nothing more to be written.
+            with suppress(OSError, ValueError, RuntimeError):
+                stream.flush()
         os._exit(code)
+
+    for number in _STOPPING:
+        signal.signal(number, end)
+    if code in (ExitCode.INTERRUPTED, ExitCode.TERMINATED):
+        end()
     raise SystemExit(code)
 
 

@@ -140,6 +140,26 @@ def test_a_signal_that_comes_when_everything_is_done_changes_nothing() -> None:
     assert (run.communicate(timeout=30)[1], run.returncode) == ("", 0)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals that can be sent to a process")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_process_that_waits_for_a_thread(number: signal.Signals) -> None:
+    """The thread sleeps for a minute; what was printed without a flush is not lost, and the code is that of what was done."""
+    code = (
+        "import signal, sys, threading, time; from fusion.endings import leave\n"
+        "def last():\n"
+        "    while signal.getsignal(signal.SIGTERM) is signal.SIG_DFL: time.sleep(0.01)\n"
+        "    print('unflushed'); print('ready', file=sys.stderr, flush=True); time.sleep(60.0)\n"
+        "threading.Thread(target=last).start()\n"
+        "leave(103)"
+    )
+    run = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert run.stderr is not None and run.stderr.readline() == "ready\n"
+    begun = time.monotonic()
+    run.send_signal(number)
+    assert (run.communicate(timeout=50)[0], run.returncode) == ("unflushed\n", 103)
+    assert time.monotonic() - begun < 20.0
+
+
 def _indented(code: str) -> str:
     return "\n".join(f"    {line}" for line in code.splitlines())
 
