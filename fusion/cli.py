@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import gc
 import io
 import json
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fusion.endings import ExitCode, answering, failed_code, interrupt_ends_step, leave
-from fusion.terminal import Terminal, printable, printable_json
+from fusion.terminal import Terminal, ascii_json, printable, printable_json
 
 if TYPE_CHECKING:
     from fusion.products.progress import Report
@@ -212,7 +213,9 @@ def _progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
 
 def _print_json(content: object, told: Callable[[str], str] = str) -> None:
     """Print JSON for other programs; `told` puts in the address of what was fetched."""
-    sys.stdout.write(told(printable_json(json.dumps(content, indent=1, ensure_ascii=False))) + "\n")
+    text = told(printable_json(json.dumps(content, indent=1, ensure_ascii=False)))
+    in_utf8 = codecs.lookup(sys.stdout.encoding or "utf-8").name == "utf-8"
+    sys.stdout.write((text if in_utf8 else ascii_json(text)) + "\n")
 
 
 def _place(text: str) -> Path | str:

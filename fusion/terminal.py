@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable
 from typing import Any
@@ -14,6 +15,7 @@ from rich.text import Text
 #: Characters that move the cursor, colour, rename or clear a terminal (C0 but for tab and line feed, DEL, C1), turn the direction of what
 #: follows, end a line without being seen to, or are half of a character (bytes of a file name that are no text).
 _ACTING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+_BEYOND_ASCII = re.compile("[^\x00-\x7f]+")
 #: Longer lines, and more of them, are cut: a message that names what somebody put into a file is read by people.
 _LONGEST_LINE, _MOST_LINES = 4_000, 2_000
 
@@ -47,6 +49,17 @@ def printable_json(text: str) -> str:
         JSON over any number of lines.
     """
     return _ACTING.sub(lambda found: f"\\u{ord(found.group()):04x}", text)
+
+
+def ascii_json(text: str) -> str:
+    r"""Return JSON of ASCII alone: the same values, other characters written as ``\u00b5``.
+
+    Parameters
+    ----------
+    text : str
+        JSON over any number of lines.
+    """
+    return _BEYOND_ASCII.sub(lambda found: json.dumps(found.group())[1:-1], text)
 
 
 def cell(text: str) -> str:

@@ -132,8 +132,11 @@ def read_campaign(folder: Path) -> ComparedCampaign:
     ------
     ResultsError
         If it is none.
+    DamagedProductError
+        If its results.json or deviations.nc is not what its run wrote.
     """
     results = read_results(folder)
+    require_own(folder, ["results.json"])
     return ComparedCampaign(folder, results, _axis(folder), _drift(folder / "deviations.nc"))
 
 

@@ -11,7 +11,7 @@ import xarray as xr
 
 from fusion.attribution.family_wise import LEVEL
 from fusion.errors import FusionError
-from fusion.products.contracts import is_file_list, read_fusion, read_product
+from fusion.products.contracts import is_file_list, read_fusion, read_product, require_own
 from fusion.products.grouped import group, has
 from fusion.products.results import RecordLoop, Results, read_results
 from fusion.report import record_section, summary_section
@@ -113,10 +113,11 @@ def report_of(folder: Path) -> str:
 
     Raises
     ------
-    ResultsError, ProductsError
-        If the folder does not hold the products of a finished run.
+    ResultsError, ProductsError, DamagedProductError
+        If the folder does not hold the products of a finished run, as that run wrote them.
     """
     results = read_results(folder)
+    require_own(folder, ["results.json"])
     origin = folder / "provenance.json"
     if not origin.is_file():
         raise ProductsError(f"{origin} is missing; run the campaign again, with --resume to keep what is finished")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -213,6 +214,21 @@ def test_iso230_evaluates_a_window(campaign_folder: Path, tmp_path: Path) -> Non
         assert (refused.exit_code, refused.stderr) == (2, message)
 
 
+@pytest.mark.parametrize("encoding", ["ascii", "cp850", "utf-8"])
+def test_json_is_json_in_any_encoding(tmp_path: Path, encoding: str) -> None:
+    """A pipe of another encoding than UTF-8 cannot take every character, and JSON has its own way to write them."""
+    name = "µ €\U0001d6b9.csv"
+    (tmp_path / name).write_text("no table")
+    done = subprocess.run(
+        [sys.executable, "-m", "fusion.cli", "inspect", str(tmp_path / name), "--json"],
+        capture_output=True,
+        env=os.environ | {"PYTHONIOENCODING": encoding},
+        check=False,
+    )
+    assert Path(json.loads(done.stdout.decode(encoding))["files"][0]["file"]).name == name
+    assert ("µ".encode() in done.stdout) == (encoding == "utf-8")
+
+
 def test_plan_proposes_a_schedule_and_refuses_half_a_source() -> None:
     result = invoke("plan", "--source", "spindle=40 min", "--source", "drive=15 min", "--effect", "3 um")
     assert result.exit_code == 0, result.output
@@ -320,3 +336,16 @@ def test_what_cannot_be_watched_is_refused(campaign_folder: Path, tmp_path: Path
     assert (both.exit_code, both.stderr) == (2, "thermofuse: one campaign can be watched at a time\n")
     wish = invoke("run", campaign, "--out", tmp_path / "r", "--watch", "--wanted", "-1 um")
     assert wish.exit_code == 2 and "the wanted uncertainty lies above 0" in wish.stderr
+
+
+def test_results_that_were_edited_are_not_reported(results_folder: Path, tmp_path: Path) -> None:
+    edited = shutil.copytree(results_folder, tmp_path / "edited")
+    text = (edited / "results.json").read_text(encoding="utf-8")
+    (edited / "results.json").write_text(text.replace("Small campaign", "Another campaign"), encoding="utf-8")
+    commands = [("report", edited), ("export", edited, "--format", "csv"), ("iso230", edited)]
+    for arguments in (*commands, ("compare", results_folder, edited)):
+        told = invoke(*arguments)
+        assert told.exit_code == 2, told.output
+        assert "edited/results.json: is not the file that this run wrote (its SHA-256 is not" in told.output.replace(
+            "\n", ""
+        )

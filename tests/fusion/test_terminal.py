@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from fusion.cli import app
 from fusion.report.tables import print_table, table
-from fusion.terminal import Terminal, cell, printable, printable_json, short
+from fusion.terminal import Terminal, ascii_json, cell, printable, printable_json, short
 
 #: Clears the screen, renames the window, rings, goes back over the line, sets by C1, turns the direction of what follows.
 ACTING = "\x1b[2J \x1b]0;x\x07 \r \x08 \x9b2J \u202e"
@@ -52,6 +52,11 @@ def test_json_keeps_its_values() -> None:
     shown = printable_json(text)
     assert json.loads(shown) == {"name": ACTING + "µ"} and "µ" in shown
     assert not any(character in shown for character in "\x1b\x9b\u202e\x07\r")
+
+
+def test_json_of_ascii_keeps_its_values() -> None:
+    shown = ascii_json(json.dumps({"name": "µ \U0001d6b9 \\ \x7f"}, indent=1, ensure_ascii=False))
+    assert json.loads(shown) == {"name": "µ \U0001d6b9 \\ \x7f"} and shown.isascii() and "\n" in shown
 
 
 def test_long_text_is_cut_and_what_is_left_out_is_counted() -> None:

@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from fusion.products.contracts import read_product, require_kind
+from fusion.products.contracts import read_product, require_kind, require_own
 from fusion.products.grouped import group, has
 from fusion.products.results import RecordLoop, Results, read_results
-from fusion.products.store import read_json_object, told_if_damaged
+from fusion.products.store import DamagedProductError, read_json_object, told_if_damaged
 from fusion.report.charts.thermal_map import LAYERS, Layer, scale_of
 
 #: Cycles from which the one colour scale of all cycles is taken; of a longer test evenly spaced ones.
 _SCALE_CYCLES = 60
+#: A fields.nc of up to so many bytes is compared with the hash of its run; reading a larger one takes longer than a screen may wait.
+_HASHED_BYTES = 100_000_000
 
 
 class Products:
@@ -38,11 +40,14 @@ class Products:
     ------
     ResultsError
         If the folder is none.
+    DamagedProductError
+        If its results.json is not what its run wrote.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.results: Results = read_results(folder)
+        require_own(folder, ["results.json"])
 
     def __del__(self) -> None:
         """Close fields.nc where it was opened."""
@@ -60,9 +65,15 @@ class Products:
         path = self.folder / "fields.nc"
         if not path.is_file():
             return None
+        if path.stat().st_size <= _HASHED_BYTES:
+            require_own(self.folder, [path.name])
         with told_if_damaged(path):
             opened = xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False, cache=False)
-        return require_kind(opened, "fields", path)
+        try:
+            return require_kind(opened, "fields", path)
+        except DamagedProductError:
+            opened.close()
+            raise
 
     @cached_property
     def deviations(self) -> xr.Dataset | None:

@@ -3,12 +3,13 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
 from fusion.app.results.products import Products
 from fusion.products.results import ResultsError
-from fusion.products.store import DamagedProductError, read_dataset
+from fusion.products.store import DamagedProductError, read_dataset, write_dataset
 
 
 @pytest.fixture(scope="module")
@@ -65,3 +66,27 @@ def test_a_damaged_product_is_named(results_folder: Path, tmp_path: Path, name: 
     (tmp_path / f"{name}.nc").write_bytes((results_folder / f"{name}.nc").read_bytes()[:5000])
     with pytest.raises(DamagedProductError, match=rf"{name}\.nc"):
         getattr(Products(tmp_path), name)
+
+
+def test_fields_of_another_kind_are_told_and_not_left_open(results_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "results.json").write_bytes((results_folder / "results.json").read_bytes())
+    (tmp_path / "fields.nc").write_bytes((results_folder / "deviations.nc").read_bytes())
+    seen = Products(tmp_path)
+    with pytest.raises(DamagedProductError, match="another kind of file") as told:
+        seen.fields  # noqa: B018 - it is opened when it is asked for
+    assert told.tb is not None, "the stack still holds what was opened"
+    # A file that is open for reading cannot be opened for writing.
+    with h5py.File(tmp_path / "fields.nc", "r+"):
+        pass
+
+
+def test_products_that_the_run_did_not_write_are_told(results_folder: Path, tmp_path: Path) -> None:
+    for name in ("results.json", "provenance.json", "fields.nc"):
+        (tmp_path / name).write_bytes((results_folder / name).read_bytes())
+    write_dataset(tmp_path / "fields.nc", read_dataset(tmp_path / "fields.nc").isel(cycle=slice(5)))
+    with pytest.raises(DamagedProductError, match=r"fields\.nc: is not the file that this run wrote"):
+        Products(tmp_path).fields  # noqa: B018 - it is opened when it is asked for
+    text = (tmp_path / "results.json").read_text(encoding="utf-8")
+    (tmp_path / "results.json").write_text(text.replace("Small campaign", "Another campaign"), encoding="utf-8")
+    with pytest.raises(DamagedProductError, match=r"results\.json: is not the file that this run wrote"):
+        Products(tmp_path)

@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+from fusion.products.store import file_sha256
+
 pytestmark = pytest.mark.browser
 
 
@@ -22,6 +24,9 @@ def page(app: tuple[str, Path], new_page: Callable[..., Any]) -> Any:
     results = json.loads((laser / "results.json").read_text(encoding="utf-8"))
     results["campaign"] = "<img src=x onerror=alert(1)>"
     (laser / "results.json").write_text(json.dumps(results), encoding="utf-8")
+    provenance = json.loads((laser / "provenance.json").read_text(encoding="utf-8"))
+    provenance["products"]["results.json"]["sha256"] = file_sha256(laser / "results.json")
+    (laser / "provenance.json").write_text(json.dumps(provenance), encoding="utf-8")
     return new_page(app[0], width=390)
 
 
