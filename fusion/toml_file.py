@@ -23,8 +23,6 @@ _DEEP_KEY = re.compile(
 )
 #: Whole numbers of TOML have 64 bits.
 _INTEGERS = range(-(2**63), 2**63)
-
-
 _TOO_DEEP = (
     f"brackets stand in brackets too many times, more than {_MOST_LEVELS} levels; no key here needs more than four"
 )
@@ -74,15 +72,13 @@ def read_toml(path: Path) -> tuple[dict[str, Any], str]:
         raise TomlError(f"line {line} has a key of more than {_MOST_LEVELS} levels; no key here needs more than four")
     try:
         tables = tomllib.loads(text)
-        _require_bounds(tables)
-        return tables, text
     except RecursionError:
         raise TomlError(_TOO_DEEP) from None
-    except TomlError:
-        raise
     # Also whole numbers of thousands of digits, which the parser hands to Python.
     except ValueError as error:
         raise TomlError(str(error)) from None
+    _require_bounds(tables)
+    return tables, text
 
 
 def _require_bounds(tables: dict[str, Any]) -> None:
@@ -92,12 +88,11 @@ def _require_bounds(tables: dict[str, Any]) -> None:
         for key, value in level:
             if isinstance(value, int) and value not in _INTEGERS:
                 raise TomlError(f"{key} is a whole number beyond 64 bits; write a smaller one")
-        below = [
+        level = [
             (f"{key}.{name}" if isinstance(value, dict) else key, item)
             for key, value in level
             if isinstance(value, dict | list)
             for name, item in (value.items() if isinstance(value, dict) else enumerate(value))
         ]
-        level = below
     if level:
         raise TomlError(_TOO_DEEP)

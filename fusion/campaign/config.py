@@ -21,16 +21,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from fusion.campaign.messages import (
-    as_written,
-    describe,
-    find_line,
-    first_faults,
-    is_text,
-    key_lines,
-    near_file,
-    suggest,
-)
+from fusion.campaign.messages import as_written, describe, find_line, first_faults, key_lines, near_file, suggest
 from fusion.campaign.needed_tables import check_tables
 from fusion.campaign.quantities import split_uncertainty
 from fusion.campaign.standard_test import AcceptanceTable, ReportTable, UncertaintyTable
@@ -58,6 +49,7 @@ from fusion.effects.effect import Effect
 from fusion.effects.library import library
 from fusion.effects.thermal import QUASI_STATIC
 from fusion.errors import FusionError
+from fusion.products.store import is_text
 from fusion.toml_file import TomlError, read_toml
 
 #: What a record may be declared with: every displacement a linear function of the temperatures.
@@ -107,11 +99,15 @@ def _matching(pattern: str, info: ValidationInfo) -> str:
         found = _matches(info.context.folder, pattern)
         lost = [path for path in found if not path.exists()]
         unnamed = [path for path in found if not is_text(str(path).removeprefix(str(info.context.folder)))]
-        if lost or unnamed or not found:
+        if lost:
+            text = f"{lost[0]} is a link to a file that is gone; bring it back or remove the link"
+        elif unnamed:
+            text = f"{str(unnamed[0])!a} has a name that is no text in UTF-8; rename it"
+        elif not found:
             text = f"matches no file in {info.context.folder}; paths are relative to the campaign file"
-            text = f"{str(unnamed[0])!a} has a name that is no text in UTF-8; rename it" if unnamed else text
-            text = f"{lost[0]} is a link to a file that is gone; bring it back or remove the link" if lost else text
-            raise PydanticCustomError("pattern", "{text}", {"text": text})
+        else:
+            return pattern
+        raise PydanticCustomError("pattern", "{text}", {"text": text})
     return pattern
 
 

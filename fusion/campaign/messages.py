@@ -49,17 +49,6 @@ def suggest(name: str, known: Iterable[str]) -> str:
     return f"did you mean {near[0]}? " if near else ""
 
 
-def is_text(name: str) -> bool:
-    """Return whether the name of a file is text: others cannot be written into results.
-
-    Parameters
-    ----------
-    name : str
-        As the system gives it, with halves of characters in place of bytes that are no UTF-8.
-    """
-    return not any("\ud800" <= character <= "\udfff" for character in name)
-
-
 def near_file(path: Path) -> str:
     """Return the hint that names the nearest file of the same folder.
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import filelock
 
-from fusion.products.store import OutputError, write_json
+from fusion.products.store import OutputError, is_text, write_json
 from thermography.io.atomic import PARTIAL, partial_path
 
 MANIFEST = "manifest.json"
@@ -53,7 +53,7 @@ def open_folder(folder: Path, *, resume: bool) -> Iterator[Path]:
     The operating system gives the lock free when its process ends, however it ends: a lock without a living holder is taken over. Only
     that of another machine is not, because not every network file system passes locks on.
     """
-    if any("\ud800" <= character <= "\udfff" for character in str(folder)):
+    if not is_text(str(folder)):
         raise OutputError(f"{str(folder)!a} is no text in UTF-8; name another folder for the results with --out")
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder} is a file; name a folder for the results with --out")

@@ -65,6 +65,17 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
         ) from error
 
 
+def is_text(name: str) -> bool:
+    """Return whether the name of a file is text: others cannot be written into results.
+
+    Parameters
+    ----------
+    name : str
+        As the system gives it, with halves of characters in place of bytes that are no UTF-8.
+    """
+    return not any("\ud800" <= character <= "\udfff" for character in name)
+
+
 def write_text(path: Path, text: str) -> Path:
     """Write UTF-8 text whole or not at all.
 

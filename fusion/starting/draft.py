@@ -12,7 +12,7 @@ import numpy as np
 
 from fusion.errors import FusionError
 from fusion.products.notices import counted
-from fusion.products.store import write_text
+from fusion.products.store import is_text, write_text
 from fusion.starting.folder import FolderContent, scan_folder
 from fusion.starting.kinds import Kind, Recognised, column_unit, is_displacement, is_temperature, is_time
 from fusion.starting.questions import TO_FILL, Asker
@@ -75,15 +75,10 @@ def write_campaign(folder: Path, asker: Asker) -> tuple[Path, list[str]]:
         raise DraftError(f"{path} exists already and is not replaced; thermofuse check {path} says what it lacks")
     content = scan_folder(folder.resolve())
     lines = list(draft_lines(content, asker))
-    text = "\n".join(lines) + "\n"
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        line = next(line for line in lines if any("\ud800" <= one <= "\udfff" for one in line))
-        raise DraftError(
-            f"{folder}: the name of a file in it is not UTF-8 ({line!a}); give that file another name"
-        ) from None
-    write_text(path, text)
+    unnamed = next((line for line in lines if not is_text(line)), None)
+    if unnamed is not None:
+        raise DraftError(f"{folder}: the name of a file in it is not UTF-8 ({unnamed!a}); give that file another name")
+    write_text(path, "\n".join(lines) + "\n")
     return path, [
         f"line {number}: {line}"
         for number, line in enumerate(lines, start=1)
