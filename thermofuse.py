@@ -134,6 +134,6 @@ def __dir__() -> list[str]:
 
 
 if __name__ == "__main__":
-    from fusion.cli import main
+    from fusion.command import main
 
     main()

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.twin.camera import KELVIN, SC660, Renderer, fiducial_points, make_view
-from fusion.twin.machine.recipe import RecipeError
+from fusion.twin.folders import CAMPAIGN_FILE, check_free, whole_folders, write_truth_nc
 from fusion.twin.machine.streams import stream
 from fusion.twin.recipe_file import read_recipe
 from fusion.twin.record import simulate_record, write_record
@@ -57,7 +57,8 @@ def simulate_campaign(recipe_path: Path, out: Path, *, progress: Progress | None
     Raises
     ------
     RecipeError
-        The recipe cannot be read, is not TOML, or asks for what no machine can be; or one of the two folders is not empty.
+        The recipe cannot be read, is not TOML, or asks for what no machine can be; or one of the two folders is not empty or cannot be
+        written to, and both are as they were before.
 
     Notes
     -----
@@ -74,28 +75,12 @@ def simulate_campaign(recipe_path: Path, out: Path, *, progress: Progress | None
     """
     recipe, out = read_recipe(Path(recipe_path)), Path(out)
     if recipe.record is None:
-        _check_free(out)
+        check_free(out)
         return write_campaign(simulate(recipe), out, progress=progress)
     truth = simulate_record(recipe)
-    _make_folders(out)
-    return write_record(truth, out, truth_folder(out))
-
-
-def truth_folder(out: Path) -> Path:
-    """Return the folder in which the truth of a campaign is kept: beside the campaign, never inside.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of the campaign.
-
-    Returns
-    -------
-    Path
-        ``<out>-truth``, absolute.
-    """
-    out = Path(out).resolve()
-    return out.with_name(f"{out.name}-truth")
+    with whole_folders(out) as (folder, beside):
+        write_record(truth, folder, beside)
+    return out / CAMPAIGN_FILE
 
 
 def write_campaign(truth: Truth, out: Path, *, progress: Progress | None = None) -> Path:
@@ -118,18 +103,18 @@ def write_campaign(truth: Truth, out: Path, *, progress: Progress | None = None)
     Raises
     ------
     RecipeError
-        `out` or the folder of the truth is not empty.
+        `out` or the folder of the truth is not empty or cannot be written to; both are as they were before.
     """
     out = Path(out)
-    _make_folders(out)
-    _write_laser(truth, out)
-    write_environment_csv(out / "environment.csv", environment_log(truth))
-    _write_drivers(truth, out / "drivers.csv")
-    _write_fiducials(truth, out / "fiducials.csv")
-    (out / "campaign.toml").write_text(_campaign_text(truth), encoding="utf-8")
-    _write_truth(truth, truth_folder(out))
-    _write_frames(truth, out / "thermal", progress)
-    return out / "campaign.toml"
+    with whole_folders(out) as (folder, beside):
+        _write_laser(truth, folder)
+        write_environment_csv(folder / "environment.csv", environment_log(truth))
+        _write_drivers(truth, folder / "drivers.csv")
+        _write_fiducials(truth, folder / "fiducials.csv")
+        (folder / CAMPAIGN_FILE).write_text(_campaign_text(truth), encoding="utf-8")
+        _write_truth(truth, beside)
+        _write_frames(truth, folder / "thermal", progress)
+    return out / CAMPAIGN_FILE
 
 
 def _campaign_text(truth: Truth) -> str:
@@ -182,20 +167,6 @@ file = "drivers.csv"
 [model]
 declared = ["axis_expansion", "table_offset"]
 """
-
-
-def _make_folders(out: Path) -> None:
-    """Make the folders of the campaign and of its truth."""
-    _check_free(out)
-    out.mkdir(parents=True, exist_ok=True)
-    truth_folder(out).mkdir(parents=True, exist_ok=True)
-
-
-def _check_free(out: Path) -> None:
-    """Raise an error where a folder of the campaign holds something already."""
-    for folder in (out, truth_folder(out)):
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise RecipeError(f"{folder} exists and is not an empty folder; name another output folder or empty it")
 
 
 def _write_laser(truth: Truth, out: Path) -> None:
@@ -258,7 +229,7 @@ def _write_truth(truth: Truth, folder: Path) -> None:
         coords={"field_time": truth.clock(field_s).astype("datetime64[ns]"), "y": y, "x": x},
     )
     readings = truth.readings.drop_encoding()
-    xr.merge([readings, fields, truth.frames]).to_netcdf(folder / "truth.nc", engine="h5netcdf")
+    write_truth_nc(folder, xr.merge([readings, fields, truth.frames]))
     view = make_view(recipe.camera)
     moving = {name: moving_rms(truth.in_order(name), truth.session) for name in truth.parts}
     content = {

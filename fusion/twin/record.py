@@ -16,6 +16,7 @@ import xarray as xr
 from scipy.linalg import expm
 
 from fusion._typing import Array
+from fusion.twin.folders import write_truth_nc
 from fusion.twin.machine.effects import EFFECTS
 from fusion.twin.machine.recipe import EffectRecipe, Recipe, RecipeError, Record
 from fusion.twin.machine.session import Session
@@ -199,7 +200,7 @@ drivers = ["spindle speed*"]
 """,
         encoding="utf-8",
     )
-    table.to_netcdf(beside / "truth.nc", engine="h5netcdf")
+    write_truth_nc(beside, table)
     rms = {name: float(_centred_rms(table[name].values)) for name in truth.parts}
     content = {"recipe": asdict(truth.recipe), "parts_rms_um": rms, "undeclared": [e.name for e in truth.recipe.effect]}
     (beside / "truth.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -42,3 +42,12 @@ def test_a_full_disk_ends_with_a_message_and_whole_products(disk: Path, tmp_path
     assert not list(disk.rglob("*.partial*"))
     for path in disk.rglob("*.json"):
         json.loads(path.read_text())
+
+
+@pytest.mark.slow
+def test_a_simulation_into_a_full_disk_leaves_nothing(disk: Path, tmp_path: Path) -> None:
+    (tmp_path / "recipe.toml").write_text('[campaign]\ntitle = "Three cycles"\n[test]\ncycles = 12\n')
+    ended = command("simulate", tmp_path / "recipe.toml", "--out", disk / "campaign")
+    assert ended.returncode == 2, ended.stderr
+    assert "campaign: cannot be written (No space left on device), and nothing is left there" in ended.stderr
+    assert not list(disk.iterdir())

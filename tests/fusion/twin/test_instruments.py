@@ -11,7 +11,8 @@ import pytest
 import xarray as xr
 
 from fusion.twin import simulate
-from fusion.twin.instruments import simulate_campaign, truth_folder, write_campaign
+from fusion.twin.folders import truth_folder
+from fusion.twin.instruments import simulate_campaign, write_campaign
 from fusion.twin.machine.recipe import Recipe, RecipeError
 from fusion.twin.recipe_file import read_recipe
 from interferometry.io.readers import read_deviations, read_environment

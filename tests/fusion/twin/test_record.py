@@ -11,7 +11,8 @@ import xarray as xr
 from fusion.campaign.config import load_campaign
 from fusion.campaign.record_runs import read_record
 from fusion.twin import simulate
-from fusion.twin.instruments import simulate_campaign, truth_folder
+from fusion.twin.folders import truth_folder
+from fusion.twin.instruments import simulate_campaign
 from fusion.twin.machine.recipe import AnomalyRecipe, EffectRecipe, Recipe, RecipeError
 from fusion.twin.recipe_file import packaged_recipe, read_recipe
 from fusion.twin.record import IN_A_RECORD, MOTOR_W, PARTS, SPINDLE_W, simulate_record, solve_parts

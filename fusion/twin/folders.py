@@ -1,0 +1,121 @@
+"""The folders of a simulated campaign and of its truth: both whole, or none."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import xarray as xr
+
+from fusion.twin.machine.recipe import RecipeError
+
+#: What makes a folder a campaign; it comes last into a folder that existed.
+CAMPAIGN_FILE = "campaign.toml"
+#: Ends the name of a folder that is being written, which begins with a dot.
+PARTIAL = ".partial"
+
+
+def truth_folder(out: Path) -> Path:
+    """Return the folder in which the truth of a campaign is kept: beside the campaign, never inside.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the campaign.
+
+    Returns
+    -------
+    Path
+        ``<out>-truth``, absolute.
+    """
+    out = Path(out).resolve()
+    return out.with_name(f"{out.name}-truth")
+
+
+def check_free(out: Path) -> None:
+    """Raise an error where a folder of the campaign cannot be filled.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the campaign.
+
+    Raises
+    ------
+    RecipeError
+        It or the folder of its truth holds something already or is a file, or it is the root of a disk, which has nothing beside it.
+    """
+    for folder in (out, truth_folder(out)):
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise RecipeError(f"{folder} exists and is not an empty folder; name another output folder or empty it")
+    if out.is_mount():
+        raise RecipeError(
+            f"{out} is the root of a disk, and the truth is kept beside the campaign; name a folder in it: {out / 'campaign'}"
+        )
+
+
+@contextmanager
+def whole_folders(out: Path) -> Iterator[tuple[Path, Path]]:
+    """Let a campaign and its truth be written under temporary names, and put them in place when both are whole.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the campaign; it and `truth_folder` of it must be absent or empty.
+
+    Yields
+    ------
+    campaign, truth : Path
+        Empty folders to write to. What fails or is stopped leaves neither.
+
+    Raises
+    ------
+    RecipeError
+        As `check_free`, or the disk takes no more.
+    """
+    check_free(out)
+    places = (truth_folder(out), out.resolve())
+    truth, campaign = (place.with_name(f".{place.name}{PARTIAL}") for place in places)
+    try:
+        for growing in (truth, campaign):
+            shutil.rmtree(growing, ignore_errors=True)
+            growing.mkdir(parents=True)
+        yield campaign, truth
+        for growing, place in zip((truth, campaign), places, strict=True):
+            _put_in_place(growing, place)
+    except OSError as error:
+        raise RecipeError(
+            f"{out}: cannot be written ({error.strerror or error}), and nothing is left there; make room, allow writing there, "
+            "or name another folder with --out"
+        ) from error
+    finally:
+        for growing in (truth, campaign):
+            shutil.rmtree(growing, ignore_errors=True)
+
+
+def write_truth_nc(folder: Path, truth: xr.Dataset) -> None:
+    """Write ``truth.nc``.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the truth.
+    truth : Dataset
+        Readings or a record, and what they are made of.
+
+    Notes
+    -----
+    The file is made in memory: the HDF5 library, which cannot close a file on a full disk, would end the process.
+    """
+    (folder / "truth.nc").write_bytes(truth.to_netcdf(engine="h5netcdf"))
+
+
+def _put_in_place(growing: Path, place: Path) -> None:
+    """Give a folder its name; an empty folder that has the name stays, in which somebody may be at work, and is filled."""
+    if not place.exists():
+        growing.rename(place)
+        return
+    for item in sorted(growing.iterdir(), key=lambda item: item.name == CAMPAIGN_FILE):
+        item.rename(place / item.name)
