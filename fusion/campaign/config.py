@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -43,7 +42,9 @@ from fusion.campaign.value_types import (
     Seconds,
     TimeZone,
     area_mm2,
+    check_pattern,
     corner_words,
+    matching_files,
 )
 from fusion.effects.effect import Effect
 from fusion.effects.library import library
@@ -54,8 +55,6 @@ from fusion.toml_file import TomlError, read_toml
 
 #: What a record may be declared with: every displacement a linear function of the temperatures.
 RECORD_EFFECTS = (QUASI_STATIC,)
-#: Folders of a pattern, each of which is searched within the one before.
-_MOST_PARTS = 64
 #: Effects that need positions along an axis; a record that declares them is run without, and the results say so.
 _ALONG_AN_AXIS = ("axis_expansion", "table_offset")
 #: Attribute of ``[thermography]`` -> its key, of what files of temperatures are corrected for already.
@@ -96,7 +95,8 @@ def _existing(name: str, info: ValidationInfo) -> str:
 def _matching(pattern: str, info: ValidationInfo) -> str:
     """Accept a pattern that matches at least one file."""
     if isinstance(info.context, _Surroundings):
-        found = _matches(info.context.folder, pattern)
+        check_pattern(info.context.folder, pattern)
+        found = matching_files(info.context.folder, pattern)
         lost = [path for path in found if not path.exists()]
         unnamed = [path for path in found if not is_text(str(path).removeprefix(str(info.context.folder)))]
         if lost:
@@ -545,7 +545,9 @@ class Campaign(_Table):
         """Return the thermal files that the glob patterns match, each once, sorted by name."""
         if self.thermography is None:
             return ()
-        return tuple(sorted({path for pattern in self.thermography.frames for path in _matches(self.folder, pattern)}))
+        return tuple(
+            sorted({path for pattern in self.thermography.frames for path in matching_files(self.folder, pattern)})
+        )
 
     def record_paths(self) -> tuple[Path, ...]:
         """Return the tables of the record's runs, each once, in the order in which the campaign file names them."""
@@ -673,23 +675,6 @@ def load_campaign(path: str | Path, *, effects: Mapping[str, Effect] | None = No
     return campaign
 
 
-def _matches(folder: Path, pattern: str) -> list[Path]:
-    """Return the files that a glob pattern, relative or absolute, matches; a link whose file is gone counts, so that it is missed."""
-    given = Path(pattern)
-    if len(given.parts) > _MOST_PARTS:
-        raise PydanticCustomError(
-            "pattern", f"has more than {_MOST_PARTS} folders; name the files from a folder nearer to them"
-        )
-    found = Path(given.anchor).glob(str(given.relative_to(given.anchor))) if given.anchor else folder.glob(pattern)
-    try:
-        there = [path for path in found if path.is_file() or (path.is_symlink() and not path.exists())]
-    except OSError as error:
-        if error.errno == errno.ENAMETOOLONG:
-            return []
-        raise
-    return [path.resolve() if path.exists() and not given.anchor else path for path in there]
-
-
 def _each_match(folder: Path, patterns: tuple[str, ...]) -> tuple[Path, ...]:
     """Return the files that patterns match, each once, in the order of the patterns and of the names that one pattern matches."""
-    return tuple(dict.fromkeys(path for pattern in patterns for path in sorted(_matches(folder, pattern))))
+    return tuple(dict.fromkeys(path for pattern in patterns for path in sorted(matching_files(folder, pattern))))

@@ -1,8 +1,11 @@
-"""Values of a campaign file as types: quantities with their unit, shares, patches of pixels, time zones; each names what is wrong."""
+"""Values of a campaign file as types: quantities with their unit, shares, patches, time zones, patterns; each names what is wrong."""
 
 from __future__ import annotations
 
+import errno
+import os
 import re
+from pathlib import Path
 from typing import Annotated
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 
@@ -11,6 +14,12 @@ from pydantic_core import PydanticCustomError
 
 from fusion.campaign.messages import suggest
 from fusion.campaign.quantities import QuantityError, read_quantity
+
+#: Folders of a pattern, each of which is searched within the one before.
+_MOST_PARTS = 64
+#: Most files and folders that are looked through for one pattern: a test of 10,000 cycles with 100 frames in each.
+_MOST_SEARCHED = 1_000_000
+_WILDCARD = re.compile(r"[*?[]")
 
 
 def _quantity(unit: str) -> BeforeValidator:
@@ -135,3 +144,61 @@ def corner_words(corners: tuple[tuple[float, float], ...]) -> str:
         In order.
     """
     return ", ".join(f"({x:g}, {y:g})" for x, y in corners) + " mm"
+
+
+def matching_files(folder: Path, pattern: str) -> list[Path]:
+    """Return the files that a pattern matches; a link whose file is gone counts, so that it is missed.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the campaign file, from which relative patterns start.
+    pattern : str
+        As `pathlib.Path.glob` takes it, relative or absolute.
+    """
+    given = Path(pattern)
+    found = Path(given.anchor).glob(str(given.relative_to(given.anchor))) if given.anchor else folder.glob(pattern)
+    try:
+        there = [path for path in found if path.is_file() or (path.is_symlink() and not path.exists())]
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            return []
+        raise
+    return [path.resolve() if path.exists() and not given.anchor else path for path in there]
+
+
+def check_pattern(folder: Path, pattern: str) -> None:
+    """Refuse a pattern for which a whole disk would be searched.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the campaign file, from which relative patterns start.
+    pattern : str
+        As `matching_files` takes it.
+
+    Raises
+    ------
+    PydanticCustomError
+        It has more than 64 folders, or searches folders of any depth below the root of a disk, or more than 1,000,000 files and folders.
+    """
+    parts = Path(pattern).parts
+    if len(parts) > _MOST_PARTS:
+        raise PydanticCustomError(
+            "pattern", f"has more than {_MOST_PARTS} folders; name the files from a folder nearer to them"
+        )
+    first = next((k for k, part in enumerate(parts) if _WILDCARD.search(part)), len(parts))
+    wild = [part for part in parts[first:-1] if _WILDCARD.search(part)]
+    if "**" not in parts and len(wild) < 2:
+        return
+    start = Path(os.path.realpath(folder.joinpath(*parts[:first])))
+    advice = f"name the folder of the files before the first wildcard, for example {start / 'thermal' / '*.jpg'}"
+    if start == Path(start.anchor):
+        text = f"would search the whole disk {start}; {advice}"
+        raise PydanticCustomError("pattern", "{text}", {"text": text})
+    searched = 0
+    for _, folders, files in os.walk(start):
+        searched += len(folders) + len(files)
+        if searched > _MOST_SEARCHED:
+            text = f"would search more than {_MOST_SEARCHED:,} files and folders in {start}; {advice}"
+            raise PydanticCustomError("pattern", "{text}", {"text": text})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -22,9 +21,11 @@ from interferometry.io.workbook import is_workbook, read_sheets
 
 #: Marks that may stand between fields.
 DELIMITERS = ";\t,|"
-_LINE_ENDS = re.compile(r"\r\n|\n|\r")
 #: Columns of the widest sheet of a spreadsheet; a text with more is no table of readings, and takes long to be found none.
 _MOST_COLUMNS = 16_384
+#: A line with a reading has more characters; a text with more shorter lines than a spreadsheet has rows is damaged, and takes long to
+#: be found so.
+_SHORT_LINE, _MOST_SHORT_LINES = 4, 1_048_576
 #: Longest part of a line of the file that a message repeats, characters.
 _SHOWN = 160
 
@@ -105,7 +106,7 @@ def read_grids(path: Path, *, sheet: str | None = None) -> list[Grid]:
     Raises
     ------
     LaserFormatError
-        The file is empty, no text and no spreadsheet, or has no such sheet.
+        The file is empty, no text and no spreadsheet, has no such sheet, or more than 1,048,576 lines of fewer than four characters.
     OSError
         The file cannot be opened.
     """
@@ -118,7 +119,14 @@ def read_grids(path: Path, *, sheet: str | None = None) -> list[Grid]:
             )
         return [Grid(path, name, rows) for name, rows in sheets.items() if sheet in (None, name)]
     text = decode_text(path, content, chinese_words=CHINESE_WORDS)
-    lines = ["" if line.startswith("#") else line for line in _LINE_ENDS.split(text)]
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    short = sum(len(line) < _SHORT_LINE for line in lines) if len(lines) > _MOST_SHORT_LINES else 0
+    if short > _MOST_SHORT_LINES:
+        raise LaserFormatError(
+            f"{path}: {short} lines with nothing or fewer than {_SHORT_LINE} characters, too short for a reading; the file is damaged or "
+            "no table, export it again"
+        )
+    lines = ["" if line.startswith("#") else line for line in lines]
     present = sorted((mark for mark in DELIMITERS if any(mark in line for line in lines)), key=text.count, reverse=True)
     grids = [Grid(path, "", split_lines(path, lines, mark)) for mark in present or [","]]
     if not grids[0].rows:

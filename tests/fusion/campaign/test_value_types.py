@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 from pydantic import TypeAdapter, ValidationError
+from pydantic_core import PydanticCustomError
 
 from fusion.campaign import value_types
 
@@ -43,3 +45,25 @@ def test_a_value_comes_in_the_unit_of_its_name(name: str, written: Any, value: A
 def test_a_value_that_cannot_be_is_named(name: str, written: Any, fault: str) -> None:
     with pytest.raises(ValidationError, match=fault):
         TypeAdapter(getattr(value_types, name)).validate_python(written)
+
+
+@pytest.mark.parametrize("pattern", ["/**/*", "/**/*.jpg", "/*/*/*/*.jpg", "../" * 20 + "**/*.seq"])
+def test_a_pattern_does_not_search_the_whole_disk(tmp_path: Path, pattern: str) -> None:
+    with pytest.raises(
+        PydanticCustomError, match="would search the whole disk /; name the folder of the files before the first"
+    ):
+        value_types.check_pattern(tmp_path, pattern)
+
+
+def test_a_pattern_searches_a_million_files_at_most(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(value_types, "_MOST_SEARCHED", 4)
+    (tmp_path / "day1" / "thermal").mkdir(parents=True)
+    for number in range(2):
+        (tmp_path / "day1" / "thermal" / f"{number}.jpg").touch()
+    for pattern in ("**/*.jpg", "*/*/*.jpg", f"{tmp_path}/**/*.jpg", "day1/thermal/*.jpg"):
+        value_types.check_pattern(tmp_path, pattern)
+        assert len(value_types.matching_files(tmp_path, pattern)) == 2
+    (tmp_path / "2.jpg").touch()
+    value_types.check_pattern(tmp_path, "day1/thermal/*.jpg")
+    with pytest.raises(PydanticCustomError, match=f"more than 4 files and folders in {tmp_path}; name the folder"):
+        value_types.check_pattern(tmp_path, "**/*.jpg")

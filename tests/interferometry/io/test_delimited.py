@@ -63,3 +63,19 @@ def test_a_line_of_more_columns_than_a_sheet_has_is_refused(tmp_path: Path) -> N
         read_grids(written(tmp_path, "time,x\n" + "1," * 100_000))
     (grid,) = read_grids(written(tmp_path, "x," * 16_383 + "x\n"))
     assert len(grid.rows[0][1]) == 16_384
+
+
+@pytest.mark.parametrize("line", ["\n", "\r\n", ",\n", "#\n", "1\r"])
+def test_a_million_lines_too_short_for_a_reading_are_refused_before_they_are_split(tmp_path, line):
+    path = tmp_path / "laser.csv"
+    path.write_bytes(b"cycle,direction,target\n" + 1_048_577 * line.encode())
+    with pytest.raises(
+        LaserFormatError, match=r"laser\.csv: 10485\d\d lines with nothing or fewer than 4 characters.*export it again"
+    ):
+        read_grids(path)
+
+
+def test_any_line_ends_count_the_same_lines(tmp_path):
+    path = tmp_path / "laser.csv"
+    path.write_bytes(b"a,b\r\n\r\n1,2\r3,4\n\n5,6")
+    assert read_grids(path)[0].rows == [(1, ["a", "b"]), (3, ["1", "2"]), (4, ["3", "4"]), (6, ["5", "6"])]
