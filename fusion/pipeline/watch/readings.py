@@ -1,7 +1,8 @@
 """Readings that arrive while a test runs: each cycle is given once, when the next one has begun.
 
 A table with one reading per line is read on from where it was read before. Any other file of readings is read again as a whole when it
-has grown, but never for more than a small share of the time.
+has changed, but never for more than a small share of the time. What cannot be read may just be being written, and is told when it stands
+still.
 """
 
 from __future__ import annotations
@@ -85,6 +86,8 @@ class ArrivingReadings:
     _context_cycles: set[int] = field(default_factory=set)
     _pending: Rows = field(default_factory=list)
     _size: int = -1
+    _changed: int = -1
+    _failed: tuple[int, int] = (-1, -1)
     _next_whole: float = -np.inf
     _last: int = 0
     _counted: int = 0
@@ -101,12 +104,14 @@ class ArrivingReadings:
             Whether the test is over: the last line need not have an end, and the last cycle is finished too.
         """
         try:
-            size = self.path.stat().st_size
-            if size == self._size and not final:
+            now = self.path.stat()
+            if (now.st_size, now.st_mtime_ns) == (self._size, self._changed) and not final:
                 return Arrived()
-            self._size = size
+            self._size, self._changed = now.st_size, now.st_mtime_ns
             return self._poll_whole(final=final) if self._last and not self._header else self._poll_lines(final=final)
-        except (OSError, InterferometryError) as error:
+        except InterferometryError as error:
+            return self._wait_until_still(error, final=final)
+        except OSError as error:
             return Arrived(faults=self._new([str(error)]))
 
     def _poll_lines(self, *, final: bool) -> Arrived:
@@ -215,6 +220,14 @@ class ArrivingReadings:
         if self._shorter or final:
             return Arrived(faults=self._new([f"{self.path}: {_SHORTER}"]))
         self._shorter, self._size = True, -1
+        return Arrived()
+
+    def _wait_until_still(self, error: InterferometryError, *, final: bool) -> Arrived:
+        """Look once more at a file that cannot be read; tell why where it has not changed since."""
+        found = self._size, self._changed
+        if found == self._failed or final:
+            return Arrived(faults=self._new([str(error)]))
+        self._failed, self._size = found, -1
         return Arrived()
 
     def _go_on(self) -> None:

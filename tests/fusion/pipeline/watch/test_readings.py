@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import os
 from pathlib import Path
 
+import openpyxl
 import pytest
 import xarray as xr
 
@@ -227,3 +229,35 @@ def test_a_file_that_is_short_when_the_test_is_over_is_told_at_once(tmp_path: Pa
     laser.poll()
     write_runs(path, 2)
     assert "has become shorter" in laser.poll(final=True).faults[0]
+
+
+def test_a_spreadsheet_caught_while_it_is_written_is_waited_for(tmp_path: Path) -> None:
+    """The saving program writes it in pieces: half of an archive is no spreadsheet, and is none that is damaged either."""
+    table = tmp_path / "laser.xlsx"
+    book = openpyxl.Workbook()
+    for row in [HEADER, *lines(range(3))]:
+        book.active.append(row.split(","))
+    book.save(table)
+    whole, path = table.read_bytes(), tmp_path / "watched.xlsx"
+    laser = ArrivingReadings(path, clock=lambda: 0.0)
+    for end in (500, 2000, 3000):
+        path.write_bytes(whole[:end])
+        caught = laser.poll()
+        assert (caught.readings, caught.cycles, caught.faults) == (0, None, ())
+    path.write_bytes(whole)
+    assert given([laser.poll()]) == [1, 2]
+    path.write_bytes(whole[:3000])
+    told = [laser.poll().faults for _ in range(4)]
+    assert [len(faults) for faults in told] == [0, 1, 0, 0] and "watched.xlsx" in told[1][0]
+
+
+def test_a_file_put_right_at_the_same_size_is_read_again(tmp_path: Path) -> None:
+    path = tmp_path / "laser.csv"
+    laser = ArrivingReadings(path, clock=lambda: 0.0)
+    write_runs(path, 4)
+    whole = path.read_text()
+    path.write_text(whole.replace("Position", "Whatever"))
+    os.utime(path, ns=(0, 0))
+    assert [len(laser.poll().faults) for _ in range(3)] == [0, 1, 0]
+    path.write_text(whole)
+    assert given([laser.poll()]) == [1, 2, 3]
