@@ -157,7 +157,7 @@ def evaluate_candidates(
     lags_s : sequence of float, s
         Time constants of the first-order lags.
     draws : int
-        Number of simulated series that set the thresholds (the whitened residuals of the series, block-permuted).
+        Number of simulated series that set the thresholds (the whitened residuals of the series, block-permuted), at least 19.
     checks : int
         Number of fresh simulated series (Gaussian innovations) on which the false alarm rate is measured.
     favour : mapping of str to float
@@ -368,7 +368,7 @@ def _draw(
 ) -> list[Array]:
     """The measured series, `draws` simulated with its permuted residuals, and `checks` with Gaussian ones, stacked."""
     longest = max(channel.values.size for channel in series)
-    orders = np.stack([_shuffle_blocks(longest, rng) for _ in range(draws)]) if draws else np.empty((0, longest), int)
+    orders = np.stack([_shuffle_blocks(longest, rng) for _ in range(draws)])
     stacks = []
     for channel, bank in zip(series, banks, strict=True):
         n = channel.values.size

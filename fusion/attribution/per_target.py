@@ -31,6 +31,8 @@ _TILE = 512
 _ROWS = 1000
 #: Relative variance of a value that is missing.
 _NO_WEIGHT = 1e8
+#: Largest share of the squares of a series that one temperature can explain: beyond it lies the single precision of the products.
+_MOST_EXPLAINED = 1.0 - 1e-6
 
 
 @dataclass(frozen=True)
@@ -245,7 +247,8 @@ class _Result:
 
     def finish(self, groups: Sequence[_Group]) -> Screening:
         """Turn shares of explained squares into likelihood ratios, and compare them with the maxima over all series."""
-        statistic = _log_ratio(self.share, self.freedom[:, None])
+        share = np.minimum(self.share, _MOST_EXPLAINED)
+        statistic = _log_ratio(share, self.freedom[:, None])
         shares = np.zeros((self._permutations, self.freedom.size))
         size = np.zeros(self.freedom.size)
         for group in groups:
@@ -253,18 +256,18 @@ class _Result:
             if self._permutations:
                 largest = self.maxima_of(group.rows).reshape(group.rows.size, self._permutations)
                 shares[:, group.rows] = largest.T
-        maxima = _log_ratio(shares, self.freedom[None, :])
+        maxima = _log_ratio(np.minimum(shares, _MOST_EXPLAINED), self.freedom[None, :])
         p_value = np.full(statistic.shape, np.nan, np.float32)
         if self._permutations:
             ordered = np.sort(maxima.max(axis=1))
             above = self._permutations - np.searchsorted(ordered, statistic, side="left")
             p_value = ((above + 1) / (self._permutations + 1)).astype(np.float32)
-        spread = np.sqrt((1.0 - self.share) * self.weight / (self.freedom - 1)[:, None]) * size[:, None]
+        spread = np.sqrt((1.0 - share) * self.weight / (self.freedom - 1)[:, None]) * size[:, None]
         return Screening(
             statistic.astype(np.float32), self.lag, self.coefficient, spread.astype(np.float32), maxima, p_value
         )
 
 
 def _log_ratio(share: Array | Array32, freedom: NDArray[np.int64]) -> Array:
-    """Likelihood ratios from shares of explained squares; a share of 1 is limited by the single precision of the products."""
-    return np.asarray(-freedom * np.log1p(-np.minimum(share, 1.0 - 1e-6)), float)
+    """Likelihood ratios from shares of explained squares."""
+    return np.asarray(-freedom * np.log1p(-share), float)

@@ -102,3 +102,88 @@ def test_permuted_residuals_stay_in_blocks_of_a_tenth_of_the_series(rng):
         broken = np.mean([np.count_nonzero(np.diff(order) % length != 1) for order in orders])
         # Poisson with mean 10, less the cut at the start and blocks that meet again: 9 to 10; the mean of 300 is known within 0.2.
         assert 8.0 < broken < 10.6
+
+
+def one_channel_of(cells, banks=1):
+    """Tallies by hand of one set: one channel, `cells` columns, `banks` simulated series."""
+    return module._Tally(1, cells, banks)
+
+
+def test_false_alarms_are_the_share_of_fresh_series_that_pass_in_any_row():
+    """Nineteen simulated maxima 1..19 give the threshold 19; of four fresh series one passes it in the first set, another in the second."""
+    cells, modes = module._Tally(2, 1, 23), module._Tally(2, 1, 23)
+    for tally in (cells, modes):
+        tally.maxima[:, :19] = np.arange(1.0, 20.0)
+        tally.statistic[:] = 10.0
+    cells.maxima[:, 19:] = [[18.0, 25.0, 3.0, 2.0], [1.0, 2.0, 3.0, 19.5]]
+    modes.maxima[:, 19:] = [[30.0, 25.0, 3.0, 2.0], [1.0, 2.0, 3.0, 2.0]]
+    candidates = {"cells": walks(np.random.default_rng(0), 1), "modes": walks(np.random.default_rng(0), 1)}
+    result = module._conclude(["common", "reversal"], [cells, modes], candidates, {}, [], 19, 4)
+    assert result.sets["cells"].threshold == pytest.approx([19.0, 19.0])
+    assert [result.sets[name].false_alarm_rate for name in ("cells", "modes")] == [0.5, 0.5]
+    assert result.false_alarm_rate == 0.75
+    assert result.sets["modes"].p_value.tolist() == [[11 / 20], [11 / 20]]
+
+
+def test_the_detection_limit_is_the_threshold_and_the_quantile_of_80_percent_power():
+    """Threshold 9, standard uncertainty 0.5 um/K: (3 + 0.84) 0.5 um/K is found four times of five."""
+    tally = one_channel_of(2)
+    tally.effects[2] = [0.5, 2.0]
+    test = tally.finish(["common"], np.ones((1, 2)), np.array([9.0]), 0.0)
+    np.testing.assert_allclose(test.detectable, [[0.5 * 3.8416, 2.0 * 3.8416]])
+
+
+def test_false_discovery_rates_follow_benjamini_and_hochberg():
+    """Of 99 pooled values 49 reach the statistic 1, 4 the statistic 2, and none 3: p = 0.5, 0.05, 0.01."""
+    counts = np.zeros(module._BINS.size - 1)
+    counts[[0, 12, 21]] = [50, 45, 4]
+    q = module._false_discovery(np.array([1.0, 3.0, 2.0]), counts)
+    np.testing.assert_allclose(q, [0.5, 3 * 0.01, 1.5 * 0.05])
+    # A smaller p-value never has the larger q-value: 3 of 4 columns at p = 0.05 pull the fourth down with them.
+    np.testing.assert_allclose(module._false_discovery(np.array([2.0, 2.0, 2.0, 2.1]), counts), 0.05)
+
+
+def test_simulated_values_are_pooled_in_tenths_without_the_measured_one():
+    tally = one_channel_of(2, 3)
+    best = np.array([[9.0, 9.0], [0.05, 0.31], [0.35, 39.7], [0.05, 400.0]], np.float32)
+    tally.add(0, slice(0, 2), module._Channel(best, np.array([1, 0]), np.ones((3, 2))))
+    assert tally.pooled[0].sum() == 6
+    assert {int(k): int(tally.pooled[0, k]) for k in np.flatnonzero(tally.pooled[0])} == {0: 2, 3: 2, 397: 1, 399: 1}
+    assert tally.maxima[0].tolist() == [np.float32(0.31), np.float32(39.7), 400.0]
+    assert tally.statistic.tolist() == [[9.0, 9.0]] and tally.lag_index.tolist() == [[1, 0]]
+
+
+def test_the_width_of_a_tile_changes_nothing_and_progress_reaches_the_end(rng, monkeypatch):
+    candidates = {"cells": walks(rng, 7), "modes": walks(rng, 2)}
+    values = np.cumsum(rng.standard_normal(60))
+    whole = evaluate(np.random.default_rng(3), values, candidates).sets
+    done: list[float] = []
+    monkeypatch.setattr(
+        module, "tiles", lambda columns, group: [slice(k, min(k + 4, columns)) for k in range(0, columns, 4)]
+    )
+    parts = evaluate(np.random.default_rng(3), values, candidates, progress=done.append).sets
+    np.testing.assert_allclose(done, np.array([2, 4, 6, 7, 9]) / 9)
+    for name, test in whole.items():
+        # Single precision of the products.
+        np.testing.assert_allclose(parts[name].statistic, test.statistic, atol=1e-4)
+        np.testing.assert_allclose(parts[name].coefficient, test.coefficient, rtol=1e-4)
+        assert parts[name].p_value.tolist() == test.p_value.tolist()
+
+
+def test_a_series_with_a_missing_reading_is_permuted_as_the_others(rng, monkeypatch):
+    """What two series share stays shared: the shorter one takes the same order, without the place that it lacks."""
+    asked = []
+
+    def resampled(bank, orders, *, rng, gaussian=False):
+        asked.append((gaussian, np.array(orders)))
+        return np.zeros(orders.shape)
+
+    monkeypatch.setattr(module, "resample", resampled)
+    series = [drift("common", np.zeros(60)), drift("reversal", np.zeros(59))]
+    stacks = module._draw(series, [None, None], 5, 2, rng)
+    assert [stack.shape for stack in stacks] == [(8, 60), (8, 59)]
+    (long, short) = (orders for gaussian, orders in asked if not gaussian)
+    assert long.shape == (5, 60) and short.shape == (5, 59)
+    for one, other in zip(long, short, strict=True):
+        assert one[one != 59].tolist() == other.tolist()
+    assert [orders.shape for gaussian, orders in asked if gaussian] == [(2, 60), (2, 59)]

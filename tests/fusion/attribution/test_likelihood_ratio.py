@@ -13,6 +13,7 @@ from fusion.attribution.likelihood_ratio import (
     resample,
     tiles,
     whiten_series,
+    whitening_grid,
 )
 
 
@@ -101,7 +102,7 @@ def test_tiles_cover_all_columns_once_in_whole_groups():
     covered = np.zeros(6006, int)
     for tile in tiles(6006, 6):
         covered[tile] += 1
-        assert tile.start % 6 == 0
+        assert tile.start % 6 == 0 and tile.stop - tile.start <= 512
     assert (covered == 1).all()
 
 
@@ -141,3 +142,39 @@ def test_what_the_nuisance_regressors_took_out_is_put_back_at_random(rng):
     residual = point.project @ bank.values
     # The mean square of 800 normal numbers is known to 5 %; 4 sigma.
     assert np.mean(along**2) == pytest.approx(residual @ residual / bank.freedom, rel=0.2)
+
+
+def test_the_grid_reaches_from_no_drift_to_drifts_that_hide_every_source():
+    """Walks of 0.1 to 219 and integrated walks of 0.1 to 1968 standard deviations of the noise an hour, in steps of three."""
+    seconds = np.arange(20) * 300.0
+    grid = whitening_grid(seconds, np.ones(20), np.ones((20, 1)))
+    steps = [(one.order, one.per_hour) for one in grid.whitenings]
+    assert steps[0] == (0, 0.0)
+    assert steps[1:9] == [(1, pytest.approx(0.1 * 3**k)) for k in range(8)]
+    assert steps[9:] == [(2, pytest.approx(0.1 * 3**k)) for k in range(10)]
+    assert len(whitening_grid(seconds, np.ones(20), np.ones((20, 1)), integrated=False).whitenings) == 9
+
+
+def test_the_noise_of_a_white_series_is_its_root_mean_square_in_any_unit(rng):
+    """Without drift and regressors sigma is the rms, whatever relative variance the values share; simulated noise has that size."""
+    values = rng.standard_normal(400)
+    seconds = np.arange(400) * 10.0
+    for variance in (1.0, 9.0):
+        bank = null_bank(values, seconds, np.full(400, variance), np.empty((400, 0)), integrated=False)
+        assert bank.fitted.order == 0 and bank.freedom == 400
+        assert bank.sigma == pytest.approx(np.sqrt(np.mean(values**2)))
+    drawn = resample(with_odds(bank, {0: 1.0}), np.zeros((50, 400), int), rng=rng, gaussian=True)
+    # 20,000 normal values: 4 standard deviations of their root mean square are 2 %; none beyond 6 sigma, as a ratio of normals has.
+    assert np.sqrt(np.mean(drawn**2)) == pytest.approx(bank.sigma, rel=0.02)
+    assert np.abs(drawn).max() < 6 * bank.sigma
+
+
+def test_the_unit_of_the_readings_changes_no_likelihood_ratio(problem):
+    seconds, values, nuisance, regressors = problem
+
+    def ratios(unit):
+        bank = null_bank(values * unit, seconds, np.full(40, unit**2), nuisance)
+        return likelihood_ratios(bank, whiten_series(bank, unit * values[None, :]), regressors)
+
+    np.testing.assert_allclose(ratios(1e4), ratios(1.0), atol=1e-3)
+    np.testing.assert_allclose(ratios(1e-4), ratios(1.0), atol=1e-3)

@@ -39,7 +39,7 @@ def test_each_source_is_listed_once_with_what_both_sessions_show(first):
     second = maps_of(simulator.driven_session(np.random.default_rng(9), source=0))
     sources = compare_sessions(first, second).sources
     (cause,) = [one for one in sources if one.cause]
-    assert cause.shown_by == (0, 1)
+    assert cause.shown_by == (0, 1) and cause.power is None
     assert simulator.distance_cells(cause.y_mm / 10 - 0.5, cause.x_mm / 10 - 0.5, 0) <= 5
     assert max(cause.p_value) <= 0.05
     # 3 um per 3 K at the source, common and stretch together at the far end: 2 um/K.
@@ -53,6 +53,8 @@ def test_a_source_of_one_session_is_listed_as_its_own(first):
     assert {one.shown_by for one in alone} == {(0,)}
     assert min(simulator.distance_cells(one.y_mm / 10 - 0.5, one.x_mm / 10 - 0.5, 0) for one in alone) <= 5
     assert all(one.p_value[0] <= 0.05 < one.p_value[1] for one in alone)
+    # The second session would have shown the leading one: its silence means something.
+    assert alone[0].power > 0.99 and all(0.0 <= one.power <= 1.0 for one in alone)
 
 
 def test_what_only_one_session_shows_is_not(first):
@@ -90,6 +92,8 @@ def test_other_channels_are_refused(first):
         ({}, True),
         ({"sensitivity": -2.0}, False),
         ({"p_value": 0.06}, False),
+        ({"p_value": 0.05}, True),
+        ({"x": 100.0 + 30.0, "y": 50.0 - 40.0}, True),
         ({"sensitivity": 2.0 + 2.9 * np.hypot(0.3, 0.4)}, True),
         ({"sensitivity": 2.0 + 3.1 * np.hypot(0.3, 0.4)}, False),
         ({"x": 100.0 + 49.0}, True),
@@ -129,10 +133,97 @@ def test_a_place_on_which_both_agree_is_told_apart_from_its_neighbour():
     plan = xr.Dataset(coords={"y": np.arange(5.0, 200.0, 10.0), "x": np.arange(5.0, 500.0, 10.0)})
     pair = SimpleNamespace(at=lambda name, row, column: (row, column))
     alone = module._source_at(pair, "joint", (405.0, 95.0), (9, 40), (0,), True)
-    agreed = module.ChannelAgreement("joint", "attributable", 330.0, 95.0, 0.004, (4.0, 5.8), (0.0, 0.0), "")
+    agreed = module.ChannelAgreement("joint", "attributable", 345.0, 140.0, 0.004, (4.0, 5.8), (0.0, 0.0), "")
     first, second = module._tell_apart([alone], [agreed], plan, {"joint": pair})
-    assert (second.x_mm, second.agrees, second.cause, second.shown_by) == (330.0, True, False, (0, 1))
-    assert first.agreed_near_mm == (330.0, 95.0, 75.0) and not first.agrees
+    assert (second.x_mm, second.agrees, second.cause, second.shown_by) == (345.0, True, False, (0, 1))
+    assert first.agreed_near_mm == (345.0, 140.0, 75.0) and not first.agrees
     # A cause at that place already, be it in another part of the drift, is not listed a second time.
     cause = module._source_at(pair, "common", (345.0, 95.0), (9, 34), (0, 1), True)
     assert module._tell_apart([cause], [agreed], plan, {"joint": pair}) == [cause]
+    # A cause elsewhere hides nothing.
+    far = module._source_at(pair, "common", (290.0, 140.0), (13, 29), (0, 1), True)
+    assert [one.x_mm for one in module._tell_apart([far], [agreed], plan, {"joint": pair})] == [290.0, 345.0]
+
+
+def session_by_hand(mode_statistic=30.0):
+    """One channel, threshold 10; cells of 10 mm, one of them never seen; one thermal mode, threshold 20, with its peak in cell (1, 2)."""
+    statistic = np.full((3, 4), 2.0)
+    statistic[0, 0] = np.nan
+    dims = ("channel", "y", "x")
+    cells = {
+        "statistic": (dims, statistic[None]),
+        "p_value": (dims, 0.25 * statistic[None]),
+        "sensitivity": (dims, 0.05 * statistic[None]),
+        "sensitivity_u": (dims, 0.1 * statistic[None]),
+        "lag": (dims, 300.0 * statistic[None]),
+        "threshold": ("channel", [10.0]),
+    }
+    of_mode = {
+        "statistic": mode_statistic,
+        "p_value": 0.01,
+        "sensitivity": 3.0,
+        "sensitivity_u": 0.4,
+        "lag": 1200.0,
+        "threshold": 20.0,
+    }
+    modes = {name: (("channel", "mode"), [[value]]) for name, value in of_mode.items()}
+    places = {"at_x": ("mode", [26.0]), "at_y": ("mode", [14.0])}
+    plan = xr.Dataset(cells, {"channel": ["joint"], "y": [5.0, 15.0, 25.0], "x": [5.0, 15.0, 25.0, 35.0]})
+    return xr.DataTree(plan, children={"modes": xr.DataTree(xr.Dataset(modes | places, {"channel": ["joint"]}))})
+
+
+def test_the_candidate_of_a_cell_is_itself_or_the_mode_that_has_its_peak_there():
+    found = module._candidates(session_by_hand(), "joint")
+    assert found["statistic"].tolist() == [[-0.1, 0.2, 0.2, 0.2], [0.2, 0.2, 1.5, 0.2], [0.2, 0.2, 0.2, 0.2]]
+    assert [float(found[name][1, 2]) for name in ("p_value", "sensitivity", "sensitivity_u", "lag")] == [
+        0.01,
+        3.0,
+        0.4,
+        1200.0,
+    ]
+    assert (found["p_value"][0, 0], found["sensitivity"][0, 0], found["sensitivity_u"][0, 0]) == (1.0, 0.0, np.inf)
+    assert (found["x"][1, 2], found["y"][1, 2]) == (25.0, 15.0)
+    # A mode below its threshold by more than the cell is leaves the cell as it is.
+    assert module._candidates(session_by_hand(3.0), "joint")["p_value"][1, 2] == 0.5
+
+
+def test_a_candidate_is_seen_from_every_cell_within_reach_and_from_no_other():
+    statistic = np.zeros((7, 8))
+    statistic[3, 4] = 5.0
+    statistic[0, 0] = 1.0
+    row, column = np.mgrid[:7, :8]
+    blank = {name: np.zeros((7, 8)) for name in ("p_value", "sensitivity", "sensitivity_u", "lag")}
+    found = module._strongest_nearby({"statistic": statistic, "x": column, "y": row, **blank}, 2)
+    near = np.hypot(row - 3, column - 4) <= 2
+    assert ((found["statistic"] == 5.0) == near).all()
+    assert (found["x"][near] == 4).all() and (found["y"][near] == 3).all()
+    assert found["statistic"][0, 2] == found["statistic"][1, 1] == 1.0 and found["statistic"][1, 2] == 0.0
+
+
+def test_two_sizes_at_one_place_are_told_with_both_values():
+    common = {"statistic": 2.0, "p_value": 0.01, "sensitivity_u": 0.1, "lag": 0.0, "x": 100.0, "y": 50.0}
+    pair = module._Pair(
+        *(
+            {name: np.full((1, 1), value) for name, value in {**common, "sensitivity": one}.items()}
+            for one in (1.0, 2.5)
+        )
+    )
+    told = module._conclude("joint", pair, True)
+    assert told.verdict == "not attributable" and "+1.00 and +2.50 µm/K" in told.reason
+
+
+def test_agreement_goes_before_strength_and_is_where_the_weaker_session_is_strongest():
+    """Cells: both strong but of unlike size; agreement (5, 2); agreement (3, 4)."""
+    shared = {
+        "p_value": [0.01] * 3,
+        "sensitivity_u": [0.1] * 3,
+        "lag": [0.0] * 3,
+        "x": [5.0, 15.0, 25.0],
+        "y": [5.0] * 3,
+    }
+    one = shared | {"statistic": [9.0, 5.0, 3.0], "sensitivity": [1.0, 1.0, 1.0]}
+    other = shared | {"statistic": [9.0, 2.0, 4.0], "sensitivity": [3.0, 1.0, 1.0], "x": [5.0, 15.0, 35.0]}
+    told = module._conclude(
+        "joint", module._Pair(*({k: np.array([v]) for k, v in side.items()} for side in (one, other))), True
+    )
+    assert (told.verdict, told.x_mm, told.sensitivity_um_per_K) == ("attributable", 30.0, (1.0, 1.0))
