@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from interferometry.drift.gls import estimate, fit_fixed_effects, settling_noise_scale
+from interferometry.drift.gls import (
+    average_drift,
+    estimate,
+    fit_fixed_effects,
+    settling_noise_scale,
+    von_neumann_p_value,
+)
 from interferometry.drift.state_space import DriftModelError, drift_system, start_columns
 
 POSITIONS = np.r_[np.arange(16), np.arange(15, -1, -1)]
@@ -132,6 +138,37 @@ def test_a_robust_fit_is_not_moved_by_gross_outliers(rng):
 
     # 40 of 1920 readings carry no information any more: 1 % more spread than the clean fit's 0.4 / sqrt(120) um.
     assert error(robust) < 0.02 < error(plain)
+
+
+@pytest.mark.parametrize(("order", "ratios"), [(1, [0.01, 0.02]), (2, [1e-6, 3e-6])])
+def test_the_average_of_the_drift_and_its_covariance_are_those_of_dense_algebra(rng, order, ratios):
+    """Two drifts at once, some readings held out, some without weight in the average."""
+    seconds, loadings, y = readings(rng, 30)
+    observed = rng.random(30) < 0.8
+    weights = np.where(rng.random(30) < 0.5, rng.uniform(0.5, 1.0, 30), 0.0)
+    weights /= weights.sum()
+    system = drift_system(seconds, loadings, order=order, ratios=ratios, observed=observed)
+    average, covariance, with_drift = average_drift(system, weights, y[:, None])
+
+    _, total = dense_covariance(seconds, loadings, order, ratios, np.ones(30))
+    gain = np.zeros((30, 30))
+    gain[np.ix_(observed, observed)] = np.linalg.inv(total[np.ix_(observed, observed)])
+    each = [dense_covariance(seconds, np.ones((30, 1)), order, [ratio], np.ones(30))[0] for ratio in ratios]
+    seen = [walk * column for walk, column in zip(each, loadings.T, strict=True)]
+    np.testing.assert_allclose(average[:, 0], [weights @ one @ gain @ y for one in seen], atol=1e-9)
+    left = [[(each[c] if c == i else 0.0) - seen[c] @ gain @ seen[i].T for i in (0, 1)] for c in (0, 1)]
+    np.testing.assert_allclose(covariance, [[weights @ one @ weights for one in row] for row in left], atol=1e-9)
+    np.testing.assert_allclose(
+        with_drift, np.transpose([[one @ weights for one in row] for row in left], (2, 0, 1)), atol=1e-9
+    )
+
+
+def test_the_von_neumann_ratio_tells_a_trend_from_alternation_and_needs_eight_values():
+    """A trend of eight values has the ratio 7 / 42; its distance from 2, in standard deviations of sqrt(24 / 63), is 2.97."""
+    assert von_neumann_p_value(np.arange(8.0)) == pytest.approx(0.00149, abs=5e-6)
+    assert von_neumann_p_value(100.0 + 5.0 * np.arange(8.0)) == pytest.approx(0.00149, abs=5e-6)
+    assert von_neumann_p_value(np.tile([1.0, -1.0], 4)) == pytest.approx(0.99246, abs=5e-6)
+    assert von_neumann_p_value(np.arange(7.0)) == von_neumann_p_value(np.full(20, 3.0)) == 1.0
 
 
 @pytest.mark.parametrize(

@@ -79,6 +79,19 @@ def test_definitions_by_hand(rng: np.random.Generator) -> None:
     assert float(result["mean_reversal"]) == pytest.approx(float((x[:, 0] - x[:, 1]).mean()))
 
 
+def test_two_cycles_by_hand() -> None:
+    """Readings of 0 and 2 um forward and 5 and 6 um backward at the second position: s of 1.41 and 0.71 um."""
+    result = evaluate_iso230(test_made(np.array([[[0.0, 0.0], [0.0, 5.0]], [[0.0, 2.0], [0.0, 6.0]]])))
+    root = np.sqrt(2.0)
+    np.testing.assert_allclose(result["standard_deviation"], [[0.0, root], [0.0, root / 2]])
+    np.testing.assert_allclose(result["repeatability"], [[0.0, 4 * root], [0.0, 2 * root]])
+    np.testing.assert_allclose(result["mean_bidirectional"], [0.0, 3.25])
+    np.testing.assert_allclose(result["repeatability_bidirectional"], [0.0, 2 * root + root + 4.5])
+    assert {name: float(result[name]) for name in "BREMA"} == pytest.approx(
+        {"B": 4.5, "R": 3 * root + 4.5, "E": 5.5, "M": 3.25, "A": 4.5 + 3 * root}
+    )
+
+
 def test_one_direction_has_no_bidirectional_quantity(rng: np.random.Generator) -> None:
     x = rng.normal(0, 1, (5, 2, 4))
     x[:, 1] = np.nan
@@ -114,6 +127,9 @@ def test_windows_that_cannot_be_evaluated_are_refused(rng: np.random.Generator) 
         ValueError, match="no target has two readings from one side in a window of one cycle; ISO 230-2"
     ):
         evaluate_iso230(test, cycles=[5])
+    one_way = test_made(np.where(np.arange(2)[:, None] == 0, test["deviation"].values, np.nan))
+    with pytest.raises(ValueError, match="no target has two readings from one side in a window of one cycle"):
+        evaluate_iso230(one_way, cycles=[5])
 
 
 def test_short_tests_and_empty_windows_have_the_windows_that_can_be_evaluated(rng: np.random.Generator) -> None:
@@ -145,6 +161,16 @@ def test_the_reversal_error_that_scatter_alone_gives_is_met_by_half_of_such_test
     assert np.isnan(evaluate_iso230(test_made(one_sided))["B_of_scatter"])
 
 
+def test_the_reversal_error_of_scatter_at_one_position_is_the_quartile_of_the_normal_distribution() -> None:
+    """Five readings with s = 1 um from either side: means differ by 0.63 um (k = 1), in half of the tests by more than 0.67 times that."""
+    x = np.repeat(np.array([-1.0, -1.0, 0.0, 1.0, 1.0])[:, None, None], 2, axis=1)
+    assert float(evaluate_iso230(test_made(x))["B_of_scatter"]) == pytest.approx(0.67449 * np.sqrt(2 / 5), rel=1e-5)
+    # Of two positions the larger one counts: (2 Phi(q) - 1)^2 = 1/2 at q = 1.0518.
+    assert float(evaluate_iso230(test_made(np.repeat(x, 2, axis=2)))["B_of_scatter"]) == pytest.approx(
+        1.05180 * np.sqrt(2 / 5), rel=1e-4
+    )
+
+
 def test_the_settled_window_is_that_of_the_second_half_whose_drift_varies_least() -> None:
     rng = np.random.default_rng(5)
     test = test_made(rng.normal(0.0, 0.5, (40, 2, 4)))
@@ -154,11 +180,14 @@ def test_the_settled_window_is_that_of_the_second_half_whose_drift_varies_least(
     drift[30:35], drift[0:5] = 30.0, 0.0
     windows = evaluate_windows(test, drift=drift)
     chosen = settled_window(windows)
-    assert windows["first_cycle"].values[chosen], windows["last_cycle"].values[chosen] == (31, 35)
+    assert (int(windows["first_cycle"][chosen]), int(windows["last_cycle"][chosen])) == (31, 35)
     assert float(windows["drift_variation"][chosen]) == 0.0
     assert float(windows["drift_variation"][1]) == pytest.approx(np.std(np.arange(5.0), ddof=1))
     assert settled_window(evaluate_windows(test)) == 7
     assert settled_window(evaluate_windows(test.isel(cycle=slice(0, 4)))) == 0
+    # Readings in the first half only: the last window of them.
+    test["deviation"][15:] = np.nan
+    assert settled_window(evaluate_windows(test)) == 2
 
 
 def test_the_drift_and_the_temperature_of_a_window_enter_its_budget() -> None:

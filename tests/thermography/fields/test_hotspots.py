@@ -5,6 +5,7 @@ import pytest
 import xarray as xr
 
 from thermography.errors import ThermographyError
+from thermography.fields import hotspots as module
 from thermography.fields.hotspots import detect_hotspots
 
 X = np.arange(140) * 5.0 + 2.5
@@ -72,3 +73,52 @@ def test_a_second_peak_within_six_standard_deviations_of_the_noise_is_none(rng):
     for height, found in ((0.01, 1), (0.3, 2)):
         field = plane((500.0, 90.0, 1.0, 30.0), (200.0, 90.0, height, 15.0)) + noise
         assert len(detect_hotspots(field, least_prominence_K=0.0)) == found, height
+
+
+def test_the_zone_of_a_peak_is_that_above_half_its_height_to_the_edges_of_its_cells():
+    """A Gaussian of 30 mm, smoothed by a cell of 5 mm, falls to half within 35.8 mm: seven cells to either side of that of the peak."""
+    (spot,) = detect_hotspots(plane((202.5, 92.5, 3.0, 30.0)))
+    assert spot.extent_mm == (165.0, 240.0, 55.0, 130.0)
+    assert (spot.centroid_x_mm, spot.centroid_y_mm) == pytest.approx((202.5, 92.5))
+    assert spot.x_mm == pytest.approx(202.5) and spot.y_mm == pytest.approx(92.5)
+
+
+def test_the_vertex_of_an_oblique_paraboloid_is_exact():
+    row, column = np.mgrid[:9, :11]
+    u, v = column - 5.3, row - 3.6
+    values = 4.0 - 0.2 * u**2 - 0.3 * v**2 + 0.15 * u * v
+    assert module._vertex(values, values, (4, 5)) == pytest.approx((5.3, 3.6, 4.0))
+    # At the border of the plan the fit takes the cells that there are.
+    assert module._vertex(values[:6, :7], values[:6, :7], (4, 5)) == pytest.approx((5.3, 3.6, 4.0))
+    # A ridge has no vertex: the cell itself.
+    ridge = -0.3 * v**2
+    assert module._vertex(ridge, ridge, (4, 5))[:2] == (5.0, 4.0)
+
+
+def test_the_prominence_of_a_peak_counts_from_the_saddle_to_a_higher_one():
+    field = np.zeros((3, 9))
+    field[1] = [0.0, 2.0, 5.0, 3.0, 4.0, 9.0, 6.0, 8.0, 1.0]
+    assert module._saddle(field, (1, 2), 0.0) == 3.0
+    assert module._saddle(field, (1, 7), 0.0) == 6.0
+    assert module._saddle(field, (1, 5), 0.0) == 0.0
+    # Cells that touch at a corner are connected.
+    corner = np.array([[7.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 6.0]])
+    assert module._saddle(corner, (2, 2), 0.0) == 4.0
+
+
+def test_a_ripple_below_the_least_prominence_is_no_hotspot_on_a_warm_table():
+    assert detect_hotspots(plane((202.5, 92.5, 0.09, 30.0)) + 20.0) == []
+    (spot,) = detect_hotspots(plane((202.5, 92.5, 0.12, 30.0)) + 20.0)
+    assert spot.prominence_K == pytest.approx(0.12, rel=0.05) and spot.peak_rise_K == pytest.approx(20.12, rel=1e-3)
+
+
+def test_the_maximum_in_a_corner_of_the_plan_is_found_there():
+    slope = plane(slope=0.01)
+    (spot,) = detect_hotspots(slope + 0.02 * slope["y"])
+    assert (spot.x_mm, spot.y_mm, spot.at_edge) == (697.5, 177.5, True)
+
+
+def test_the_most_prominent_come_first_and_no_more_than_asked_for():
+    field = plane((120.0, 90.0, 1.0, 20.0), (350.0, 90.0, 3.0, 20.0), (580.0, 90.0, 2.0, 20.0))
+    assert [round(spot.x_mm) for spot in detect_hotspots(field)] == [350, 580, 120]
+    assert [round(spot.x_mm) for spot in detect_hotspots(field, limit=2)] == [350, 580]

@@ -33,7 +33,8 @@ def test_logged_conditions_are_interpolated_to_each_frame_and_win() -> None:
 def test_a_log_is_not_extrapolated() -> None:
     air = ParameterLog(TIMES.astype("datetime64[ns]"), np.array([293.0, 295.0, 294.0]))
     with pytest.raises(
-        RadiometryError, match=r"frame at 2026-03-09T06:38:48\.125: the log reaches from .* only; extend it"
+        RadiometryError,
+        match=r"frame at 2026-03-09T06:38:48\.125: the log reaches from 2026-03-09T06:33:47\S* to 2026-03-09T06:38:47\S* only; extend it",
     ):
         Overrides(logs={"atmospheric_temperature_K": air})(frame(seconds=301))
 
@@ -44,11 +45,22 @@ def test_a_log_is_not_extrapolated() -> None:
         (TIMES, [1.0, 2.0], r"expected as many times as values, got \(3,\) and \(2,\)"),
         (TIMES[::-1], [1.0, 2.0, 3.0], "expected increasing times and finite values; sort the log and remove gaps"),
         (TIMES, [1.0, np.nan, 3.0], "expected increasing times and finite values"),
+        (TIMES[[0, 1, 1]], [1.0, 2.0, 3.0], "expected increasing times and finite values"),
+        (TIMES[:2], [1.0, 2.0, 3.0], r"expected as many times as values, got \(2,\) and \(3,\)"),
+        (TIMES[None], [[1.0, 2.0, 3.0]], r"expected as many times as values, got \(1, 3\) and \(1, 3\)"),
+        (TIMES[:0], [], r"expected as many times as values, got \(0,\) and \(0,\)"),
     ],
 )
 def test_a_broken_log_is_refused(times: np.ndarray, values: list[float], message: str) -> None:
     with pytest.raises(RadiometryError, match=message):
         ParameterLog(times, np.array(values))
+
+
+def test_a_log_of_one_reading_holds_at_its_instant_alone() -> None:
+    air = ParameterLog(TIMES[:1], np.array([293.0]))
+    assert air.interpolate(TIMES[0]) == 293.0
+    with pytest.raises(RadiometryError, match="only; extend it"):
+        air.interpolate(TIMES[1])
 
 
 def test_an_unknown_parameter_is_refused() -> None:

@@ -218,7 +218,9 @@ def test_constants_of_the_air_that_give_no_transmission_are_refused_unless_one_i
 
 
 def test_a_window_that_is_not_there_needs_no_temperature() -> None:
-    check_parameters(replace(PARAMETERS, window_temperature_K=0.0))
+    without = replace(PARAMETERS, window_temperature_K=0.0)
+    check_parameters(without)
+    assert temperature_from_counts(18000, without) == temperature_from_counts(18000, PARAMETERS)
     with pytest.raises(RadiometryError, match="window_temperature_K = 0"):
         check_parameters(replace(PARAMETERS, window_temperature_K=0.0, window_transmission=0.9))
 
@@ -232,3 +234,7 @@ def test_unknown_names_averages_and_wild_emissivities_are_refused() -> None:
         calibrate(np.array([18000.5]), PARAMETERS)  # type: ignore[arg-type]
     with pytest.raises(RadiometryError, match=r"emissivity from 0 to 0\.5: expected fractions above 0 and up to 1"):
         temperature_from_counts(18000, PARAMETERS, emissivity=[0.0, 0.5])
+    with pytest.raises(RadiometryError, match=r"emissivity from 0\.5 to 1\.01: expected fractions above 0 and up to 1"):
+        temperature_from_counts(18000, PARAMETERS, emissivity=[0.5, 1.01])
+    with pytest.raises(RadiometryError, match="counts: expected uint16, got uint8"):
+        calibrate(np.array([180], np.uint8), PARAMETERS)  # type: ignore[arg-type]
