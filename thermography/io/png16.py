@@ -167,8 +167,11 @@ def _undo_paeth(line: Array, above: Array, out: Array, shift: int) -> None:  # p
 
 @njit(cache=True, nogil=True, inline="always")
 def _paeth(left: np.int32, up: np.int32, corner: np.int32) -> np.int32:  # pragma: no cover - compiled
-    """Of equally near ones the left one, then the one above."""
-    from_left, from_up = abs(up - corner), abs(left - corner)
-    from_corner = abs(left + up - 2 * corner)
-    predicted = up if from_up <= from_corner else corner
-    return left if from_left <= from_up and from_left <= from_corner else predicted
+    """Of left, up and corner the nearest to left + up - corner; of equally near ones the left one, then the one above.
+
+    The higher of left and up is nearest where 3 corner <= 2 lower + higher, the lower where 3 corner >= lower + 2 higher, else the corner:
+    fewer steps from pixel to pixel than by three distances.
+    """
+    lower, higher = min(left, up), max(left, up)
+    limit = 3 * corner - left - up
+    return higher if limit <= lower else (lower if higher <= limit else corner)

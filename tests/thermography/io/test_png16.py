@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import njit
 
 from thermography.io.fff_record import PNG_SIGNATURE
-from thermography.io.png16 import PngError, decode_png
+from thermography.io.png16 import PngError, _paeth, decode_png
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:
@@ -42,6 +43,27 @@ def test_random_lines_with_all_filters_equal_libpng(rows: int, columns: int, see
     decoded = decode_png(data, (rows, columns))
     np.testing.assert_array_equal(decoded, expected)
     assert decoded.dtype == np.uint16 and decoded.dtype.isnative and decoded.flags.writeable
+
+
+@njit
+def _differing_predictions() -> int:  # pragma: no cover - compiled
+    """Number of left, up and corner for which the prediction is not that of ISO/IEC 15948, 9.4."""
+    differing = 0
+    for left in range(256):
+        for up in range(256):
+            for corner in range(256):
+                from_left, from_up = abs(up - corner), abs(left - corner)
+                from_corner = abs(left + up - 2 * corner)
+                if from_left <= from_up and from_left <= from_corner:
+                    nearest = left
+                else:
+                    nearest = up if from_up <= from_corner else corner
+                differing += _paeth(np.int32(left), np.int32(up), np.int32(corner)) != nearest
+    return differing
+
+
+def test_the_prediction_of_filter_4_is_that_of_the_standard_for_all_bytes() -> None:
+    assert _differing_predictions() == 0
 
 
 def test_data_in_several_chunks_and_bytes_after_the_end_are_fine() -> None:
