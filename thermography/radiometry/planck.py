@@ -61,7 +61,8 @@ def calibrate(counts: NDArray[np.uint16], parameters: CameraParameters) -> NDArr
 
     Notes
     -----
-    Measurement formula of FLIR's user manuals; see the module docstring. The formula is evaluated once per occurring count.
+    Measurement formula of FLIR's user manuals; see the module docstring. The formula is evaluated once per count between the lowest and the highest
+    that occur; frames with the same parameters share these values.
 
     Examples
     --------
@@ -79,11 +80,43 @@ def calibrate(counts: NDArray[np.uint16], parameters: CameraParameters) -> NDArr
         )
     if counts.size == 0:
         return np.empty(counts.shape, np.float32)
-    low, high = int(counts.min()), int(counts.max())
-    table = np.empty(1 << 16, np.float32)
-    table[low : high + 1] = temperature_from_counts(np.arange(low, high + 1, dtype=np.float64), parameters)
+    table = _table(parameters).covering(int(counts.min()), int(counts.max()))
     temperature: NDArray[np.float32] = np.asarray(cv2.LUT(np.ascontiguousarray(counts).reshape(-1), table), np.float32)
     return temperature.reshape(counts.shape)
+
+
+class _Table:
+    """Temperatures of counts with one set of parameters, computed for the counts that occur; threads may share it.
+
+    Parameters
+    ----------
+    parameters : CameraParameters
+    """
+
+    def __init__(self, parameters: CameraParameters) -> None:
+        self.parameters = parameters
+        self.temperature = np.empty(1 << 16, np.float32)
+        # From the first one on, up to but without the second. Two threads may compute the same values twice, never leave one out.
+        self.known = (0, 0)
+
+    def covering(self, low: int, high: int) -> NDArray[np.float32]:
+        """Return temperatures by count, (65536,) degC, of which those from `low` to `high` are computed."""
+        start, stop = self.known
+        if start <= low <= high < stop:
+            return self.temperature
+        if start == stop:
+            start = stop = low
+        whole = min(start, low), max(stop, high + 1)
+        for first, end in ((whole[0], start), (stop, whole[1])):
+            if first < end:
+                counts = np.arange(first, end, dtype=np.float64)
+                self.temperature[first:end] = temperature_from_counts(counts, self.parameters)
+        self.known = whole
+        return self.temperature
+
+
+#: 256 kB each: the parameters of the last frames, which seldom differ.
+_table = lru_cache(maxsize=16)(_Table)
 
 
 def temperature_from_counts(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 
@@ -99,6 +100,20 @@ def test_calibrate_is_the_float64_formula_within_float32() -> None:
 def test_any_shape_and_stride_is_calibrated(view: tuple) -> None:
     counts = np.arange(18000, 18200, dtype=np.uint16).reshape(10, 20)
     np.testing.assert_array_equal(calibrate(counts[view], PARAMETERS), calibrate(counts, PARAMETERS)[view])
+
+
+def test_frames_that_share_their_parameters_give_the_same_bits_in_any_order_and_by_threads() -> None:
+    """A table of temperatures is shared and grows with the counts that occur; what it held before must not show."""
+    rng = np.random.default_rng(5)
+    edges = np.sort(rng.integers(0, 1 << 16, (60, 2)), axis=1)
+    frames = [rng.integers(low, high + 1, 50).astype(np.uint16) for low, high in edges]
+    frames.append(np.array([0, 65535], np.uint16))
+    ours = replace(PARAMETERS, emissivity=0.876)
+    alone = [temperature_from_counts(counts, ours).astype(np.float32) for counts in frames]
+    with ThreadPoolExecutor(4) as executor:
+        together = list(executor.map(calibrate, frames, [ours] * len(frames)))
+    for shared, single in zip(together, alone, strict=True):
+        assert shared.tobytes() == single.tobytes()
 
 
 def test_empty_counts_give_empty_temperature() -> None:
