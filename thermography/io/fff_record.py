@@ -74,6 +74,8 @@ class FffSource:
         Path of the file, for messages.
     segments : tuple of (offset, length)
         Segments of the record in their order, bytes in the file.
+    front : bytes, optional
+        First bytes of the record, read already.
 
     Attributes
     ----------
@@ -81,12 +83,14 @@ class FffSource:
         Length of the record, bytes.
     """
 
-    def __init__(self, file: BinaryIO, path: Path, segments: Segments) -> None:
-        self.file, self.path, self.segments = file, path, segments
+    def __init__(self, file: BinaryIO, path: Path, segments: Segments, front: bytes = b"") -> None:
+        self.file, self.path, self.segments, self.front = file, path, segments, front
         self.size = segments[0][1] if len(segments) == 1 else sum(length for _, length in segments)
 
     def read(self, offset: int, length: int) -> bytes:
         """Return `length` bytes from `offset` of the record, or fewer at its end."""
+        if offset + length <= len(self.front):
+            return self.front[offset : offset + length]
         if len(self.segments) == 1:
             start, available = self.segments[0]
             self.file.seek(start + offset)

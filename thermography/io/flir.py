@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 #: Frames are read together where the file has room for this number of them: fewer are read one by one before the code is loaded.
 FEWEST_FRAMES = 256
+#: Bytes read at once: the start of a file, where those of a JPEG hold all its headers in most cases, and between its segments.
+_FRONT, _WINDOW = 1 << 14, 1 << 10
 
 
 class FlirReader:
@@ -219,12 +221,14 @@ def index_sequence(
 
 def _walk(file: BinaryIO, path: Path) -> Iterator[FlirFrameReference | FrameTable | RejectedFrame]:
     """Yield the frames of one file in file order; damaged ones as `RejectedFrame`, those of a long sequence together."""
-    start = file.read(4)
-    if start[:2] == b"\xff\xd8":
-        source = FffSource(file, path, _jpeg_segments(file, path))
+    front = file.read(_FRONT)
+    if front[:2] == b"\xff\xd8":
+        segments = _jpeg_segments(file, path, front)
+        start, length = segments[0]
+        source = FffSource(file, path, segments, front[start : start + length])
         yield _reference(source, read_directory(source), 0)
         return
-    size = file.seek(0, os.SEEK_END)
+    start, size = front[:4], file.seek(0, os.SEEK_END)
     # The first header of a sequence may be damaged; a file without any header is no sequence.
     first = 0 if start == MAGIC else _find_header(file, 1, size)
     actual = start.hex(" ") or "an empty file"
@@ -340,17 +344,21 @@ def _find_header(file: BinaryIO, offset: int, size: int) -> int:
     return size
 
 
-def _jpeg_segments(file: BinaryIO, path: Path) -> Segments:
-    r"""Return the segments of the FFF record in a radiometric JPEG, in their order.
+def _jpeg_segments(file: BinaryIO, path: Path, front: bytes) -> Segments:
+    r"""Return the segments of the FFF record in a radiometric JPEG, whose first bytes are read already, in their order.
 
     Each APP1 segment holds `FLIR\0 01 index last` and up to 65524 bytes; the segments may come in any order.
     """
     pieces: dict[int, tuple[int, int]] = {}
     size = file.seek(0, os.SEEK_END)
-    last, offset = -1, 2
+    last, offset, window, begin = -1, 2, front, 0
     while True:
-        file.seek(offset)
-        head = file.read(12)
+        head = window[offset - begin : offset - begin + 12]
+        if len(head) < 12:
+            # Short segments stand close together behind the long ones.
+            file.seek(offset)
+            window, begin = file.read(_WINDOW), offset
+            head = window[:12]
         if len(head) < 4 or head[0] != 0xFF or head[1] in (0xD9, 0xDA):
             break
         if head[1] == 0xFF:
