@@ -18,7 +18,7 @@ from thermography.errors import ThermographyError
 from thermography.fields.cycle_fields import CyclePart, assemble_fields, position_covariance
 from thermography.fields.inputs import FrameSeries
 from thermography.fields.resampling import plan_weights
-from thermography.fields.scheduling import THREADS
+from thermography.fields.scheduling import usable_threads
 from thermography.io.atomic import write_atomically
 from thermography.io.frame import CameraParameters
 from thermography.radiometry.averaging import CountStatistics, MeanTemperature, mean_temperature
@@ -271,7 +271,7 @@ def recalibrate(
         part.finish(plan)
         return part
 
-    with ThreadPoolExecutor(THREADS) as executor:
+    with ThreadPoolExecutor(usable_threads()) as executor:
         parts = list(executor.map(calibrated, sorted(Path(folder).glob("frames_*.sums"))))
     if not parts:
         raise CheckpointError(f"{folder}: holds no finished cycle; reduce the frames first")

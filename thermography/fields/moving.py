@@ -109,7 +109,7 @@ def reduce_moving_frames(
     block_s : float, s
         Frames of one cycle within this time share one field of `frame_temperature`; 0 gives every frame its own.
     scheduler : str or None
-        Address of a dask scheduler whose workers see the same files; None for two threads.
+        Address of a dask scheduler whose workers see the same files; None for threads on the cores of this machine.
     checkpoint : str, Path or None
         Folder to which blocks are written as they are done; a run that finds it resumes at the first block that is missing.
     progress : callable or None

@@ -14,7 +14,7 @@ from scipy import ndimage, sparse
 
 from thermography._typing import Array
 from thermography.errors import ThermographyError
-from thermography.fields.scheduling import THREADS
+from thermography.fields.scheduling import usable_threads
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration
 
@@ -189,7 +189,7 @@ def _pieces(
     corners = registration.to_plan(np.stack([across, down], axis=-1))
     discs = np.array([(disc.x_mm, disc.y_mm, disc.diameter_mm / 2) for disc in registration.masked]).reshape(-1, 3)
     size = (grid.width_mm, grid.height_mm)
-    with ThreadPoolExecutor(THREADS) as executor:
+    with ThreadPoolExecutor(usable_threads()) as executor:
         halves = executor.map(
             lambda part: _cut_pixels(corners, part, discs, size, grid.cell_size_mm, margin_px),
             [(0, rows // 2), (rows // 2, rows)],

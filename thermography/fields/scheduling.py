@@ -19,14 +19,20 @@ if TYPE_CHECKING:
 
 Task = TypeVar("Task")
 
-#: Threads without a cluster: reading and the sums release the interpreter lock, and two keep a disk and a core busy.
-THREADS = 2
+#: Most threads without a cluster. Reading, decoding and the sums release the interpreter lock; a thread costs up to 12 MB.
+MOST_THREADS = 8
 #: Options of mallopt(3).
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 
 
 class SchedulerError(ThermographyError):
     """The cluster cannot be used; the message names its address and the remedy."""
+
+
+def usable_threads() -> int:
+    """Return the number of threads without a cluster: the cores that this process may use, up to `MOST_THREADS`."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, MOST_THREADS)
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,7 @@ def open_pool(scheduler: str | None = None) -> Iterator[Pool]:
     Parameters
     ----------
     scheduler : str or None
-        Address of a dask scheduler (``tcp://host:8786``) whose workers see the same files; None for two threads.
+        Address of a dask scheduler (``tcp://host:8786``) whose workers see the same files; None for threads.
 
     Yields
     ------
@@ -71,7 +77,7 @@ def open_pool(scheduler: str | None = None) -> Iterator[Pool]:
         dask.distributed is not installed, or no scheduler with workers answers at the address.
     """
     if scheduler is None:
-        threads = min(THREADS, os.cpu_count() or 1)
+        threads = usable_threads()
         with ThreadPoolExecutor(threads, "reduce") as executor:
             yield Pool(executor.submit, lambda shared: shared, threads + 1, lambda future: future.result())
         return

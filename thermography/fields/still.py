@@ -82,7 +82,7 @@ def reduce_frames(
     block_s : float, s
         Frames of one cycle within this time share one field of `frame_temperature`; 0 gives every frame its own.
     scheduler : str or None
-        Address of a dask scheduler whose workers see the same files; None for two threads.
+        Address of a dask scheduler whose workers see the same files; None for threads on the cores of this machine.
     checkpoint : str, Path or None
         Folder for finished cycles with their sums of counts. A run that finds it resumes there, also within a long cycle;
         `thermography.fields.checkpoint.recalibrate` calibrates the cycles again without the frames.
