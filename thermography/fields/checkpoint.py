@@ -18,9 +18,9 @@ from thermography.errors import ThermographyError
 from thermography.fields.cycle_fields import CyclePart, assemble_fields, position_covariance
 from thermography.fields.inputs import FrameSeries
 from thermography.fields.resampling import plan_weights
-from thermography.fields.scheduling import usable_threads
 from thermography.io.atomic import write_atomically
 from thermography.io.frame import CameraParameters
+from thermography.io.frame_index.by_threads import usable_threads
 from thermography.radiometry.averaging import CountStatistics, MeanTemperature, mean_temperature
 from thermography.registration.displacement import RegistrationSpan
 from thermography.registration.plan import PlanGrid

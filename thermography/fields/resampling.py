@@ -14,7 +14,7 @@ from scipy import ndimage, sparse
 
 from thermography._typing import Array
 from thermography.errors import ThermographyError
-from thermography.fields.scheduling import usable_threads
+from thermography.io.frame_index.by_threads import usable_threads
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration
 

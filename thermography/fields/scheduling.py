@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
@@ -13,26 +12,19 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from thermography.errors import ThermographyError
+from thermography.io.frame_index.by_threads import usable_threads
 
 if TYPE_CHECKING:
     from distributed import Client
 
 Task = TypeVar("Task")
 
-#: Most threads without a cluster. Reading, decoding and the sums release the interpreter lock; a thread costs up to 12 MB.
-MOST_THREADS = 8
 #: Options of mallopt(3).
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 
 
 class SchedulerError(ThermographyError):
     """The cluster cannot be used; the message names its address and the remedy."""
-
-
-def usable_threads() -> int:
-    """Return the number of threads without a cluster: the cores that this process may use, up to `MOST_THREADS`."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, MOST_THREADS)
 
 
 @dataclass(frozen=True)

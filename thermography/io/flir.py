@@ -25,6 +25,7 @@ from thermography.io.fff_record import (
     read_header,
 )
 from thermography.io.frame import FlirFormatError, Frame, FrameReference, RejectedFrame, Segments
+from thermography.io.frame_index.by_threads import call_by_threads, opening_threads
 from thermography.io.frame_index.flir_frame import FlirFrameReference
 from thermography.io.frame_index.frame_list import FrameList, FrameTable, order_by_time
 
@@ -152,15 +153,23 @@ def index_frames(
     """
     frames: list[FrameReference | FrameTable] = []
     rejected: list[RejectedFrame] = []
-    for path in map(Path, [paths] if isinstance(paths, str | os.PathLike) else paths):
-        try:
-            with path.open("rb", buffering=0) as file:
-                for result in _walk(file, path):
-                    (rejected if isinstance(result, RejectedFrame) else frames).append(result)  # type: ignore[arg-type]
-        except (OSError, FlirFormatError) as error:
-            rejected.append(RejectedFrame(path, 0, str(error)))
+    files = list(map(Path, [paths] if isinstance(paths, str | os.PathLike) else paths))
+    for results in call_by_threads(_index_file, files, opening_threads(files)):
+        for result in results:
+            (rejected if isinstance(result, RejectedFrame) else frames).append(result)  # type: ignore[arg-type]
     kept, repeated = order_by_time(frames)
     return kept, rejected + repeated
+
+
+def _index_file(path: Path) -> list[FlirFrameReference | FrameTable | RejectedFrame]:
+    """List the frames of one file in its order; the fault of a whole file is its last entry."""
+    found: list[FlirFrameReference | FrameTable | RejectedFrame] = []
+    try:
+        with path.open("rb", buffering=0) as file:
+            found.extend(_walk(file, path))
+    except (OSError, FlirFormatError) as error:
+        found.append(RejectedFrame(path, 0, str(error)))
+    return found
 
 
 def index_sequence(
@@ -224,8 +233,8 @@ def _walk(file: BinaryIO, path: Path) -> Iterator[FlirFrameReference | FrameTabl
     front = file.read(_FRONT)
     if front[:2] == b"\xff\xd8":
         segments = _jpeg_segments(file, path, front)
-        start, length = segments[0]
-        source = FffSource(file, path, segments, front[start : start + length])
+        begin, length = segments[0]
+        source = FffSource(file, path, segments, front[begin : begin + length])
         yield _reference(source, read_directory(source), 0)
         return
     start, size = front[:4], file.seek(0, os.SEEK_END)

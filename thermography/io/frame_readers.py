@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -21,6 +21,7 @@ from typing import Protocol, runtime_checkable
 from thermography.errors import ThermographyError
 from thermography.io.flir import FlirReader
 from thermography.io.frame import FrameReference, RejectedFrame
+from thermography.io.frame_index.by_threads import call_by_threads, opening_threads
 from thermography.io.frame_index.frame_list import FrameList, FrameTable, order_by_time
 from thermography.io.temperature_frames import StackError, StackOptions
 from thermography.io.text_frames import TextReader
@@ -147,19 +148,24 @@ def index_recordings(
     options = options or StackOptions()
     frames: list[FrameReference | FrameTable] = []
     rejected: list[RejectedFrame] = []
-    for path in map(Path, paths):
-        try:
-            reader = find_reader(path)
-            if reader is None:
-                rejected.append(
-                    RejectedFrame(path, 0, f"{path}: no thermal file that is read; docs/formats.md lists them")
-                )
-                continue
-            for result in reader.index(path, options):
-                (rejected if isinstance(result, RejectedFrame) else frames).append(result)  # type: ignore[arg-type]
-        except StackError:
-            raise
-        except (OSError, ThermographyError) as error:
-            rejected.append(RejectedFrame(path, 0, str(error)))
+    files = list(map(Path, paths))
+    for results in call_by_threads(partial(_index_file, options=options), files, opening_threads(files)):
+        for result in results:
+            (rejected if isinstance(result, RejectedFrame) else frames).append(result)  # type: ignore[arg-type]
     kept, repeated = order_by_time(frames)
     return kept, rejected + repeated
+
+
+def _index_file(path: Path, options: StackOptions) -> list[FrameReference | FrameTable | RejectedFrame]:
+    """List the frames of one file in its order; the fault of a whole file is its last entry."""
+    found: list[FrameReference | FrameTable | RejectedFrame] = []
+    try:
+        reader = find_reader(path)
+        if reader is None:
+            return [RejectedFrame(path, 0, f"{path}: no thermal file that is read; docs/formats.md lists them")]
+        found.extend(reader.index(path, options))
+    except StackError:
+        raise
+    except (OSError, ThermographyError) as error:
+        found.append(RejectedFrame(path, 0, str(error)))
+    return found

@@ -223,6 +223,22 @@ class _File:
                 resource.close()
 
 
+def in_memory(path: Path) -> bool:
+    """Return whether the start of a file is in the page cache of the system; True where the system cannot tell, or there is none.
+
+    Parameters
+    ----------
+    path : Path
+    """
+    try:
+        file = _File(path)
+    except OSError:
+        return True
+    resident = file.pages is None or _resident(file.pages, 0, 1)
+    file.close()
+    return resident
+
+
 def _resident(pages: mmap.mmap, place: int, length: int) -> bool:
     """Return whether all of these bytes of a mapped file are in memory; True where the system cannot tell."""
     try:

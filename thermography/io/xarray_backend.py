@@ -22,6 +22,7 @@ from xarray.core import indexing
 from thermography.io.flir import FlirFrameReference, index_frames
 from thermography.io.flir_annotations import read_measurement_regions, read_visible_picture
 from thermography.io.frame import CameraParameters, FlirFormatError, FrameReference, RejectedFrame
+from thermography.io.frame_index.by_threads import call_by_threads, usable_threads
 from thermography.io.frame_index.frame_list import FrameList, frame_times
 from thermography.radiometry.planck import ZERO_CELSIUS_K, RadiometryError, calibrate, override
 
@@ -308,8 +309,13 @@ class _FrameStack(BackendArray):
         chosen = range(len(self.frames))[time] if isinstance(time, slice) else time
         first = np.empty(self.shape[1:], self.dtype)[row][..., column]
         stack = np.empty((len(chosen), *first.shape), self.dtype)
-        for place, index in enumerate(chosen):
-            stack[place] = self.read(self.frames[int(index)], int(index))[row][..., column]
+
+        def fill(place: int) -> None:
+            index = int(chosen[place])
+            stack[place] = self.read(self.frames[index], index)[row][..., column]
+
+        for _ in call_by_threads(fill, range(len(chosen)), usable_threads()):
+            pass
         return stack
 
 

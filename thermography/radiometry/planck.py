@@ -61,8 +61,8 @@ def calibrate(counts: NDArray[np.uint16], parameters: CameraParameters) -> NDArr
 
     Notes
     -----
-    Measurement formula of FLIR's user manuals; see the module docstring. The formula is evaluated once per count between the lowest and the highest
-    that occur; frames with the same parameters share these values.
+    Measurement formula of FLIR's user manuals; see the module docstring. The formula is evaluated once per count between the lowest and
+    the highest that occur; frames with the same parameters share these values.
 
     Examples
     --------

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from tests.thermography.plan_scene import DISCS, GRID, START, Scene, record
-from thermography.fields import scheduling
-from thermography.fields.scheduling import SchedulerError, in_order, open_pool, usable_threads
+from thermography.fields.scheduling import SchedulerError, in_order, open_pool
 from thermography.fields.still import reduce_frames
 from thermography.fields.tasks import stretches
 from thermography.registration.register import register
@@ -46,13 +45,12 @@ def assert_equal_bits(one, other):
     assert one.attrs == other.attrs
 
 
-@pytest.mark.parametrize(("cores", "threads"), [(1, 1), (2, 2), (3, 3), (64, 8)])
-def test_threads_follow_the_cores_and_give_the_same_fields_bit_for_bit(cores, threads, film, monkeypatch):
+@pytest.mark.parametrize("cores", [1, 3, 64])
+def test_any_number_of_threads_gives_the_same_fields_bit_for_bit(cores, film, monkeypatch):
     frames, registration = film
     monkeypatch.setattr(stretches, "STRETCH_FRAMES", 2)
     alone = reduce_frames(frames, registration, GRID, BOUNDS, block_s=1)
-    monkeypatch.setattr(scheduling.os, "sched_getaffinity", lambda process: set(range(cores)), raising=False)
-    assert usable_threads() == threads
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(cores)), raising=False)
     assert_equal_bits(alone, reduce_frames(frames, registration, GRID, BOUNDS, block_s=1))
 
 

@@ -9,10 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.thermography.flir_mutations import CAMERA, HOUSEKEEPING, LIMITS, PARAMETERS, SETTINGS, TIME, jpeg, sequence
+from tests.thermography.flir_mutations import (
+    CAMERA,
+    HOUSEKEEPING,
+    LIMITS,
+    PARAMETERS,
+    SETTINGS,
+    TIME,
+    jpeg,
+    sequence,
+)
+from tests.thermography.flir_mutations import frame as simulate
 from thermography.io.flir import index_frames, index_sequence, read_frame
 from thermography.io.flir_writer import write_jpeg
 from thermography.io.frame import FlirFormatError
+from thermography.io.frame_index import by_threads
+from thermography.io.frame_readers import index_recordings
 
 SC660_JPEG = "gtatters__Thermimage/inst/extdata/IR_2412.jpg"
 SC660_SEQ = "gtatters__Thermimage/inst/extdata/SampleSEQ.seq"
@@ -311,3 +323,21 @@ def test_a_sequence_that_is_over_tells_what_its_end_lacks(tmp_path: Path) -> Non
     frames, rejected, following = index_sequence(path)
     assert (len(frames), len(rejected), following) == (2, 1, 2 * len(whole) // 3)
     assert index_sequence(path, growing=True)[1] == []
+
+
+@pytest.mark.parametrize("index", [index_frames, index_recordings])
+def test_files_opened_by_threads_give_the_same_frames_and_faults(tmp_path: Path, monkeypatch, index) -> None:
+    """Where a folder is not in memory, threads wait for the disk; frames, order and reasons must not show it."""
+    paths = []
+    for number in range(60):
+        paths.append(tmp_path / f"{number:02}.jpg")
+        one = simulate(12, 16, seconds=60 - number // 2, seed=number)
+        write_jpeg(paths[-1], one.counts, one.parameters, one.time, encoding="png" if number % 3 else "raw")
+    for number in (3, 17, 40):
+        paths[number].write_bytes(paths[number].read_bytes()[: 100 * number])
+    paths.insert(30, tmp_path / "not there.jpg")
+    alone = index(paths)
+    monkeypatch.setattr(by_threads, "in_memory", lambda path: False)
+    together = index(paths)
+    assert list(together[0]) == list(alone[0]) and together[1] == alone[1]
+    assert len(alone[0]) + len(alone[1]) == 61 and len(alone[1]) > 4

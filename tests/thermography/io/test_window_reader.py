@@ -9,7 +9,7 @@ import pytest
 from tests.thermography.flir_mutations import frame
 from thermography.io.flir import index_frames
 from thermography.io.flir_writer import write_sequence
-from thermography.io.window_reader import WindowReader
+from thermography.io.window_reader import WindowReader, in_memory
 
 WINDOW = (slice(37, 201), slice(0, 320))
 
@@ -108,3 +108,14 @@ def test_an_error_ends_the_reading_ahead(tmp_path):
     forget(references[0].path)
     with pytest.raises(OSError, match="ends early"), WindowReader(WINDOW) as reader:
         list(reader.read_in_chunks(references, 2))
+
+
+def test_whether_a_file_is_in_memory(tmp_path):
+    path = tmp_path / "a.bin"
+    path.write_bytes(bytes(1 << 16))
+    assert in_memory(path)
+    forget(path)
+    assert not in_memory(path) or not hasattr(os, "posix_fadvise")
+    empty = tmp_path / "empty"
+    empty.write_bytes(b"")
+    assert in_memory(empty) and in_memory(tmp_path / "not there") and in_memory(tmp_path)

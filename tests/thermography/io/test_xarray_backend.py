@@ -12,7 +12,8 @@ import pytest
 import xarray as xr
 
 from tests.thermography.flir_mutations import PARAMETERS, TIME, frame, jpeg, sequence
-from thermography.io.flir import FlirFrameReference, read_frame
+from thermography.io import xarray_backend
+from thermography.io.flir import FlirFrameReference, index_frames, read_frame
 from thermography.io.flir_writer import write_jpeg, write_sequence
 from thermography.io.frame import FlirFormatError
 from thermography.io.xarray_backend import FlirBackendEntrypoint
@@ -194,3 +195,26 @@ def test_a_real_series_of_jpegs_is_one_dataset(real_file) -> None:
     assert dict(dataset.sizes) == {"time": 25, "row": 96, "column": 128, "sensor": 4}
     assert (np.diff(dataset["time"]) > np.timedelta64(0)).all()
     np.testing.assert_array_equal(dataset["counts"][24], read_frame(paths[24]).counts)
+
+
+def test_a_folder_read_by_threads_has_the_values_of_one_thread_and_tells_the_first_damaged_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = []
+    for number in range(30):
+        paths.append(str(tmp_path / f"{number:02}.jpg"))
+        one = frame(48, 64, seconds=number, seed=number)
+        write_jpeg(Path(paths[-1]), one.counts, one.parameters, one.time, encoding="png")
+    values = []
+    for threads in (1, 4):
+        monkeypatch.setattr(xarray_backend, "usable_threads", lambda threads=threads: threads)
+        values.append([_open(paths)[name].values.tobytes() for name in ("counts", "temperature")])
+    assert values[0] == values[1]
+    dataset = _open(paths)
+    for number in (11, 12, 25):
+        data = bytearray(Path(paths[number]).read_bytes())
+        reference = index_frames(paths[number])[0][0]
+        data[reference.segments[0][0] + reference.samples.offset + 200] ^= 255
+        Path(paths[number]).write_bytes(data)
+    with pytest.raises(FlirFormatError, match=r"11\.jpg"):
+        dataset["temperature"].load()
