@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 import numpy as np
 
 from fusion._typing import Array
@@ -10,6 +12,8 @@ from interferometry.drift.gls import DriftFit
 from interferometry.drift.state_space import DriftSystem
 
 DRAWS = 200
+#: Readings whose random numbers are drawn together, where those of all would be one more of the largest matrices.
+_READINGS_AT_ONCE = 2048
 
 
 def simulate_null(
@@ -33,28 +37,40 @@ def simulate_null(
     noise, share = fit.noise()
     system = fit.system if over is None else over
     relative = noise / np.sqrt(np.maximum(share, 1e-12))
-    # In place throughout: these are the largest matrices of a long test.
-    shape = (system.seconds.size, draws)
-    drawn: Array = rng.choice(relative, size=shape)
+    # In place and some readings at a time: these are the largest matrices of a long test.
+    drawn = np.empty((system.seconds.size, draws))
+    for rows in _blocks(drawn):
+        rows[:] = rng.choice(relative, size=rows.shape)
     drawn *= np.sqrt(system.variance)[:, None]
     ratios = plausible_ratios(fit, rng, draws=draws)
     for ratio, loading in zip(ratios.T, system.loadings.T, strict=True):
-        first = rng.standard_normal(shape)
-        second = rng.standard_normal(shape) if system.order == 2 else first
-        walk = random_walk(system, first, second)
-        walk *= fit.sigma * np.sqrt(ratio)
-        walk *= loading[:, None]
-        drawn += walk
+        drawn += _simulated_drift(system, fit.sigma * np.sqrt(ratio), loading, rng)
     return drawn
 
 
-def random_walk(system: DriftSystem, first: Array, second: Array) -> Array:
+def _blocks(matrix: Array) -> Iterator[Array]:
+    """Successive rows of a matrix, some at a time."""
+    for start in range(0, len(matrix), _READINGS_AT_ONCE):
+        yield matrix[start : start + _READINGS_AT_ONCE]
+
+
+def _simulated_drift(system: DriftSystem, rates: Array, loading: Array, rng: np.random.Generator) -> Array:
+    """What one component of the drift makes of every reading, (n, draws), with a rate (draws,) for each draw."""
+    first = rng.standard_normal((system.seconds.size, rates.size))
+    walk = random_walk(system, first, (rng.standard_normal(rows.shape) for rows in _blocks(first)))
+    walk *= rates
+    walk *= loading[:, None]
+    return walk
+
+
+def random_walk(system: DriftSystem, first: Array, second: Iterable[Array]) -> Array:
     """Random walk (order 1) or integrated random walk (order 2) of unit variance rate at the readings' own times.
 
     Parameters
     ----------
     system : times and order of the drift
-    first, second : (n, draws) independent standard normal numbers; order 1 uses the first only. Both are overwritten.
+    first : (n, draws) independent standard normal numbers; overwritten with the walk
+    second : as many further ones, (some readings, draws) after one another; overwritten. Order 1 asks for none.
 
     Returns
     -------
@@ -69,12 +85,22 @@ def random_walk(system: DriftSystem, first: Array, second: Array) -> Array:
     shocks = np.multiply(first, np.sqrt(steps), out=first)
     if system.order == 1:
         return np.asarray(np.cumsum(shocks, axis=0, out=shocks))
-    moved = np.multiply(second, np.sqrt(steps / 12.0), out=second)
-    moved += 0.5 * shocks
-    rate = np.cumsum(shocks, axis=0, out=shocks)
-    moved[1:] += rate[:-1]
-    moved *= steps
-    return np.asarray(np.cumsum(moved, axis=0, out=moved))
+    start, rate, level = 0, np.zeros(first.shape[1]), np.zeros(first.shape[1])
+    for moved in second:
+        rows = slice(start, start + len(moved))
+        here = shocks[rows]
+        moved *= np.sqrt(steps[rows] / 12.0)
+        moved += 0.5 * here
+        here[0] += rate
+        rates = np.cumsum(here, axis=0, out=here)
+        moved[0] += rate
+        moved[1:] += rates[:-1]
+        rate = rates[-1].copy()
+        moved *= steps[rows]
+        moved[0] += level
+        level = np.cumsum(moved, axis=0, out=here)[-1]
+        start = rows.stop
+    return shocks
 
 
 def tail_probability(value: float, null: Array) -> float:

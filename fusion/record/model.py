@@ -187,7 +187,8 @@ def simulate_channels(model: RecordFit, rng: np.random.Generator, *, draws: int)
         pool[rows] = noises[k]
         drawn = pool[picked[rows]] * np.sqrt(fit.system.variance)[:, None]
         ratios = plausible_ratios(fit, rng, draws=draws)[:, 0]
-        drawn += fit.sigma * np.sqrt(ratios) * random_walk(fit.system, *correlated[..., k][:, rows])
+        first, second = correlated[..., k][:, rows]
+        drawn += fit.sigma * np.sqrt(ratios) * random_walk(fit.system, first, [second])
         simulated.append(drawn)
     return simulated
 

@@ -25,7 +25,8 @@ def covariance_of_walk(order: int) -> np.ndarray:
     n = SECONDS.size
     system = drift_system(SECONDS, np.ones((n, 1)), order=order, ratios=np.ones(1))
     unit, nothing = np.eye(n), np.zeros((n, n))
-    matrix = np.column_stack([random_walk(system, unit.copy(), nothing.copy()), random_walk(system, nothing, unit)])
+    parts = (unit.copy(), [nothing.copy()]), (nothing, np.split(unit, [1, 4]))
+    matrix = np.column_stack([random_walk(system, first, second) for first, second in parts])
     return matrix @ matrix.T
 
 
@@ -41,7 +42,8 @@ def test_an_integrated_walk_has_the_covariance_of_theory():
 @pytest.mark.parametrize("order", [1, 2])
 def test_the_variance_of_drawn_walks_is_that_of_theory(order, rng):
     system = drift_system(SECONDS, np.ones((6, 1)), order=order, ratios=np.ones(1))
-    draws = random_walk(system, *rng.standard_normal((2, 6, 20000)))
+    first, second = rng.standard_normal((2, 6, 20000))
+    draws = random_walk(system, first, [second])
     expected = 200.0 if order == 1 else 200.0**3 / 3.0
     # A variance from 20,000 draws has a relative standard deviation of sqrt(2 / 20000) = 1 %.
     assert draws[-1].var() == pytest.approx(expected, rel=0.04)
