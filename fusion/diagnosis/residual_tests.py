@@ -8,6 +8,7 @@ that are flat or linear along the axis are absorbed by the drift; their size is 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,8 +30,8 @@ _FEWEST_OSCILLATIONS = 2.0
 _CLIP = 4.0
 #: Quantile of the largest power under the null hypothesis that is given as its limit.
 _LIMIT = 0.95
-#: Permutations that are evaluated at once.
-_BATCH = 50
+#: Permutations that are evaluated at once at most, and values of them, 8 MB.
+_BATCH, _VALUES_AT_ONCE = 50, 2**20
 
 
 @dataclass(frozen=True)
@@ -112,11 +113,11 @@ def examine_residual(model: ModelFit, rng: np.random.Generator) -> ResidualTests
         phase = 2 * np.pi * readings.seconds / (60.0 * period)
         waves[:, k], waves[:, periods.size + k] = np.cos(phase), np.sin(phase)
     memory, shift, power = _time_statistics(clipped[None, :], window, waves)
-    null = [_time_statistics(_permutations_of(clipped, rng), window, waves) for _ in range(_PERMUTATIONS // _BATCH)]
-    strongest = np.concatenate([powers.max(axis=1) for _, _, powers in null])
+    null = [_largest(*_time_statistics(some, window, waves)) for some in _permutations_of(clipped, rng)]
+    memories, shifts, strongest = (np.concatenate(largest) for largest in zip(*null, strict=True))
     p_values = {
-        "memory": _p_value(memory[0], np.concatenate([memories for memories, _, _ in null])),
-        "event": _p_value(shift[0].max(), np.concatenate([shifts.max(axis=1) for _, shifts, _ in null])),
+        "memory": _p_value(memory[0], memories),
+        "event": _p_value(shift[0].max(), shifts),
         "rhythm": _p_value(power[0].max(), strongest),
         **remainder.examine(readings, fit, rng).p_values,
     }
@@ -143,9 +144,16 @@ def _periods_min(seconds: Array) -> Array:
     return np.asarray(1.0 / np.arange(lowest, highest, step, dtype=np.float64)[:_MOST_PERIODS])
 
 
-def _permutations_of(values: Array, rng: np.random.Generator) -> Array:
-    """Return a batch of permutations (batch, n) of values (n,)."""
-    return rng.permuted(np.tile(values, (_BATCH, 1)), axis=1)
+def _permutations_of(values: Array, rng: np.random.Generator) -> Iterator[Array]:
+    """Yield permutations (some, n) of values (n,), some at a time."""
+    at_once = min(_BATCH, max(1, _VALUES_AT_ONCE // values.size))
+    for start in range(0, _PERMUTATIONS, at_once):
+        yield rng.permuted(np.tile(values, (min(at_once, _PERMUTATIONS - start), 1)), axis=1)
+
+
+def _largest(memory: Array, shift: Array, power: Array) -> tuple[Array, Array, Array]:
+    """Return what a permutation test needs of the statistics of each series: memory, largest shift, largest power, (r,) each."""
+    return memory, shift.max(axis=1), power.max(axis=1)
 
 
 def _time_statistics(series: Array, window: int, waves: NDArray[np.float32]) -> tuple[Array, Array, Array]:

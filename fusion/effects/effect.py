@@ -28,6 +28,32 @@ class Prior:
 
 
 @dataclass(frozen=True, eq=False)
+class Wave:
+    """A harmonic course in time, computed at the readings that are asked for: hundreds of them at all readings fill the memory.
+
+    Attributes
+    ----------
+    shape : callable
+        ``numpy.cos`` or ``numpy.sin``.
+    seconds : (n,) ndarray
+        Time of each reading, s.
+    period_s : float
+    """
+
+    shape: Callable[[Array], Array]
+    seconds: Array
+    period_s: float
+
+    def __array__(self, dtype: DTypeLike = None, copy: bool | None = None) -> Array:
+        """At all readings, (n,)."""
+        return np.asarray(self[:], dtype)
+
+    def __getitem__(self, rows: Any) -> Array:
+        """At some readings, a slice or an array of them."""
+        return self.shape(2.0 * np.pi * self.seconds[rows] / self.period_s)
+
+
+@dataclass(frozen=True, eq=False)
 class Separable:
     """Columns that are courses in time, each weighed by the place of a reading, multiplied out at the readings that are asked for.
 
@@ -36,14 +62,14 @@ class Separable:
 
     Attributes
     ----------
-    courses : tuple of ndarray
-        (n,) each, one per column; candidates that follow the same course share the array.
+    courses : tuple of ndarray or Wave
+        (n,) each, one per column; candidates that follow the same course share it.
     place : (n,) ndarray of int
         Place of every reading, a row of the weights; shared by candidates too.
     weights : (places, q) ndarray
     """
 
-    courses: tuple[Array, ...]
+    courses: tuple[Array | Wave, ...]
     place: NDArray[np.int64]
     weights: Array
 

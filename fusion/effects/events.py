@@ -8,7 +8,7 @@ import numpy as np
 
 from fusion._typing import Array
 from fusion.alignment.readings import Readings
-from fusion.effects.effect import Candidate, Effect, Separable
+from fusion.effects.effect import Candidate, Effect, Separable, Wave
 from fusion.effects.jumps import cycle_starts, event_instants, instants_near
 
 #: Periods that are tried at most: all down to 3 min in a record of 7.5 h, down to 11 min in one of 28 h.
@@ -75,8 +75,7 @@ def _periodic_disturbance(readings: Readings, _: Mapping[str, float], near: Cand
     place, share = readings.target_index, readings.positions_mm / readings.span_mm
     weights = {"flat": np.ones((share.size, 2)), "linear": np.column_stack([share, share])}
     for period in periods:
-        phase = 2 * np.pi * readings.seconds / (60.0 * period)
-        waves = (np.cos(phase), np.sin(phase))
+        waves = tuple(Wave(shape, readings.seconds, 60.0 * period) for shape in (np.cos, np.sin))
         for shape, weight in weights.items():
             yield Candidate(
                 Separable(waves, place, weight), {"period_min": float(period), "shape": shape}, ("um", "um")

@@ -19,10 +19,10 @@ from fusion.loop.state import Confirmation, Confirmed, Score
 from fusion.model.drift_variances import SHIFT_AND_STRETCH, scaled_systems
 from fusion.model.fit import ModelFit
 from fusion.model.least_squares import (
+    Moments,
     PriorRows,
     density_ahead,
     gain_across,
-    moments_of,
     profile_likelihood,
     solve,
 )
@@ -42,6 +42,8 @@ _CONTRADICTED = 0.5
 _FIVE_SIGMA = 2.9e-7
 #: Share of the cycles from which the later ones are predicted.
 _EARLY_SHARE = 0.5
+#: Values of simulated campaigns that are filtered together, 16 MB.
+_VALUES_AT_ONCE = 2**21
 
 
 def prior_rows(model: ModelFit, rng: np.random.Generator, *, draws: int = DRAWS) -> PriorRows:
@@ -105,7 +107,7 @@ class CandidateScorer:
     def products(self, candidates: Sequence[Candidate], *, simulated: bool = True) -> list[Products]:
         """Products of the candidates with the measured response, freed of the model, and with every simulated one if asked for."""
         measured = self.fit.residual()[:, None]
-        responses = np.column_stack([measured, self.draws]) if simulated else measured
+        responses = [measured, self.draws] if simulated else [measured]
         return sum_products(self.systems(), responses, self.fit.design, by_width(candidates, self.used))
 
     def gains(self, candidates: Sequence[Candidate], *, simulated: bool = True) -> Gains:
@@ -151,16 +153,16 @@ class CandidateScorer:
         gains = replace(self, fit=fit, used=used).gains(candidates, simulated=False)
         return candidates[int(np.argmax(np.where(gains.separable, gains.gain[:, 0], -np.inf)))]
 
-    def _responses(self) -> Array:
-        """The measured response and every simulated one, (n, 1 + draws)."""
-        return np.column_stack([self.fit.response, self.draws])
+    def _responses(self) -> list[Array]:
+        """The measured response and every simulated one, (n, 1) and (n, draws)."""
+        return [self.fit.response[:, None], self.draws]
 
     def _event_gain(self, candidates: Sequence[Candidate], place: int) -> Array:
         """Gain of an event with instant and size from one half of the targets on the other half, and back, (1 + draws,)."""
         system, responses, design = self.systems()[place], self._responses(), self.fit.design
         groups = by_width(candidates, self.used)
         ((one, other),) = sum_products_apart([system], responses, design, groups, self.halves)
-        prior_design, prior_responses = self.priors.design, self.priors.responses(responses.shape[1])
+        prior_design, prior_responses = self.priors.design, self.priors.responses(1 + self.draws.shape[1])
         normal = one.design + other.design + prior_design.T @ prior_design
         of_responses = solve(normal, one.cross + other.cross + prior_design.T @ prior_responses)
         of_events = solve(normal, one.with_design + other.with_design)
@@ -214,19 +216,16 @@ def ask_hold_out(model: ModelFit, candidate: Candidate, rng: np.random.Generator
         Coefficients, noise and drift come from the training readings alone.
     """
     fit, whole, design = model.fit, model.whole_system(), model.whole_design()
-    train = whole.observed
     priors = prior_rows(model, rng)
-    null = simulate_null(fit, rng, over=replace(whole, observed=np.ones_like(train)))
-    responses = np.column_stack([model.readings.response, null])
-    count = responses.shape[1]
-    columns = np.column_stack([responses, design, candidate.columns])
+    null = simulate_null(fit, rng, over=replace(whole, observed=np.ones_like(whole.observed)))
+    columns = np.column_stack([design, candidate.columns])
+    responses = np.array_split(null, 1 + null.size // _VALUES_AT_ONCE, axis=1)
+    responses[0] = np.column_stack([model.readings.response, responses[0]])
     likelihood: dict[bool, list[Array]] = {False: [], True: []}
     error: dict[bool, list[Array]] = {False: [], True: []}
     for system in scaled_systems(fit, SHIFT_AND_STRETCH, over=whole):
-        errors, spread = system.innovations(columns)
-        y, x = errors[~train, :count], errors[~train, count:]
-        errors /= np.sqrt(spread)[:, None]
-        seen = priors.add_to(moments_of(errors[train, :count], errors[train, count:], spread[train]))
+        seen, x, y = _open_loop(system, columns, responses)
+        seen = priors.add_to(seen)
         for with_candidate in (False, True):
             moments = seen if with_candidate else seen.first(design.shape[1])
             beta = solve(moments.design, moments.cross)
@@ -237,3 +236,25 @@ def ask_hold_out(model: ModelFit, candidate: Candidate, rng: np.random.Generator
         for key in (False, True)
     )
     return float(before[0]), float(after[0]), float((1 + (after[1:] <= after[0]).sum()) / after.size)
+
+
+def _open_loop(system: DriftSystem, design: Array, responses: Sequence[Array]) -> tuple[Moments, Array, Array]:
+    """Products over the observed readings, and prediction errors of the others: of the design (m, p) and of all responses (m, r).
+
+    Responses come in matrices (n, some) that are filtered one after another.
+    """
+    train = system.observed
+    errors, spread = system.innovations(design)
+    x, roots = errors[train], np.sqrt(spread[train])[:, None]
+    x /= roots
+    cross, squares, ahead = [], [], []
+    for some in responses:
+        y, _ = system.innovations(some)
+        ahead.append(y[~train])
+        seen = y[train]
+        seen /= roots
+        cross.append(x.T @ seen)
+        squares.append((seen**2).sum(axis=0))
+    log_spread = float(np.log(spread[train]).sum())
+    moments = Moments(x.T @ x, np.hstack(cross), np.concatenate(squares), x.shape[0], log_spread)
+    return moments, errors[~train], np.hstack(ahead)

@@ -138,7 +138,7 @@ def _alike(
     design = scorer.fit.design
     shown = np.column_stack([candidates[k].columns[scorer.used][:, 0] for k in typical])
     shown = shown - design @ np.linalg.lstsq(design, shown, rcond=None)[0]
-    (held,) = sum_products([scorer.fit.system], shown, design, by_width(candidates, scorer.used))
+    (held,) = sum_products([scorer.fit.system], [shown], design, by_width(candidates, scorer.used))
     products = held.of_candidates()
     freed = beside_design(products)
     reduced, given, _ = reductions(products, freed)

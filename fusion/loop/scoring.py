@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.effects.effect import Candidate, Separable
+from fusion.effects.effect import Candidate, Separable, Wave
 from fusion.loop.decisions import Decision, Reason
 from fusion.loop.parameter_ranges import DERIVED_WORDS, parameter_ranges
 from fusion.loop.state import Score, SearchError
@@ -88,7 +88,7 @@ def _check_columns(candidates: Sequence[Candidate], rows: int) -> None:
         if len(columns.shape) != 2 or columns.shape[0] != rows:
             raise SearchError(f"columns have shape {columns.shape}; expected ({rows}, columns)")
         # Of columns that share courses these are looked at, and all columns only where one is not finite.
-        parts = (*columns.courses, columns.weights) if isinstance(columns, Separable) else (columns,)
+        parts = (*map(_made_of, columns.courses), columns.weights) if isinstance(columns, Separable) else (columns,)
         if not all(np.isfinite(part).all() for part in parts):
             not_finite = int((~np.isfinite(np.asarray(columns))).sum())
             raise SearchError(f"{not_finite} values are not finite at {dict(candidate.parameters)}")
@@ -96,6 +96,11 @@ def _check_columns(candidates: Sequence[Candidate], rows: int) -> None:
             raise SearchError(
                 f"{columns.shape[1]} columns but {len(candidate.units)} units at {dict(candidate.parameters)}"
             )
+
+
+def _made_of(course: Array | Wave) -> Array:
+    """The numbers that decide whether a course is finite."""
+    return course.seconds if isinstance(course, Wave) else course
 
 
 def score_effects(

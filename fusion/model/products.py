@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from fusion.effects.effect import Candidate, Separable
+from fusion.effects.effect import Candidate, Separable, Wave
 from fusion.model.least_squares import Moments, PriorRows
 from interferometry.drift.state_space import DriftSystem
 
@@ -81,12 +81,12 @@ class PlacedGroup(Group):
 
     Attributes
     ----------
-    courses : (n,) each, of all readings, the different ones
+    courses : at all n readings, the different ones
     place : (n,) place of every reading of the fit
     combination : (held, width * size) the candidates' columns as combinations of every course at every place alone
     """
 
-    courses: tuple[Array, ...]
+    courses: tuple[Array | Wave, ...]
     place: NDArray[np.int64]
     combination: Array
 
@@ -98,7 +98,7 @@ class PlacedGroup(Group):
     def columns(self, rows: slice) -> Array:
         """Every course at every place alone, (rows, held)."""
         at_place = self.place[rows, None] == np.arange(self.held // len(self.courses))
-        return np.concatenate([at_place * course[self.readings[rows], None] for course in self.courses], axis=1)
+        return np.concatenate([at_place * course[self.readings[rows]][:, None] for course in self.courses], axis=1)
 
     def none(self) -> Array:
         """Products of the courses over no readings, (held, held)."""
@@ -288,7 +288,7 @@ class Products:
 
 
 def sum_products(
-    systems: Sequence[DriftSystem], responses: Array, design: Array, groups: Sequence[Group]
+    systems: Sequence[DriftSystem], responses: Sequence[Array], design: Array, groups: Sequence[Group]
 ) -> list[Products]:
     """Whiten responses, design and candidates under every drift, and sum their products over all readings.
 
@@ -297,7 +297,7 @@ def sum_products(
     Parameters
     ----------
     systems : of the same n readings
-    responses : (n, r)
+    responses : matrices (n, some) of r columns together, side by side: a matrix of all of them would be another copy of the largest
     design : (n, p) columns of the model
     groups : the candidates
 
@@ -306,14 +306,14 @@ def sum_products(
     list of Products
         For every system.
     """
-    every = np.ones(responses.shape[0], bool)
+    every = np.ones(design.shape[0], bool)
     bases = [_orthonormal(system.normal_equations(design)[0]) for system in systems]
     return [products for (products,) in _sums_over(systems, responses, design, groups, bases, [every])]
 
 
 def sum_products_apart(
     systems: Sequence[DriftSystem],
-    responses: Array,
+    responses: Sequence[Array],
     design: Array,
     groups: Sequence[Group],
     part: NDArray[np.bool_],
@@ -339,21 +339,22 @@ def sum_products_apart(
 
 def _sums_over(
     systems: Sequence[DriftSystem],
-    responses: Array,
+    responses: Sequence[Array],
     design: Array,
     groups: Sequence[Group],
     bases: Sequence[Array],
     parts: Sequence[NDArray[np.bool_]],
 ) -> list[list[Products]]:
-    columns = responses.shape[1] + sum(group.held for group in groups)
+    count = sum(some.shape[1] for some in responses)
+    columns = count + sum(group.held for group in groups)
     whitenings = [system.whitening(columns + basis.shape[1]) for system, basis in zip(systems, bases, strict=True)]
-    sums = [[Products.none(groups, basis, responses.shape[1]) for _ in parts] for basis in bases]
+    sums = [[Products.none(groups, basis, count) for _ in parts] for basis in bases]
     at_once = max(1, _VALUES_AT_ONCE // (columns + design.shape[1]))
-    for start in range(0, responses.shape[0], at_once):
+    for start in range(0, design.shape[0], at_once):
         rows = slice(start, start + at_once)
-        candidates = [group.columns(rows) for group in groups]
+        measured, candidates = [some[rows] for some in responses], [group.columns(rows) for group in groups]
         for whitening, basis, of_parts in zip(whitenings, bases, sums, strict=True):
-            here = np.concatenate([responses[rows], design[rows] @ basis, *candidates], axis=1)
+            here = np.concatenate([*measured, design[rows] @ basis, *candidates], axis=1)
             whitened, roots = whitening.whiten(here), whitening.roots[rows]
             for part, products in zip(parts, of_parts, strict=True):
                 counted = part[rows]

@@ -62,7 +62,7 @@ def profile_gains(
         (``beside`` of :class:`fusion.effects.effect.Candidate`) are part of the model it is held against, at the price of one unit of
         log-likelihood each.
     """
-    return gains_by_products(sum_products(systems, responses, design, groups), priors)
+    return gains_by_products(sum_products(systems, [responses], design, groups), priors)
 
 
 def gains_by_products(sums: Sequence[Products], priors: PriorRows | None = None) -> ProfileGains:

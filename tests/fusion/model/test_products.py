@@ -34,7 +34,7 @@ def drifting(n: int) -> DriftSystem:
 def explained(candidates: list[Candidate], responses: np.ndarray, model: np.ndarray) -> tuple:
     """Reductions where nothing drifts."""
     n = responses.shape[0]
-    (products,) = sum_products([still(n)], responses, model, by_width(candidates, np.ones(n, bool)))
+    (products,) = sum_products([still(n)], [responses], model, by_width(candidates, np.ones(n, bool)))
     return reductions(products, beside_design(products))
 
 
@@ -79,7 +79,7 @@ def test_products_are_those_of_columns_that_are_whitened_at_once(monkeypatch, rn
     c = whitened_columns(candidates, system)
     for values in (1, 100, 10**6):
         monkeypatch.setattr("fusion.model.products._VALUES_AT_ONCE", values)
-        (told,) = sum_products([system], responses, model, groups)
+        (told,) = sum_products([system], [responses[:, :1], responses[:, 1:]], model, groups)
         # The design enters by combinations of its columns.
         np.testing.assert_allclose(told.design, np.eye(3), atol=1e-9)
         np.testing.assert_allclose(told.cross, told.basis.T @ x.T @ y, rtol=1e-9, atol=1e-9)
@@ -99,7 +99,7 @@ def test_products_apart_are_those_of_each_part_under_the_same_drift(rng):
     system, candidates = drifting(n), candidates_of_three_kinds(rng, n)
     responses, model = rng.standard_normal((n, 2)), rng.standard_normal((n, 3))
     part = rng.random(n) < 0.4
-    (told,) = sum_products_apart([system], responses, model, by_width(candidates, np.ones(n, bool)), part)
+    (told,) = sum_products_apart([system], [responses], model, by_width(candidates, np.ones(n, bool)), part)
     spread = system.innovations(model)[1]
     for products, here in zip(told, (part, ~part), strict=True):
         y, x = (system.whiten(columns)[0][here] for columns in (responses, model))
@@ -122,7 +122,7 @@ def test_products_are_freed_of_the_design_by_its_coefficients(rng):
     columns, y, x = rng.standard_normal((n, 4)), rng.standard_normal((n, 2)), rng.standard_normal((n, 3))
     events = [Candidate(column[:, None], {}, ("um",)) for column in columns.T]
     part = np.arange(n) < 12
-    ((first, _),) = sum_products_apart([still(n)], y, x, by_width(events, np.ones(n, bool)), part)
+    ((first, _),) = sum_products_apart([still(n)], [y], x, by_width(events, np.ones(n, bool)), part)
     of_y, of_c = rng.standard_normal((3, 2)), rng.standard_normal((3, 4))
     crossed, own = first.freed(of_y, of_c)
     free_y, free_c = (y - x @ of_y)[part], (columns - x @ of_c)[part]
@@ -137,7 +137,7 @@ def test_responses_are_freed_of_a_design_with_priors_whatever_its_units(rng):
     y, candidate = rng.standard_normal((n, 2)), Candidate(rng.standard_normal((n, 1)), {}, ("um",))
     priors = PriorRows(np.array([[3e-6, 1.0, 0.0, 0.0, 0.0]]), np.array([0.7]), np.array([[-0.2]]))
     system = drifting(n)
-    (products,) = sum_products([system], y, x, by_width([candidate], np.ones(n, bool)))
+    (products,) = sum_products([system], [y], x, by_width([candidate], np.ones(n, bool)))
     told = beside_design(products, priors)
     white_y, white_x = (system.whiten(columns)[0] for columns in (y, x))
     all_y, all_x = priors.append(white_y, white_x)
@@ -207,7 +207,7 @@ def test_few_courses_at_few_places_tell_the_products_of_many_candidates(rng):
     placed, whole = (by_width(some, used) for some in (candidates, plain))
     # Two courses at three places are six columns, those of nine candidates eighteen.
     assert sum(group.held for group in whole) - sum(group.held for group in placed) == 12
-    (told,), (expected,) = (sum_products([drifting(45)], y, x, groups) for groups in (placed, whole))
+    (told,), (expected,) = (sum_products([drifting(45)], [y], x, groups) for groups in (placed, whole))
     for one, other in zip(
         reductions(told.of_candidates(), beside_design(told.of_candidates())),
         reductions(expected.of_candidates(), beside_design(expected)),
@@ -219,4 +219,4 @@ def test_few_courses_at_few_places_tell_the_products_of_many_candidates(rng):
 def test_few_candidates_are_not_told_by_places(rng):
     few = by_width(waves(rng, 60, 3), np.ones(60, bool))
     assert [group.held for group in few] == [6]
-    assert sum_products([still(60)], np.ones((60, 1)), np.ones((60, 1)), few)[0].of_candidates().groups is few
+    assert sum_products([still(60)], [np.ones((60, 1))], np.ones((60, 1)), few)[0].of_candidates().groups is few
