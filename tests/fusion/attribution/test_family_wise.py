@@ -111,18 +111,19 @@ def one_channel_of(cells, banks=1):
 
 def test_false_alarms_are_the_share_of_fresh_series_that_pass_in_any_row():
     """Nineteen simulated maxima 1..19 give the threshold 19; of four fresh series one passes it in the first set, another in the second."""
-    cells, modes = module._Tally(2, 1, 23), module._Tally(2, 1, 23)
+    cells, modes = module._Tally(3, 1, 23), module._Tally(3, 1, 23)
     for tally in (cells, modes):
         tally.maxima[:, :19] = np.arange(1.0, 20.0)
         tally.statistic[:] = 10.0
-    cells.maxima[:, 19:] = [[18.0, 25.0, 3.0, 2.0], [1.0, 2.0, 3.0, 19.5]]
-    modes.maxima[:, 19:] = [[30.0, 25.0, 3.0, 2.0], [1.0, 2.0, 3.0, 2.0]]
+    # A value equal to the threshold does not pass.
+    cells.maxima[:2, 19:] = [[18.0, 25.0, 19.0, 2.0], [1.0, 2.0, 3.0, 19.5]]
+    modes.maxima[:2, 19:] = [[30.0, 25.0, 3.0, 2.0], [1.0, 2.0, 3.0, 2.0]]
     candidates = {"cells": walks(np.random.default_rng(0), 1), "modes": walks(np.random.default_rng(0), 1)}
-    result = module._conclude(["common", "reversal"], [cells, modes], candidates, {}, [], 19, 4)
-    assert result.sets["cells"].threshold == pytest.approx([19.0, 19.0])
+    result = module._conclude(["common", "proportional", "reversal"], [cells, modes], candidates, {}, [], 19, 4)
+    assert result.sets["cells"].threshold == pytest.approx([19.0] * 3)
     assert [result.sets[name].false_alarm_rate for name in ("cells", "modes")] == [0.5, 0.5]
     assert result.false_alarm_rate == 0.75
-    assert result.sets["modes"].p_value.tolist() == [[11 / 20], [11 / 20]]
+    assert result.sets["modes"].p_value.tolist() == [[11 / 20]] * 3
 
 
 def test_the_detection_limit_is_the_threshold_and_the_quantile_of_80_percent_power():

@@ -129,19 +129,19 @@ def test_the_chance_of_the_other_session_follows_from_its_detection_limit():
 
 
 def test_a_place_on_which_both_agree_is_told_apart_from_its_neighbour():
-    """One session has its mode 75 mm beside the place on which both agree: both places are listed, and the one names the other."""
+    """One session has its mode 100 mm beside the place on which both agree: both places are listed, and the one names the other."""
     plan = xr.Dataset(coords={"y": np.arange(5.0, 200.0, 10.0), "x": np.arange(5.0, 500.0, 10.0)})
     pair = SimpleNamespace(at=lambda name, row, column: (row, column))
-    alone = module._source_at(pair, "joint", (405.0, 95.0), (9, 40), (0,), True)
-    agreed = module.ChannelAgreement("joint", "attributable", 345.0, 140.0, 0.004, (4.0, 5.8), (0.0, 0.0), "")
+    alone = module._source_at(pair, "joint", (405.0, 75.0), (7, 40), (0,), True)
+    agreed = module.ChannelAgreement("joint", "attributable", 345.0, 155.0, 0.004, (4.0, 5.8), (0.0, 0.0), "")
     first, second = module._tell_apart([alone], [agreed], plan, {"joint": pair})
     assert (second.x_mm, second.agrees, second.cause, second.shown_by) == (345.0, True, False, (0, 1))
-    assert first.agreed_near_mm == (345.0, 140.0, 75.0) and not first.agrees
+    assert first.agreed_near_mm == (345.0, 155.0, 100.0) and not first.agrees
     # A cause at that place already, be it in another part of the drift, is not listed a second time.
-    cause = module._source_at(pair, "common", (345.0, 95.0), (9, 34), (0, 1), True)
+    cause = module._source_at(pair, "common", (345.0, 115.0), (11, 34), (0, 1), True)
     assert module._tell_apart([cause], [agreed], plan, {"joint": pair}) == [cause]
     # A cause elsewhere hides nothing.
-    far = module._source_at(pair, "common", (290.0, 140.0), (13, 29), (0, 1), True)
+    far = module._source_at(pair, "common", (290.0, 155.0), (15, 29), (0, 1), True)
     assert [one.x_mm for one in module._tell_apart([far], [agreed], plan, {"joint": pair})] == [290.0, 345.0]
 
 

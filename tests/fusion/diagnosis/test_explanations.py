@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from fusion.diagnosis import explanations as module
 from fusion.diagnosis.explanations import (
     LAGS_S,
     Residual,
@@ -123,3 +124,69 @@ def test_serial_test_sees_a_walk_and_keeps_its_level_on_noise(rng):
 def test_exponential_warm_up_is_all_warm_up_and_a_switched_load_is_not():
     assert warm_up_share(SECONDS, 3.0 * (1.0 - np.exp(-SECONDS / 2700.0))) > 0.995
     assert warm_up_share(SECONDS, np.sign(np.sin(2 * np.pi * SECONDS / 3600.0))) < 0.5
+    # The temperature of the table before the test says nothing, and a steady rise is a warm-up altogether.
+    assert warm_up_share(SECONDS, 20.0 + np.sign(np.sin(2 * np.pi * SECONDS / 3600.0))) < 0.5
+    assert warm_up_share(SECONDS, 20.0 + 1e-4 * SECONDS) == pytest.approx(1.0, abs=1e-9)
+    assert warm_up_share(SECONDS, np.full(CYCLES, 20.0)) == 1.0
+
+
+def test_level_and_stretch_of_every_pass_come_from_the_sound_targets_that_were_read(rng):
+    """Without noise nothing is left but the motion of the flagged target, whatever readings are missing."""
+    position = np.linspace(0.0, 300.0, 7)
+    profile = rng.normal(0.0, 3.0, (2, 7))
+    passes = rng.normal(0.0, 2.0, (12, 2, 1)) + rng.normal(0.0, 0.01, (12, 2, 1)) * position
+    own = np.sin(np.arange(12.0))[:, None] * [1.0, -2.0]
+    deviation = profile + passes
+    deviation[:, :, 4] += own
+    deviation[3, 0, [0, 6]] = np.nan
+    deviation[5, 1, 4] = np.nan
+    deviation[8, 1, :5] = np.nan
+    sound = np.arange(7) != 4
+    design = np.column_stack([np.ones(7), position / 300.0 - 0.5])
+    left = module._without_passes(deviation, design, sound)
+    # The pass with two sound readings has no line.
+    assert np.isnan(left[8, 1]).all()
+    kept = np.isfinite(left[:, :, 4])
+    expected = np.where(kept, own, np.nan)
+    assert np.abs(np.where(np.isfinite(left), left, 0.0)[:, :, sound]).max() < 1e-4
+    centred = left[:, :, 4] - np.nanmean(left[:, :, 4], axis=0)
+    np.testing.assert_allclose(centred, expected - np.nanmean(expected, axis=0), atol=1e-4)
+
+
+def test_the_typical_scatter_is_that_of_the_others_less_their_share_in_every_pass():
+    """Four sound targets at the corners of a line of unit leverage: each keeps 1 - h of its variance, the fifth adds its own h."""
+    design = np.column_stack([np.ones(5), [-1.0, -0.5, 0.5, 1.0, 0.0]])
+    sound = np.array([True, True, True, True, False])
+    leverage = 0.25 + design[:4, 1] ** 2 / 2.5
+    # Readings alternate between +1 and -1 standard deviation of a pass: the median of |values| is that standard deviation.
+    values = np.sqrt(1 - leverage) * np.where(np.arange(6) % 2, 1.0, -1.0)[:, None, None]
+    residuals = np.concatenate([np.repeat(values, 2, axis=1), np.full((6, 2, 1), 9.0)], axis=2)
+    assert module._typical_scatter(residuals, design, sound, 4) == pytest.approx(1.4826 * np.sqrt(1.25))
+    residuals[:, 1, 2] = np.nan
+    assert module._typical_scatter(residuals, design, sound, 4) == pytest.approx(1.4826 * np.sqrt(1.25))
+
+
+def test_an_explanation_gains_half_its_likelihood_ratio_over_the_walk_that_it_stands_beside(rng):
+    residual = residual_of(0.3 * rng.standard_normal((2, CYCLES)) + np.where(np.arange(CYCLES) < 30, 0.0, 0.5))
+    walk = fit_random_walk(residual)
+    # A constant is the mean again: nothing gained.
+    nothing = fit_profile(residual, np.ones((CYCLES, 1)), rng)
+    assert nothing.log_likelihood == pytest.approx(walk.shared, abs=1e-4) and nothing.p_value == 1.0
+    column = step_columns(CYCLES)[:, [25]]
+    parts = residual.parts
+    bank = module.fit_null(parts.grid, parts.mean)
+    ratio = module.likelihood_ratios(bank, module.whiten_series(bank, parts.mean[None]), column.astype(np.float32))
+    fit = fit_profile(residual, column, rng)
+    assert fit.log_likelihood == pytest.approx(walk.shared + 0.5 * float(ratio[0, 0]), abs=1e-3)
+    assert fit.log_likelihood > walk.shared + 5.0
+    # The mean of both directions is sqrt(2) times their average; the coefficient is that of the average.
+    assert fit.coefficient == pytest.approx(0.5, abs=4 * fit.coefficient_u)
+    assert fit.coefficient_u < 0.15
+
+
+def test_the_serial_test_looks_along_the_cycles():
+    """A staircase of six steps lies nearer to its neighbours in time than any of 499 permutations; alternation lies farther."""
+    staircase = np.tile(np.repeat(np.arange(6.0), 10), (2, 1))
+    rng = np.random.default_rng(2)
+    assert serial_p_value(residual_of(staircase), rng) == 1 / 500
+    assert serial_p_value(residual_of(np.tile([1.0, -1.0], (2, CYCLES // 2))), rng) == 1.0

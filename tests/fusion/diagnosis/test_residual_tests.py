@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fusion.diagnosis import residual_tests as module
 from fusion.diagnosis.residual_tests import examine_residual
 from fusion.effects.library import library
 from fusion.model.fit import Term, fit_model
@@ -59,3 +60,33 @@ def test_the_same_seed_gives_the_same_p_values():
     _, first = residual_of()
     _, again = residual_of()
     assert first.p_values == again.p_values
+
+
+def test_periods_reach_from_half_the_test_to_three_minutes_in_halves_of_the_resolution():
+    periods = module._periods_min(np.array([0.0, 3600.0]))
+    # An hour: 2 to 20 oscillations in steps of a half.
+    np.testing.assert_allclose(60.0 / periods, np.arange(2.0, 20.0, 0.5))
+    np.testing.assert_allclose(module._periods_min(np.array([0.0, 240.0])), [2.0])
+    assert module._periods_min(np.array([0.0, 1e6])).size == 300
+
+
+def test_memory_shift_and_power_of_series_that_are_known():
+    """Forty readings: six turns of a sine; and twenty of +1 after twenty of -1, on a level that must not count."""
+    n = np.arange(40)
+    turns = 2 * np.pi * n[:, None] * np.array([6.0, 11.0]) / 40.0
+    waves = np.hstack([np.cos(turns), np.sin(turns)]).astype(np.float32)
+    series = np.stack([np.sin(2 * np.pi * 6.0 * n / 40.0 + 0.3), 5.0 + np.where(n < 20, -1.0, 1.0)])
+    memory, shift, power = module._time_statistics(series, 10, waves)
+    # All of the variance at one frequency: n / 2 in units of white noise.
+    np.testing.assert_allclose(power[0], [20.0, 0.0], atol=1e-4)
+    # Ten readings of one sign over the root of their number; none where five are of either sign.
+    assert shift.shape == (2, 31)
+    np.testing.assert_allclose(shift[1, [0, 10, 15, 30]], [np.sqrt(10.0), np.sqrt(10.0), 0.0, np.sqrt(10.0)], atol=1e-9)
+    # k readings apart, 40 - 2 k of the 40 - k products are +1 and k are -1.
+    lags = np.arange(1, 13)
+    assert memory[1] == pytest.approx((((40 - 3 * lags) / (40 - lags)) ** 2).sum())
+
+
+def test_a_permutation_p_value_counts_the_measured_order_as_one():
+    assert module._p_value(3.0, np.array([1.0, 2.0, 3.0, 4.0])) == 3 / 5
+    assert module._p_value(5.0, np.array([1.0, 2.0, 3.0, 4.0])) == 1 / 5

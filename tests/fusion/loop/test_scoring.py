@@ -89,6 +89,23 @@ def refined(landscape: Landscape, start: float = 0.0) -> Score:
     return refine(score, landscape.near, landscape.gains)
 
 
+def test_an_effect_that_the_model_holds_does_not_end_the_scores_of_the_others(rng):
+    families = {"a": [candidate(0)], "constant": [candidate(1)], "b": [candidate(2)]}
+    gains = gains_of([3.0, 8.0, 5.0], rng.exponential(1.0, (3, 50)), separable=[True, False, True])
+    scores, decisions = score_effects(families, gains, level=0.015)
+    assert {score.name for score in scores} == {"a", "b", "constant"}
+    assert [decision.effect for decision in decisions] == ["constant"]
+
+
+def test_a_closer_look_raises_gain_and_excess_by_the_same_and_leaves_the_p_value():
+    """A candidate of gain 4 and excess 2.5, whose neighbour gains 5.5: excess 4."""
+    coarse = Score("a", candidate(0), 4.0, 2.5, 0.01, 0.02, 0.0, 10, 3.0)
+    neighbours = [candidate(1), candidate(2)]
+    score = refine(coarse, lambda _: neighbours, lambda looked: gains_of([3.0, 5.5], np.zeros((2, 0))))
+    assert (score.candidate, score.gain, score.excess) == (neighbours[1], 5.5, 4.0)
+    assert (score.p_value, score.family_wise_p, score.drift_place) == (0.01, 0.02, 11)
+
+
 def test_a_closer_look_moves_while_the_gain_grows_but_three_times_at_most():
     landscape = Landscape({0.0: 5.0, 1.0: 6.0, 2.0: 7.0, 3.0: 8.0, 4.0: 9.0})
     score = refined(landscape)
