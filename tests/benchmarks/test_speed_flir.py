@@ -5,6 +5,7 @@ Reproduces the rows of docs/measured.md, "Speed and memory", on reading and cali
 
 from __future__ import annotations
 
+import os
 import struct
 import subprocess
 import sys
@@ -132,19 +133,33 @@ print(seconds, int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read
 
 @pytest.mark.parametrize("frames", [10_000, 756_000])
 def test_opening_a_day_of_video(tmp_path: Path, frames: int) -> None:
+    """For the first time and again; cold, the headers are not in memory."""
     path = _sparse_video(tmp_path, frames)
     command = [sys.executable, "-c", OPENED, str(path), str(frames)]
-    seconds, peak = np.median(
-        [
-            list(map(float, subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()))
-            for _ in range(3)
-        ],
-        axis=0,
-    )
     size = path.stat().st_size
+    for cold, rounds in ((False, 3), (True, 1)):
+        turns = []
+        for turn in range(rounds):
+            for _ in ("for the first time", "again"):
+                if cold:
+                    _drop(path)
+                kept = {**os.environ, "THERMOFUSE_CACHE": str(tmp_path / f"{cold} {turn}")}
+                done = subprocess.run(command, capture_output=True, text=True, check=True, env=kept)
+                turns.append(list(map(float, done.stdout.split())))
+        first, again = np.median(np.array(turns).reshape(rounds, 2, 2), axis=0)
+        print(
+            f"\nopening {frames} frames, {size / 1e9:.0f} GB, {'cold' if cold else 'warm'}: {first[0]:.2f} s, again {again[0]:.2f} s, "
+            f"peak memory {first[1]:.0f} and {again[1]:.0f} MB"
+        )
+        assert max(first[1], again[1]) < 600
     path.unlink()
-    print(f"\nopening {frames} frames, {size / 1e9:.0f} GB: {seconds:.2f} s, peak memory {peak:.0f} MB")
-    assert peak < 600
+
+
+def _drop(path: Path) -> None:
+    """Drop a file from the system's memory."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
 def _sparse_video(folder: Path, frames: int) -> Path:

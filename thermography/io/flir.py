@@ -143,7 +143,8 @@ def index_frames(
     A file or frame that cannot be used is returned in `rejected`, never raised, so that one damaged file does not stop a series.
     The frames of a sequence are found from the ends of their records, because the magic of a header also occurs among pixels. The
     headers of every frame are read and checked, those of a long sequence compiled (`thermography.io.frame_index.header_scan`); pixels
-    and their checksums are checked when they are read.
+    and their checksums are checked when they are read. What was found of 20,000 frames or more is kept in the user's cache, or in the
+    folder that ``THERMOFUSE_CACHE`` names, and taken from there while size, time of change, first and last bytes of the file are the same.
 
     Examples
     --------

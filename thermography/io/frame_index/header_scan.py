@@ -5,6 +5,7 @@ stand at predicted places. Every one of them is read and checked as the first on
 directory, byte orders, lengths and places of the records, size and packing of the samples, that the frame is not truncated, and
 that a header or the end of the file follows. Camera, lens, calibrated range, time zone and names of sensors are compared with those of
 the first frame. The first frame that differs in any of these ends the run and is read field by field, which also finds what is wrong.
+What was found of a long run is kept for the next time (`thermography.io.frame_index.kept_columns`).
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ from thermography.io.fff_record import (
 from thermography.io.frame import CameraParameters, SampleLocation
 from thermography.io.frame_index.flir_frame import FlirFrameReference
 from thermography.io.frame_index.frame_list import FrameTable
+from thermography.io.frame_index.kept_columns import FEWEST_KEPT, keep, recall
 
 #: Frames whose headers are read and checked at once: few at first, because a run may end soon.
 _FIRST_BATCH, _LARGEST_BATCH = 8, 256
@@ -55,6 +57,8 @@ _RAW_HEAD = RAW_HEADER_SIZE + len(PNG_SIGNATURE)
 #: Rows as `_raw_fits` compares them: the samples of PNG and JPEG-LS begin so.
 _PNG_START = np.frombuffer(bytes(RAW_HEADER_SIZE) + PNG_SIGNATURE, np.uint8)
 _JPEGLS_START = np.frombuffer(bytes(RAW_HEADER_SIZE) + b"\xff\xd8\xff\xf7", np.uint8)
+#: Name under which the parameters that occur are kept.
+_SETS = "parameter_sets"
 _NO_TIME = np.iinfo(np.int64).min
 
 
@@ -238,6 +242,9 @@ def scan_table(file: BinaryIO, first: FlirFrameReference, size: int) -> FlirTabl
     layout = _layout(file, first)
     if layout is None:
         return None
+    kept = _recall(file, first, layout, size)
+    if kept is not None:
+        return kept
     largest = _LARGEST_BATCH if layout.expected.encoding == 0 else 1
     batch = min(_FIRST_BATCH, largest)
     reader = _HeaderReader(file, layout, first.segments[0][1], largest)
@@ -252,7 +259,27 @@ def scan_table(file: BinaryIO, first: FlirFrameReference, size: int) -> FlirTabl
         batch = min(4 * batch, largest)
     if not gathered.frames:
         return None
-    return FlirTable(first, layout.order, layout.names, gathered.columns(), list(known))
+    columns = gathered.columns()
+    if gathered.frames >= FEWEST_KEPT:
+        sets = np.array([list(data) for data in known], np.uint8)
+        keep(file, first.path, sum(first.segments[0]), {**columns._asdict(), _SETS: sets})
+    return FlirTable(first, layout.order, layout.names, columns, list(known))
+
+
+def _recall(file: BinaryIO, first: FlirFrameReference, layout: _Layout, size: int) -> FlirTable | None:
+    """Return the frames that a scan of this file found before, None where nothing fit is kept."""
+    start = sum(first.segments[0])
+    empty = _Columns.empty(0, layout.expected.sensors)
+    numbered = empty._replace(parameters=np.empty(0, np.uint32))
+    kept = recall(file, first.path, start, {**numbered._asdict(), _SETS: empty.parameters})
+    if kept is None:
+        return None
+    sets = kept.pop(_SETS)
+    columns = _Columns(**kept)
+    alike = len({len(column) for column in columns}) == 1
+    if not alike or start + columns.length.sum() > size or columns.parameters.max() >= len(sets):
+        return None
+    return FlirTable(first, layout.order, layout.names, columns, [row.tobytes() for row in sets])
 
 
 def _layout(file: BinaryIO, first: FlirFrameReference) -> _Layout | None:
