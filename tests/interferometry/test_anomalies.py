@@ -201,3 +201,75 @@ def test_one_wild_reading_counts_as_three_standard_deviations(rng: np.random.Gen
         z[20, 0, 5] = wild
         excess.append(anomalies_module._scatter_test(z, 1, np.random.default_rng(1))[0])
     np.testing.assert_array_equal(excess[0], excess[1])
+
+
+def test_the_smallest_p_value_of_a_kind_is_that_of_its_share_of_the_error_probability() -> None:
+    """400 orders with the measured one, a tenth of the error probability for slow motion, seven tenths for scatter."""
+    assert anomalies_module._least_p_value("slow", 399) == pytest.approx(1 / 400 / 0.1)
+    assert anomalies_module._least_p_value("scatter", 399) == pytest.approx(1 / 400 / 0.7)
+    assert anomalies_module._least_p_value("periodic", 399) == 0.0
+
+
+def test_the_power_of_a_wave_is_the_number_of_cycles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scargle's power in units of the variance, doubled: n for a wave of any amplitude and phase, chi-square (2) for noise."""
+    seconds = 252.0 * np.arange(60)
+    periodogram = anomalies_module._Periodogram(seconds)
+    # From three oscillations to one in three cycles.
+    np.testing.assert_allclose(periodogram.frequency * 59 * 252.0, np.arange(3.0, 20.0))
+    waves = [
+        a * np.cos(2 * np.pi * f * seconds + 0.7)
+        for a, f in zip((0.5, 3.0), periodogram.frequency[[0, 9]], strict=True)
+    ]
+    power = periodogram.power(np.array(waves))
+    # The frequencies fit into 59 cycles, and 60 are read.
+    np.testing.assert_allclose([power[0, 0], power[1, 9]], 60.0, rtol=0.05)
+    assert power[0, 1:].max() < 2.0
+    monkeypatch.setattr(anomalies_module, "_WAVES_AT_ONCE", 4)
+    np.testing.assert_allclose(periodogram.power(np.array(waves)), power)
+    # Seventeen frequencies of two series: chi-square of two degrees of freedom exceeds x with probability exp(-x / 2).
+    np.testing.assert_allclose(periodogram.p_values(np.array([20.0, 1.0])), [34 * np.exp(-10.0), 1.0])
+
+
+def test_slowness_and_steps_of_series_that_are_known() -> None:
+    """Ten cycles of -1 and ten of +1: sums of five are 5, so 4 * 25 / 20; alternation leaves the odd one of every five."""
+    step = np.repeat([-1.0, 1.0], 10)
+    alternating = np.tile([1.0, -1.0], 10)
+    np.testing.assert_allclose(anomalies_module._slowness(np.stack([step, alternating])), [5.0, 0.2])
+    # The difference of the means is 2, over a standard deviation of 1 times sqrt(20 / 100).
+    profile = anomalies_module._step_profile(step)
+    assert profile.size == 11 and profile[5] == pytest.approx(-2.0 * np.sqrt(5.0))
+    assert anomalies_module._largest_step(step) == pytest.approx(2.0 * np.sqrt(5.0))
+    assert anomalies_module._step_index(step) == 10
+    # At the first cycle that leaves a block before it: -1 against 5 / 15 of +1.
+    assert profile[0] == pytest.approx((-1.0 - 1 / 3) * np.sqrt(5 * 15 / 20))
+
+
+def test_a_step_is_slow_only_if_its_remainder_is() -> None:
+    alternating = 0.1 * np.tile([1.0, -1.0], 20)
+    step = np.repeat([0.0, 3.0], 20)
+    ramps = np.tile(np.linspace(-1.0, 1.0, 20), 2)
+    significant = {"step": {0: (0.01, 0), 1: (0.01, 1)}, "slow": {0: (0.01, 0), 1: (0.01, 1)}, "periodic": {}}
+    values = np.stack([step + alternating, step + ramps])
+    assert anomalies_module._one_kind_per_target(significant, values) == [("step", 0), ("slow", 1)]
+    periods = {"step": {}, "slow": {0: (0.01, 0), 1: (0.03, 1)}, "periodic": {0: (0.02, 0), 1: (0.03, 1), 2: (0.01, 0)}}
+    assert anomalies_module._one_kind_per_target(periods, values) == [("slow", 0), ("periodic", 1), ("periodic", 2)]
+
+
+def test_the_excess_of_a_target_is_the_largest_of_both_directions_and_of_either() -> None:
+    """Two targets, two readings from either side: sums over the root of their number."""
+    values = np.array([1.0, 1.0, 2.0, 0.0, -1.0, -3.0, 3.0, 1.0])
+    target, direction = np.repeat([0, 1], 4), np.tile([0, 0, 1, 1], 2)
+    excess = anomalies_module._excess(values, target, direction, np.full((2, 2), 2.0))
+    np.testing.assert_allclose(excess, [4.0 / 2.0, 4.0 / np.sqrt(2.0)])
+
+
+def test_a_permutation_test_ranks_every_series_among_the_largest_of_all(rng: np.random.Generator) -> None:
+    """Two series, of which the statistic takes the first cycle: by permutation each value leads equally often."""
+    values = np.array([[9.0, 1.0, 2.0, 3.0, 0.0], [2.0, 1.0, 3.0, 9.0, 0.0]])
+    orders = np.array([rng.permutation(5) for _ in range(99)])
+    first = values[:, orders[:, 0]]
+    strength, p = anomalies_module._permutation_test(values, lambda some: some[..., 0], orders)
+    scaled = (first - first.mean(axis=1, keepdims=True)) / first.std(axis=1, keepdims=True)
+    expected = (values[:, 0] - first.mean(axis=1)) / first.std(axis=1)
+    np.testing.assert_allclose(strength, expected)
+    np.testing.assert_allclose(p, [(1 + (scaled.max(axis=0) >= one - 1e-12).sum()) / 100 for one in expected])

@@ -44,6 +44,7 @@ def test_equations_2_3_and_5_to_the_letter(rng: np.random.Generator) -> None:
     assert result["standard_deviation"].values == pytest.approx(x.std(axis=0, ddof=1))
     assert result["mean_u"].values == pytest.approx(x.std(axis=0, ddof=1) / np.sqrt(40))
     assert result["upper"].values == pytest.approx(x.mean(axis=0) + 2 * x.std(axis=0, ddof=1))
+    assert result["lower"].values == pytest.approx(x.mean(axis=0) - 2 * x.std(axis=0, ddof=1))
 
 
 def test_chain_of_mean_differences_is_the_mean_profile(rng: np.random.Generator) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from fusion.alignment import align as module
 from fusion.alignment.align import AlignmentError, AxisGeometry, align, camera_on_laser_clock, cycle_bounds
 from interferometry.deviations import build_deviations
 
@@ -136,3 +137,55 @@ def test_the_measured_line_is_three_cells_wide():
     np.testing.assert_allclose(strip["axis_integral"].values[inside], 0.0, atol=1e-9)
     on_it = align(deviations(), fields(lambda x, y, s: 0.01 * s * (np.abs(y - 90.0) < 3.0) + 0 * x), AXIS)
     assert float(abs(on_it["axis_integral"].values[inside]).max()) > 1.0
+
+
+def test_the_mean_over_the_surroundings_of_a_target_is_centred_on_it():
+    """Rises that grow along the axis, or across it: inside the line their mean is the value at the target, beside it nothing."""
+    along = align(deviations(), fields(lambda x, y, s: 1e-3 * s * (500.0 - x) + 0 * y), AXIS)
+    expected = 1e-3 * (252.0 * np.arange(4))[:, None] * POSITIONS
+    np.testing.assert_allclose(along["local_rise_series"].values[:, 1:-1], expected[:, 1:-1], atol=1e-9)
+    # At the ends of the line only one side of the 7.5 mm is on it.
+    ends = along["local_rise_series"].values[-1, [0, -1]] / (1e-3 * 756.0)
+    np.testing.assert_allclose(ends, [3.75, 300.0 - 3.75], atol=0.7)
+    across = align(deviations(), fields(lambda x, y, s: 1e-3 * s * (y - 90.0) + 0 * x), AXIS)
+    np.testing.assert_allclose(across["local_rise_series"], 0.0, atol=1e-9)
+    np.testing.assert_allclose(across["axis_integral_series"], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("origin", "on_the_plan"),
+    [
+        ((699.0, 90.0), True),
+        ((701.0, 90.0), False),
+        ((301.0, 90.0), True),
+        ((299.0, 90.0), False),
+        ((500.0, 1.0), True),
+        ((500.0, -10.0), False),
+        ((500.0, 179.0), True),
+        ((500.0, 190.0), False),
+    ],
+)
+def test_the_line_may_run_to_the_edges_of_the_outermost_cells(origin, on_the_plan):
+    """Plan of 700 mm x 180 mm, travel of 300 mm towards smaller x."""
+    field = fields(lambda x, y, s: 0.01 * s + 0 * x + 0 * y)
+    if on_the_plan:
+        fused = align(deviations(), field, AxisGeometry(origin, (-1.0, 0.0)))
+        np.testing.assert_allclose(fused["axis_integral_series"].values[-1], 7.56 * POSITIONS)
+    else:
+        with pytest.raises(AlignmentError, match="the measured line leaves the plan"):
+            align(deviations(), field, AxisGeometry(origin, (-1.0, 0.0)))
+
+
+def test_frames_and_readings_must_overlap_in_time():
+    def seconds(*values):
+        return START + (np.array(values) * 1e9).astype("timedelta64[ns]")
+
+    readings = seconds(100.0, 200.0)
+    for frames in (seconds(0.0, 50.0, 150.0), seconds(0.0, 100.0), seconds(200.0, 300.0), seconds(0.0, 300.0)):
+        module._check_overlap(readings, frames)
+    for frames in (seconds(0.0, 50.0, 99.0), seconds(201.0, 300.0), seconds(150.0)):
+        with pytest.raises(AlignmentError, match="never meet"):
+            module._check_overlap(readings, frames)
+    module._check_overlap(readings[:1], seconds(0.0, 300.0))
+    with pytest.raises(AlignmentError, match="no reading has a time"):
+        module._check_overlap(np.full(2, np.datetime64("NaT", "ns")), seconds(0.0, 300.0))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from fusion.diagnosis import causes
+from fusion.diagnosis import diagnose as module
 from fusion.diagnosis.diagnose import (
     THRESHOLDS,
     _directions_sentence,
@@ -237,3 +238,60 @@ def test_a_walk_in_one_direction_pays_for_its_parameter_and_its_bar():
     case.random_walk.one_direction = 2.0 + 0.5 * np.log(100) + 1.0
     probability = _probabilities(case)
     assert probability["stick_slip"] / probability["structural"] == pytest.approx(np.e)
+
+
+def test_few_readings_have_their_degrees_of_freedom():
+    """Nine readings each, eight degrees of freedom: u = s / 4, so that 1.00 and 0.46 agree within 2 * hypot(0.25, 0.115) = 0.55."""
+    row = np.resize([1.0, -1.0], 9)
+    for negative_um, equal in ((0.46, True), (0.44, False)):
+        residual = SimpleNamespace(values=np.stack([row, row]), scatter_um=(1.0, negative_um))
+        assert _directions_sentence(residual).startswith("standard deviations equal") is equal
+
+
+def test_a_random_walk_needs_no_threshold_to_leave_the_cause_open():
+    (reason,) = _objections(fitted(), "slow", 0.4)
+    assert reason == "slow (serial p = 0.5), but neither local temperature nor a step explains it"
+
+
+def test_the_temperature_is_told_with_its_expanded_uncertainty_and_its_lag():
+    case = fitted(temperature={"coefficient": 0.3, "coefficient_u": 0.02, "best": 2})
+    case.residual = SimpleNamespace(values=np.resize([1.0, -1.0], (2, 100)), typical_um=0.4, scatter_um=(1.0, 1.0))
+    spread, sentence = module._support(case, "local_temperature")
+    assert spread == "standard deviation 1.00 µm over both approaches, typical of the other positions 0.40 µm"
+    assert sentence == (
+        "+0.300 ± 0.040 µm per K (k = 2) of local temperature rise, lag 1800 s (p = 0.001), hold-out log-likelihood +3.0 nats"
+    )
+
+
+def test_the_step_is_told_with_its_expanded_uncertainty_and_its_cycle():
+    case = fitted(step={"coefficient": -1.2, "coefficient_u": 0.1})
+    case.residual = SimpleNamespace(values=np.resize([1.0, -1.0], (2, 100)), typical_um=0.4, scatter_um=(1.0, 1.0))
+    case.step_cycle = 31
+    assert module._support(case, "step")[1] == (
+        "step of -1.20 ± 0.20 µm (k = 2) at cycle 31 (p = 0.001), hold-out log-likelihood +3.0 nats"
+    )
+
+
+def test_the_gain_of_an_approach_is_that_of_the_better_of_its_two_forms():
+    def case(one_direction, along_approach):
+        scatter = SimpleNamespace(both=-20.0, one_direction=one_direction, along_approach=along_approach)
+        return SimpleNamespace(scatter=scatter)
+
+    assert module._Case.approach_gain.fget(case(-14.0, -17.0)) == 6.0
+    assert module._Case.approach_gain.fget(case(-25.0, -17.0)) == 3.0
+
+
+def test_the_next_best_explanation_and_rejected_tests_are_told(monkeypatch):
+    case = fitted(step={"p_value": 0.2})
+    case.residual = SimpleNamespace(target=3)
+    monkeypatch.setattr(
+        module, "_probabilities", lambda case: {"structural": 0.6, "stick_slip": 0.3, "slow": 0.1, "step": 0.0}
+    )
+    monkeypatch.setattr(module, "_evidence", lambda case, probability: {})
+    monkeypatch.setattr(module, "_support", lambda case, leading: [])
+    told = module._judge(case, "both")
+    assert (told.cause, told.probability) == ("structural", 0.6)
+    assert told.against_it == (
+        "next best explanation: stick-slip, probability 0.30",
+        "sudden step: p = 0.2, ordinary slow drift would look the same",
+    )

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fusion.record import remainder as module
 from fusion.record.blocks import Record
 from fusion.record.model import RecordFit, fit_record
 from fusion.record.remainder import RecordRemainder, examine
@@ -135,3 +136,28 @@ def test_blocks_without_a_value_are_no_shape(rng):
     assert examined(replace(record, displacement=holed)).shape == "a rhythm of about 30 min"
     model = fit_record(record, [], np.ones(BLOCKS, bool))
     assert examine(model, np.zeros(2), rng).p_values["rhythm"] < 0.02
+
+
+def test_statistics_of_a_wave_that_is_known():
+    """Three turns of amplitude 2 in 24 blocks, in two channels: all power in one line of eleven, twice the mean at its top."""
+    blocks = np.arange(24)
+    wave = 2.0 * np.cos(2.0 * np.pi * 3.0 * blocks / 24.0)
+    switched = np.isin(blocks, [0, 8])
+    memory, line, excess = module._statistics(np.column_stack([0.6 * wave, 0.8 * wave]), switched)
+    correlation = [wave[k:] @ wave[:-k] / (wave @ wave) for k in range(1, 13)]
+    assert memory == pytest.approx(np.sum(np.square(correlation)))
+    assert line == pytest.approx(11.0) and module._strongest_line(wave)[0] == 3
+    assert excess == pytest.approx(2.0)
+    assert module._statistics(wave[:, None], np.zeros(24, bool))[2] == 0.0
+
+
+def test_a_wave_is_taken_out_at_its_own_frequency_between_the_lines():
+    """10.3 turns of amplitude 3 beside a small ramp, which stays."""
+    turns = 10.3 / BLOCKS
+    ramp = np.linspace(-0.1, 0.1, BLOCKS)
+    wave = 3.0 * np.cos(2.0 * np.pi * turns * BLOCK + 0.4)
+    frequency, left, share = module._without_wave(np.column_stack([wave + ramp, -wave]))
+    assert frequency == pytest.approx(turns, rel=1e-6)
+    assert share > 0.999
+    assert np.abs(left[:, 1]).max() < 1e-6
+    assert np.corrcoef(left[:, 0], ramp)[0, 1] > 0.99
