@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import codecs
-import gc
 import io
-import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -13,14 +10,16 @@ from enum import StrEnum
 from functools import reduce
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from fusion.beside import collect_garbage_less, second_process
 from fusion.endings import ExitCode, answering, failed_code, interrupt_ends_step, leave
-from fusion.terminal import Terminal, ascii_json, printable, printable_json
+from fusion.terminal import Terminal, print_json, printable
 
 if TYPE_CHECKING:
+    from fusion.beside import Beside
     from fusion.products.progress import Report
     from fusion.products.results import Results
 
@@ -51,6 +50,12 @@ class ExportFormat(StrEnum):
 def _answering(folders: Sequence[Path] = ()) -> AbstractContextManager[None]:
     """End a command as `fusion.endings` says; `folders` are those of its results."""
     return answering(errors, kept=lambda: _kept(folders))
+
+
+def _refuse(why: str) -> NoReturn:
+    """End a command that cannot be done."""
+    errors.print(f"thermofuse: {why}")
+    raise typer.Exit(ExitCode.BAD_INPUT)
 
 
 def _kept(folders: Sequence[Path]) -> str:
@@ -114,6 +119,7 @@ def run(
     wanted: Annotated[
         str, typer.Option(metavar="U", help="With --watch: wanted standard uncertainty of a position.")
     ] = "0.1 um",
+    processes: Annotated[int, typer.Option(min=1, max=2, help="2: a second process shares the work.")] = 2,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but faults.")] = False,
 ) -> None:
     """Run the whole pipeline on a campaign.
@@ -121,30 +127,30 @@ def run(
     Temperature maps, drift, anomalies, the closed loop, and report.html.
     """
     if len(campaigns) > 2:
-        errors.print("thermofuse: one campaign, or two of one machine, can be analysed at a time")
-        raise typer.Exit(ExitCode.BAD_INPUT)
+        _refuse("one campaign, or two of one machine, can be analysed at a time")
     if watch and len(campaigns) > 1:
-        errors.print("thermofuse: one campaign can be watched at a time")
-        raise typer.Exit(ExitCode.BAD_INPUT)
+        _refuse("one campaign can be watched at a time")
 
     places = [_place(text) for text in campaigns]
     folders = _folders(places, out)
-    with _answering([folder for _, folder in folders]):
+    if no_plugins:
+        from fusion.effects.plugins import leave_plugins_out
+
+        leave_plugins_out()
+    second = second_process(wanted=processes > 1 and not (resume or watch))
+    with _answering([folder for _, folder in folders]), second as beside:
         # The libraries may take seconds to load: something is seen before that.
         with _progress(quiet=quiet) as report:
             report("start", 0, 1)
-            from fusion.effects.plugins import leave_plugins_out
             from fusion.report.terminal import summary_table
 
             report("start", 1, 1)
-        if no_plugins:
-            leave_plugins_out()
         if watch:
             _watch(_here(places[0], "--watch follows"), until_idle_s=until_idle, wanted=wanted, quiet=quiet)
         join = _joining([_here(place, "two are joined from") for place in places]) if len(folders) == 2 else None
         for campaign, folder in folders:
             with _progress(quiet=quiet) as report:
-                results = _run_or_keep(campaign, folder, resume=resume, scheduler=scheduler, report=report)
+                results = _run_or_keep(campaign, folder, beside, resume=resume, scheduler=scheduler, report=report)
             if not quiet:
                 console.print(summary_table(results))
                 console.print(f"report: {(folder / 'report.html').resolve()}", soft_wrap=True)
@@ -172,7 +178,9 @@ def _watch(campaign: Path, *, until_idle_s: float | None, wanted: str, quiet: bo
                 console.print(live_line(state), soft_wrap=True)
 
 
-def _run_or_keep(campaign: Path | str, folder: Path, *, resume: bool, scheduler: str | None, report: Report) -> Results:
+def _run_or_keep(
+    campaign: Path | str, folder: Path, beside: Beside, *, resume: bool, scheduler: str | None, report: Report
+) -> Results:
     """Run a campaign, or read the results of a run that is whole, for which the libraries of the analysis are not loaded."""
     if resume and isinstance(campaign, Path):
         from fusion.campaign.config import load_campaign
@@ -185,10 +193,10 @@ def _run_or_keep(campaign: Path | str, folder: Path, *, resume: bool, scheduler:
             return kept
         from fusion.pipeline.run import run_loaded
 
-        return run_loaded(loaded, folder, resume=True, scheduler=scheduler, report=report)
+        return run_loaded(loaded, folder, resume=True, scheduler=scheduler, report=report, beside=beside)
     from fusion.pipeline.run import run_campaign
 
-    return run_campaign(campaign, folder, resume=resume, scheduler=scheduler, report=report)
+    return run_campaign(campaign, folder, resume=resume, scheduler=scheduler, report=report, beside=beside)
 
 
 def _joining(campaigns: list[Path]) -> Callable[[Sequence[Path], Path], Iterable[tuple[str, str]]]:
@@ -209,13 +217,6 @@ def _progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
         return
     with Reporter(console) as report:
         yield report
-
-
-def _print_json(content: object, told: Callable[[str], str] = str) -> None:
-    """Print JSON for other programs; `told` puts in the address of what was fetched."""
-    text = told(printable_json(json.dumps(content, indent=1, ensure_ascii=False)))
-    in_utf8 = codecs.lookup(sys.stdout.encoding or "utf-8").name == "utf-8"
-    sys.stdout.write((text if in_utf8 else ascii_json(text)) + "\n")
 
 
 def _place(text: str) -> Path | str:
@@ -368,7 +369,7 @@ def check(
         place, told = _fetched(campaign, whole=True, quiet=quiet or as_json)
         checked = check_campaign(place)
         if as_json:
-            _print_json(checked.as_json(), told)
+            print_json(checked.as_json(), told)
         else:
             for line in checked.lines(quiet=quiet):
                 console.print(told(line), soft_wrap=True)
@@ -466,7 +467,7 @@ def inspect(
                     console.print(f"  thumbnail: {picture}", soft_wrap=True)
         if as_json:
             files = [one.as_json() for one in looked_into]
-            _print_json({"files": files}, told)
+            print_json({"files": files}, told)
         if any(one.fails for one in looked_into):
             raise typer.Exit(ExitCode.BAD_INPUT)
 
@@ -505,7 +506,7 @@ def iso230(
     with _answering():
         found = read_test(test, cycles)
         if as_json:
-            _print_json(iso230_json(found.part, found.dataset))
+            print_json(iso230_json(found.part, found.dataset))
         elif as_csv:
             sys.stdout.write(iso230_csv(found.part, found.dataset))
         else:
@@ -532,9 +533,8 @@ def schema(
 
     schemas = {"results": results_schema, "campaign": campaign_schema, "recipe": recipe_schema}
     if name not in schemas:
-        errors.print(f'thermofuse: there is no schema "{name}"; write results, campaign or recipe')
-        raise typer.Exit(ExitCode.BAD_INPUT)
-    _print_json(schemas[name]())
+        _refuse(f'there is no schema "{name}"; write results, campaign or recipe')
+    print_json(schemas[name]())
 
 
 @app.command()
@@ -640,7 +640,7 @@ def compare(
     with _answering():
         pairs = compare_campaigns(results)
         if as_json:
-            _print_json(comparison_json(pairs))
+            print_json(comparison_json(pairs))
             return
         wide = console if console.is_terminal else Terminal(width=_TABLE_WIDTH)
         wide.print(print_table(side_by_side(pairs), "Side by side"))
@@ -681,8 +681,7 @@ def plan(
 
 def main() -> None:
     """Run the command line, as the script ``thermofuse`` or as a module; the exit code is that of the process."""
-    # Loading libraries and drawing charts make very many small objects, which are not garbage: looking for some takes a tenth of a run.
-    gc.set_threshold(50_000)
+    collect_garbage_less()
     # A terminal or pipe of another encoding than UTF-8 shows what it has no character for as its number.
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import re
-from collections.abc import Iterable
+import sys
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -60,6 +62,21 @@ def ascii_json(text: str) -> str:
         JSON over any number of lines.
     """
     return _BEYOND_ASCII.sub(lambda found: json.dumps(found.group())[1:-1], text)
+
+
+def print_json(content: object, told: Callable[[str], str] = str) -> None:
+    """Print JSON for other programs, in the encoding of the output or in ASCII.
+
+    Parameters
+    ----------
+    content : object
+        What JSON can hold.
+    told : callable
+        Puts in the address of what was fetched.
+    """
+    text = told(printable_json(json.dumps(content, indent=1, ensure_ascii=False)))
+    in_utf8 = codecs.lookup(sys.stdout.encoding or "utf-8").name == "utf-8"
+    sys.stdout.write((text if in_utf8 else ascii_json(text)) + "\n")
 
 
 def cell(text: str) -> str:

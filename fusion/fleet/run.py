@@ -177,6 +177,7 @@ class _Fleet:
         (self.out / log).parent.mkdir(parents=True, exist_ok=True)
         row = replace(self.rows[name], log=log)
         command = [sys.executable, "-m", "fusion.cli", "run", str(member.campaign), "--out", str(folder)]
+        command += ["--processes", "1"]
         if self.resume and folder.is_dir():
             command.append("--resume")
         threads = str(max((os.cpu_count() or 1) // self.jobs, 1))

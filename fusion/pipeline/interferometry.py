@@ -16,6 +16,7 @@ from fusion.consistency.readings import find_gross_readings
 from fusion.pipeline.iso230.evaluation import evaluate_standard
 from fusion.products.grouped import group, joined
 from fusion.products.notices import counted, listed
+from fusion.products.progress import Report, silent
 from fusion.products.results import Notice, Outcome
 from fusion.report.wording import moment
 from interferometry import neighbours
@@ -34,19 +35,22 @@ LABELS = {
 }
 
 
-def evaluate_interferometry(source: LaserInputs) -> Outcome:
+def evaluate_interferometry(source: LaserInputs, *, report: Report = silent) -> Outcome:
     """Evaluate the readings conventionally, by the paper's differences, by ISO 230-2 and by the joint estimate.
 
     Parameters
     ----------
     source : LaserInputs
         Inputs of the campaign; its readings are compensated.
+    report : callable
+        ``report(label, done, total)``, for progress.
 
     Returns
     -------
     Outcome
         Content of deviations.nc; parts ``iso230``, ``neighbours`` and ``drift``.
     """
+    report(LABELS["deviations"], 0, 1)
     deviations = source.deviations
     times = deviations["time"].values[np.isfinite(deviations["deviation"].values)]
     drift = None if np.isnat(times).all() else estimate_drift(deviations)
@@ -80,6 +84,7 @@ def evaluate_interferometry(source: LaserInputs) -> Outcome:
     if drift is not None:
         parts["time"] = {"first": utc(times.min()), "last": utc(times.max()), "zone": zone}
         parts["drift"] = _drift_part(deviations, drift)
+    report(LABELS["deviations"], 1, 1)
     return Outcome(dataset, parts, tuple(_reading_notices(deviations, drift, zone)))
 
 

@@ -7,13 +7,15 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Generic
 
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from fusion.alignment.contact_log import describe_sensors, join_sensors
+from fusion.beside import Beside, InTurn
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import compensate_by_camera, read_source
 from fusion.campaign.sources import CameraInputs, Inputs, LaserInputs, Source
@@ -54,6 +56,9 @@ from fusion.products.store import (
 )
 from fusion.remote import fetched_campaign, is_address, require_outside_cache
 
+if TYPE_CHECKING:
+    from fusion.report.charts.campaign import Drawn
+
 #: Where each stage keeps its Dataset; what ends up in fusion.nc is kept apart while it may have to be resumed.
 FILES = {
     "fields": "fields.nc",
@@ -64,8 +69,35 @@ FILES = {
 }
 #: The contact sensors, made from the logs in a moment.
 _SENSORS = "sensors.nc"
+#: Fields above this size are not sent to a second process, which would hold them once more, bytes.
+_MOST_SENT = 200e6
 #: What a run writes last.
 PAGES = ("results.json", "provenance.json", "report.html")
+
+
+@dataclass(frozen=True)
+class Stage(Generic[Product]):
+    """A stage of a run.
+
+    Attributes
+    ----------
+    name : str
+        Name of the stage.
+    tables : tuple of str
+        Tables of the campaign file that its result depends on, with the files that they name.
+    after : tuple of str
+        Stages that its result depends on; it is computed again whenever one of them is.
+    compute : callable
+        ``compute(report=report)`` computes the stage.
+    read : callable
+        Reads the product that a kept stage has written.
+    """
+
+    name: str
+    tables: tuple[str, ...]
+    after: tuple[str, ...]
+    compute: Callable[..., Outcome[Product]]
+    read: Callable[[Path], Product]
 
 
 @dataclass
@@ -90,8 +122,12 @@ class Run:
         Start of the run, UTC.
     address : str or None
         Where the campaign file was fetched from.
+    beside : Beside
+        Takes stages that the next one does not wait for.
     depends : tuple
         What every stage depends on beside campaign and files, as it was at the start.
+    measured : callable, optional
+        Returns the charts of what was measured.
     parts, notices : dict, list
         Parts of results.json and notices of the stages so far.
     seconds, keys : dict
@@ -108,45 +144,32 @@ class Run:
     seen: Mapping[str, FileState]
     started: datetime
     address: str | None = None
+    beside: Beside = field(default_factory=InTurn)
     depends: tuple[Any, ...] = field(default_factory=dependencies)
+    measured: Callable[[], Drawn] | None = None
     parts: dict[str, Any] = field(default_factory=dict)
     notices: list[Notice] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     keys: dict[str, str] = field(default_factory=dict)
     products: list[Path] = field(default_factory=list)
 
-    def stage(
-        self,
-        name: str,
-        tables: tuple[str, ...],
-        after: tuple[str, ...],
-        compute: Callable[[], Outcome[Product]],
-        read: Callable[[Path], Product],
-    ) -> Product:
+    def stage(self, stage: Stage[Product]) -> Product:
         """Return the product of a stage: computed and stamped, or kept where its input has not changed.
 
         Parameters
         ----------
-        name : str
-            Name of the stage.
-        tables : tuple of str
-            Tables of the campaign file that its result depends on, with the files that they name.
-        after : tuple of str
-            Stages that its result depends on; it is computed again whenever one of them is.
-        compute : callable
-            Computes the stage.
-        read : callable
-            Reads the product that a kept stage has written.
+        stage : Stage
+            What is to be done.
         """
-        key = self.key_of(name, tables, after)
+        name, key = stage.name, self.key_of(stage)
         path = self.folder / FILES[name]
         begun = time.monotonic()
         if self.stamps.done(name, key):
             note = self.stamps.note(name)
-            outcome = Outcome(read(path), note["parts"], tuple(Notice(**item) for item in note["notices"]))
+            outcome = Outcome(stage.read(path), note["parts"], tuple(Notice(**item) for item in note["notices"]))
             self.report(f"{interferometry.LABELS[name]} (kept)", 1, 1)
         else:
-            computed = compute()
+            computed = stage.compute(report=self.report)
             outcome = replace(computed, dataset=self.described(computed.dataset))
             write_dataset(path, outcome.dataset)
             self.stamps.record(
@@ -159,12 +182,35 @@ class Run:
         self.seconds[name] = time.monotonic() - begun
         return outcome.dataset
 
-    def key_of(self, name: str, tables: tuple[str, ...], after: tuple[str, ...]) -> str:
+    def begun(self, stage: Stage[Product]) -> Stage[Product]:
+        """Return the stage with its work begun beside what follows, where it is not kept; its product comes from `stage`.
+
+        Parameters
+        ----------
+        stage : Stage
+            Its work can be pickled.
+        """
+        if self.stamps.done(stage.name, self.key_of(stage)):
+            return stage
+        waiting = self.beside.start(stage.compute, self.report)
+        return replace(stage, compute=lambda *, report: waiting())
+
+    def draw_measured(self, fields: xr.Dataset | None, deviations: xr.Dataset | None) -> None:
+        """Begin to draw what was measured.
+
+        Parameters
+        ----------
+        fields, deviations : Dataset, optional
+            Of the stages.
+        """
+        self.measured = self.beside.start(partial(_draw_measured, fields, deviations))
+
+    def key_of(self, stage: Stage[Any]) -> str:
         """Return a digest of everything that the result of a stage depends on."""
-        asked = self.campaign.model_dump(mode="json", include=set(tables))
-        files = {file: self.inputs[file] for table in tables for file in self.campaign.files_of(table)}
+        asked = self.campaign.model_dump(mode="json", include=set(stage.tables))
+        files = {file: self.inputs[file] for table in stage.tables for file in self.campaign.files_of(table)}
         zone = self.campaign.campaign.time_zone
-        return digest(name, *self.depends, zone, asked, files, [self.keys[earlier] for earlier in after])
+        return digest(stage.name, *self.depends, zone, asked, files, [self.keys[earlier] for earlier in stage.after])
 
     def checkpoint(self, key: str) -> Path:
         """Return the folder that keeps the finished cycles of a long recording; folders of other inputs are removed."""
@@ -182,7 +228,13 @@ class Run:
 
 
 def run_campaign(
-    path: str | Path, out: str | Path, *, resume: bool = False, scheduler: str | None = None, report: Report = silent
+    path: str | Path,
+    out: str | Path,
+    *,
+    resume: bool = False,
+    scheduler: str | None = None,
+    report: Report = silent,
+    beside: Beside | None = None,
 ) -> Results:
     """Run the whole pipeline on a campaign file and write its products.
 
@@ -198,6 +250,8 @@ def run_campaign(
         Address of a dask scheduler for the per-frame work.
     report : callable
         ``report(label, done, total)``, for progress.
+    beside : Beside, optional
+        Second process that takes a part of the work, from `fusion.beside.second_process`; left out: all is done in this one.
 
     Returns
     -------
@@ -222,19 +276,28 @@ def run_campaign(
     if is_address(path):
         require_outside_cache(Path(out))
         with fetched_campaign(str(path), report=report) as mirror:
-            return _run_file(mirror.path, Path(out), str(path), resume=resume, scheduler=scheduler, report=report)
-    return _run_file(Path(path), Path(out), None, resume=resume, scheduler=scheduler, report=report)
+            return _run_file(
+                mirror.path, Path(out), str(path), resume=resume, scheduler=scheduler, report=report, beside=beside
+            )
+    return _run_file(Path(path), Path(out), None, resume=resume, scheduler=scheduler, report=report, beside=beside)
 
 
 def _run_file(
-    path: Path, folder: Path, address: str | None, *, resume: bool, scheduler: str | None, report: Report
+    path: Path,
+    folder: Path,
+    address: str | None,
+    *,
+    resume: bool,
+    scheduler: str | None,
+    report: Report,
+    beside: Beside | None,
 ) -> Results:
     """Run a campaign file of this machine, which may have been fetched from an address; keep a run that is whole."""
     campaign = load_campaign(path)
     if resume and (kept := kept_results(campaign, folder)) is not None:
         report("run (kept)", 1, 1)
         return kept
-    return run_loaded(campaign, folder, address, resume=resume, scheduler=scheduler, report=report)
+    return run_loaded(campaign, folder, address, resume=resume, scheduler=scheduler, report=report, beside=beside)
 
 
 # One thread for linear algebra: several give other last digits, and are many times slower on matrices of a hundred columns.
@@ -247,6 +310,7 @@ def run_loaded(
     resume: bool = False,
     scheduler: str | None = None,
     report: Report = silent,
+    beside: Beside | None = None,
 ) -> Results:
     """Run a campaign that was read, of which no whole run is in the folder, see `run_campaign`.
 
@@ -258,7 +322,7 @@ def run_loaded(
         Results folder.
     address : str, optional
         Where the campaign file was fetched from.
-    resume, scheduler, report
+    resume, scheduler, report, beside
         As for `run_campaign`.
     """
     seen = input_states(campaign)
@@ -267,18 +331,18 @@ def run_loaded(
         record = record_stage.read_source(campaign)
         report("reading and checking", 1, 1)
         with open_folder(folder, resume=resume):
-            return _run_record(_start_run(campaign, folder, seen, report, address), record)
+            return _run_record(_start_run(campaign, folder, seen, report, address, beside or InTurn()), record)
     source = read_source(campaign)
     checks = check_source(source)
     refuse_contradictions(checks)
     report("reading and checking", 1, 1)
     with open_folder(folder, resume=resume):
-        run = _start_run(campaign, folder, seen, report, address)
+        run = _start_run(campaign, folder, seen, report, address, beside or InTurn())
         return _run_instruments(run, source, checks, scheduler=scheduler)
 
 
 def _start_run(
-    campaign: Campaign, folder: Path, seen: Mapping[str, FileState], report: Report, address: str | None
+    campaign: Campaign, folder: Path, seen: Mapping[str, FileState], report: Report, address: str | None, beside: Beside
 ) -> Run:
     """Start a run in the folder that it holds: claim the products, and note what they are made from."""
     products = [name for name in FILES.values() if not name.startswith(".")]
@@ -287,7 +351,7 @@ def _start_run(
     inputs = hash_files(campaign.input_files(), report=report)
     stamps = StageStamps(folder)
     forget_run(stamps)
-    return Run(campaign, folder, report, stamps, inputs, seen, started, address)
+    return Run(campaign, folder, report, stamps, inputs, seen, started, address, beside)
 
 
 def _run_instruments(
@@ -329,30 +393,31 @@ def _join_sensors(run: Run, source: Inputs, fields: xr.Dataset | None) -> dict[s
 
 def _run_both(run: Run, source: Source, *, scheduler: str | None) -> tuple[dict[str, Any], list[Check]]:
     """Fields, deviations, and what both show together."""
+    begun = None if source.needs_camera else run.begun(_evaluation(source, after=()))
     fields = _reduce(run, source, ("thermography", "plan", "interferometry"), scheduler=scheduler)
+    if fields.nbytes > _MOST_SENT:
+        run.beside = InTurn()
     source, redone = compensate_by_camera(source, fields)
     run.notices.extend(redone)
-    deviations = _evaluate(run, source, after=("fields",) if source.needs_camera else ())
+    deviations = _evaluate(run, source, begun or _evaluation(source, after=("fields",)))
     fused, outside = interferometry.align_recordings(source, fields, deviations)
     run.notices.extend(outside)
     too_small = [*lacks_for_model(deviations), *lacks_for_correlation(fields)]
     modelled, left_out = choose_targets(fused)
     run.notices.extend(too_small or left_out)
+    correlation = None if too_small else run.begun(_correlation(source, fields, modelled))
+    run.draw_measured(fields, deviations)
+    checked = run.beside.start(partial(check_fields, source, fields, fused))
+    written = _write_maps(run, fields)
     maps = model = None
-    if too_small:
+    if correlation is None:
         run.parts["hotspots"] = attribution.describe_hotspots(fields)
     else:
-        maps = run.stage(
-            "correlation",
-            ("plan", "interferometry", "drivers"),
-            ("fields", "deviations"),
-            lambda: attribution.correlate_field(source, fields, modelled, report=run.report),
-            read_tree,
-        )
         model = _model(run, source, fields, modelled, deviations, after=("fields", "deviations"))
+        maps = run.stage(correlation)
     fusion = _write_fusion(run, fused, modelled, maps, model)
-    _write_maps(run, fields)
-    checks = [*check_plan(source, run.parts["registration"]), *check_fields(source, fields, fused)]
+    written()
+    checks = [*check_plan(source, run.parts["registration"]), *checked()]
     checks += [] if model is None else check_loop(run.parts["loop"], source)
     return {"fields": fields, "deviations": deviations, "fusion": fusion}, checks
 
@@ -361,14 +426,16 @@ def _run_camera(run: Run, source: CameraInputs, *, scheduler: str | None) -> tup
     """Fields and hotspots, by windows of time in place of cycles."""
     fields = _reduce(run, source, ("thermography", "plan"), scheduler=scheduler)
     run.parts["hotspots"] = attribution.describe_hotspots(fields)
-    _write_maps(run, fields)
+    run.draw_measured(fields, None)
+    _write_maps(run, fields)()
     checks = [*check_plan(source, run.parts["registration"]), *check_fields_alone(source, fields)]
     return {"fields": fields}, checks
 
 
 def _run_laser(run: Run, source: LaserInputs) -> tuple[dict[str, Any], list[Check]]:
     """Deviations, and the model of the drift from what was logged."""
-    deviations = _evaluate(run, source, after=())
+    deviations = _evaluate(run, source, _evaluation(source, after=()))
+    run.draw_measured(None, deviations)
     if "drift" not in run.parts:
         # Readings without times: nothing can be set beside them.
         return {"deviations": deviations}, []
@@ -384,28 +451,39 @@ def _run_laser(run: Run, source: LaserInputs) -> tuple[dict[str, Any], list[Chec
 
 def _reduce(run: Run, source: CameraInputs, tables: tuple[str, ...], *, scheduler: str | None) -> xr.Dataset:
     """The stage of the fields."""
-    checkpoint = run.checkpoint(run.key_of("fields", tables, ()))
-    fields = run.stage(
-        "fields",
-        tables,
-        (),
-        lambda: thermal.reduce_thermography(source, checkpoint=checkpoint, scheduler=scheduler, report=run.report),
-        read_dataset,
-    )
+    stage = Stage("fields", tables, (), partial(thermal.reduce_thermography, source, scheduler=scheduler), read_dataset)
+    checkpoint = run.checkpoint(run.key_of(stage))
+    fields = run.stage(replace(stage, compute=partial(stage.compute, checkpoint=checkpoint)))
     run.parts["field"] = describe_field(fields, run.parts["radiometry"])
     return fields
 
 
-def _evaluate(run: Run, source: LaserInputs, *, after: tuple[str, ...]) -> xr.Dataset:
-    """The stage of the deviations."""
-    deviations = run.stage(
-        "deviations", ("interferometry",), after, lambda: interferometry.evaluate_interferometry(source), read_dataset
+def _evaluation(source: LaserInputs, *, after: tuple[str, ...]) -> Stage[xr.Dataset]:
+    """What the stage of the deviations does."""
+    return Stage(
+        "deviations", ("interferometry",), after, partial(interferometry.evaluate_interferometry, source), read_dataset
     )
+
+
+def _evaluate(run: Run, source: LaserInputs, evaluation: Stage[xr.Dataset]) -> xr.Dataset:
+    """The stage of the deviations."""
+    deviations = run.stage(evaluation)
     # What is stated of the test is no input of the stage: a corrected serial number computes nothing again.
     run.parts["iso230"] = complete_sheet(
         run.parts["iso230"], deviations, campaign=run.campaign, environment=source.environment
     )
     return deviations
+
+
+def _correlation(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> Stage[xr.DataTree]:
+    """The stage of the correlation."""
+    return Stage(
+        "correlation",
+        ("plan", "interferometry", "drivers"),
+        ("fields", "deviations"),
+        partial(attribution.correlate_field, source, fields, fused),
+        read_tree,
+    )
 
 
 def _model(
@@ -420,20 +498,22 @@ def _model(
     """The stage of the model: closed loop, and positions that stand out."""
     modelled = deviations.sel(target=fused["target"].values)
     return run.stage(
-        "model",
-        ("plan", "interferometry", "sensors", "drivers", "model"),
-        after,
-        lambda: drift_model.model_drift(source, fields, fused, modelled, report=run.report),
-        read_dataset,
+        Stage(
+            "model",
+            ("plan", "interferometry", "sensors", "drivers", "model"),
+            after,
+            partial(drift_model.model_drift, source, fields, fused, modelled),
+            read_dataset,
+        )
     )
 
 
-def _write_maps(run: Run, fields: xr.Dataset) -> None:
-    """Write the maps of every cycle as OpenEXR."""
+def _write_maps(run: Run, fields: xr.Dataset) -> Callable[[], object]:
+    """Begin to write the maps of every cycle as OpenEXR; return what waits for them."""
     names = [f"maps/{thermal.map_name(cycle)}" for cycle in fields["cycle"].values]
     claim(run.folder, *names)
     run.products.extend(run.folder / name for name in names)
-    thermal.write_exr(run.folder / "maps", fields, report=run.report)
+    return run.beside.start(partial(thermal.write_exr, run.folder / "maps", fields), run.report)
 
 
 def _write_fusion(
@@ -448,7 +528,7 @@ def _write_fusion(
 def _run_record(run: Run, source: record_stage.RecordSource) -> Results:
     """Run a record: one table, one stage."""
     record = run.stage(
-        "record", ("record", "model"), (), lambda: record_stage.model_record(source, report=run.report), read_dataset
+        Stage("record", ("record", "model"), (), partial(record_stage.model_record, source), read_dataset)
     )
     return _finish(run, {"record": record})
 
@@ -467,15 +547,28 @@ def _discard_stale(run: Run, datasets: Mapping[str, Any]) -> None:
         run.stamps.forget(name)
 
 
+def _draw_measured(fields: xr.Dataset | None, deviations: xr.Dataset | None) -> Drawn:
+    """The charts of what was measured; their library takes a third of a second to import, which may be done beside the run."""
+    from fusion.report.charts.campaign import draw_measured
+
+    return draw_measured(fields, deviations)
+
+
+def _draw_found(results: Results, datasets: Mapping[str, Any]) -> Drawn:
+    """The charts of what was found."""
+    from fusion.report.charts.campaign import draw_found
+
+    return draw_found(results, datasets)
+
+
 def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
     """Write results, provenance and report from what the stages found."""
-    from fusion.report.html import render_report  # its charts take half a second to import, which a run needs last
-
     _discard_stale(run, datasets)
     run.parts["plugins"] = [asdict(plugin) for plugin in plugins()]
     run.notices.extend(note_changes(run.seen, input_states(run.campaign)))
     results = assemble(run.campaign.campaign.title, run.parts, run.notices)
     run.report("report", 0, 1)
+    found = run.beside.start(partial(_draw_found, results, datasets))
     content = write_json(run.folder / "results.json", results.as_json())
     provenance = describe_run(
         run.campaign,
@@ -487,7 +580,12 @@ def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
         address=run.address,
     )
     write_json(run.folder / "provenance.json", provenance)
-    write_text(run.folder / "report.html", render_report(results, provenance, datasets))
+    from fusion.report.html import render_report
+
+    measured = run.measured
+    drawn = None if measured is None else lambda: measured().with_more(found())
+    page = render_report(results, provenance, datasets, drawn=drawn)
+    write_text(run.folder / "report.html", page)
     stamp_run(run.stamps, run.campaign, run.inputs, [*run.products, *(run.folder / name for name in PAGES)])
     run.report("report", 1, 1)
     return results

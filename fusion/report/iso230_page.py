@@ -15,6 +15,7 @@ from fusion.errors import FusionError
 from fusion.products.grouped import group
 from fusion.products.results_axis import Iso230Part
 from fusion.products.store import write_text
+from fusion.report.charts.embedding import embed
 from fusion.report.charts.iso230 import plot_single_runs, plot_test
 from fusion.report.charts.readings import plot_windows
 from fusion.report.charts.style import Chart
@@ -81,7 +82,7 @@ def render_iso230(
     single = single_run_table(dataset) if part is None else None
     return render_page(
         "iso230.html.j2",
-        draw_iso230(part, dataset),
+        embed(draw_iso230(part, dataset)),
         title=title,
         summary={"iso230": standard, "premises": {"iso230": ""}},
         single=single,

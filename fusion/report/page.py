@@ -11,19 +11,18 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from fusion.report.charts.embedding import chart_scripts, embed
-from fusion.report.charts.style import Chart
+from fusion.report.charts.embedding import EmbeddedChart, chart_scripts
 from fusion.report.wording import number
 
 
-def render_page(template: str, charts: Mapping[str, Chart], **context: Any) -> str:
+def render_page(template: str, charts: Mapping[str, EmbeddedChart], **context: Any) -> str:
     """Return a page as HTML text.
 
     Parameters
     ----------
     template : str
         Name of a template in ``fusion/report/templates``.
-    charts : mapping of str to Chart
+    charts : mapping of str to EmbeddedChart
         By the name with which the template calls ``draw``; names that it calls and that are not here leave no trace.
     **context
         Further variables of the template.
@@ -42,7 +41,7 @@ def render_page(template: str, charts: Mapping[str, Chart], **context: Any) -> s
     own = Markup((templates / "page.js").read_text(encoding="utf-8"))
     scripts = (*chart_scripts(), own) if charts else (own,)
     return environment.get_template(template).render(
-        figures=embed(charts), scripts=scripts, policy=content_security_policy(scripts), **context
+        figures=charts, scripts=scripts, policy=content_security_policy(scripts), **context
     )
 
 

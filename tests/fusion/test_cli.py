@@ -129,7 +129,7 @@ def test_stopping_tells_what_is_kept_and_how_to_go_on(
 
     monkeypatch.setattr("fusion.pipeline.run.run_campaign", stopped)
     for out, kept in (
-        (results_folder, "fields, deviations, correlation, model, report"),
+        (results_folder, "fields, deviations, model, correlation, report"),
         (tmp_path, "no finished stage"),
     ):
         result = invoke("run", tmp_path / "campaign.toml", "--out", out)

@@ -210,7 +210,7 @@ class Answer:
 
 def ask(case: Case) -> Answer:
     """Run a case as a user would, without drawing its report."""
-    with tempfile.TemporaryDirectory() as base, mock.patch("fusion.pipeline.run.render_report", return_value=""):
+    with tempfile.TemporaryDirectory() as base, mock.patch("fusion.report.html.render_report", return_value=""):
         folder = Path(base)
         case.table().to_csv(folder / "record.csv", index=False)
         text = f'[campaign]\ntitle = "{case.name}"\n\n[record]\nfile = "record.csv"\n{case.keys}'

@@ -63,7 +63,7 @@ def run(seed: int) -> Run:
     with tempfile.TemporaryDirectory() as base, contextlib.ExitStack() as stack:
         folder = Path(base)
         write(recipe, folder / "campaign")
-        stack.enter_context(mock.patch("fusion.pipeline.run.render_report", return_value=""))
+        stack.enter_context(mock.patch("fusion.report.html.render_report", return_value=""))
         try:
             results = run_campaign(folder / "campaign" / "campaign.toml", folder / "out")
         except (FusionError, InterferometryError, ThermographyError) as error:

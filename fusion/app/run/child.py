@@ -8,6 +8,7 @@ from pathlib import Path
 
 import typer
 
+from fusion.beside import second_process
 from fusion.endings import answering
 from fusion.terminal import Terminal
 
@@ -30,12 +31,12 @@ def main(campaign: str, results: str, *more: str) -> int:
         Exit code of the process, as that of the command.
     """
     try:
-        with answering(Terminal(stderr=True, soft_wrap=True)):
+        with answering(Terminal(stderr=True, soft_wrap=True)), second_process() as beside:
             write_progress("start", 0, 1)
             from fusion.pipeline.run import run_campaign
 
             write_progress("start", 1, 1)
-            run_campaign(Path(campaign), Path(results), resume="--resume" in more, report=write_progress)
+            run_campaign(Path(campaign), Path(results), resume="--resume" in more, report=write_progress, beside=beside)
     except typer.Exit as ended:
         return ended.exit_code
     return 0
@@ -51,6 +52,7 @@ def write_progress(label: str, done: int, total: int) -> None:
     done, total : int
         Finished parts and their number.
     """
+    # In one piece: two processes may tell their progress at a time.
     sys.stdout.write(json.dumps({"label": label, "done": done, "total": total}) + "\n")
     sys.stdout.flush()
 

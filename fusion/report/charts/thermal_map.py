@@ -61,13 +61,11 @@ LAYERS = (
 )
 
 
-class ThermalMap(NamedTuple):
-    """The map with what the page says of it.
+class MapControls(NamedTuple):
+    """What the reader can choose of the map, and what the page says of it.
 
     Attributes
     ----------
-    chart : Chart
-        Figure with the last cycle; its tags carry the other cycles and quantities for the script of the page.
     quantities : list of str
         Entries of the menu.
     cycles : list of int
@@ -76,7 +74,6 @@ class ThermalMap(NamedTuple):
         What was thinned or averaged; empty where nothing was.
     """
 
-    chart: Chart
     quantities: list[str]
     cycles: list[int]
     note: str
@@ -88,7 +85,7 @@ def plot_thermal_map(
     position: xr.DataArray | None = None,
     *,
     sensors: Sequence[ContactSensorPart] = (),
-) -> ThermalMap:
+) -> tuple[Chart, MapControls]:
     """Draw the plan of the table with measured line, targets and hotspots.
 
     Parameters
@@ -104,7 +101,9 @@ def plot_thermal_map(
 
     Returns
     -------
-    ThermalMap
+    chart : Chart
+        Figure with the last cycle; its tags carry the other cycles and quantities for the script of the page.
+    controls : MapControls
 
     Notes
     -----
@@ -126,12 +125,8 @@ def plot_thermal_map(
     more = {name: np.diff(values, axis=0, prepend=np.int16(0)).ravel() for name, values in flat.items()}
     drawn.tags = [ColumnDataSource(more), {"scales": scales, "cycles": kept["cycle"].values.tolist()}]
     cycle = int(kept["cycle"][-1])
-    return ThermalMap(
-        Chart(drawn, _seen(kept, last, hotspots, cycle), _columns(kept, shown, cycle)),
-        [layer.words for layer in shown],
-        kept["cycle"].values.tolist(),
-        note,
-    )
+    chart = Chart(drawn, _seen(kept, last, hotspots, cycle), _columns(kept, shown, cycle))
+    return chart, MapControls([layer.words for layer in shown], kept["cycle"].values.tolist(), note)
 
 
 def draw_map(

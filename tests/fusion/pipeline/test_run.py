@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
 import pytest
 import xarray as xr
 
+from fusion.beside import Beside, second_process
 from fusion.pipeline.run import run_campaign
 from fusion.products.contracts import check
 from fusion.products.folder import MANIFEST, read_manifest
+from fusion.products.progress import Report
 from fusion.products.results import AxisLoop, read_results, results_schema
 from fusion.products.store import OutputError, file_sha256, read_dataset
 from thermography.contract import FIELDS
@@ -115,6 +120,36 @@ def test_a_whole_run_is_read_and_nothing_written(results_folder: Path, copied: P
     assert told == ["run (kept)"]
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
     assert results.as_json() == json.loads((out / "results.json").read_text())
+
+
+class Noting(Beside):
+    """A second process that notes what it is given."""
+
+    def __init__(self, second: Beside) -> None:
+        self.second, self.names = second, []
+
+    def start(self, work: Callable[..., Any], report: Report | None = None) -> Callable[[], Any]:
+        self.names.append(work.func.__name__)
+        return self.second.start(work, report)
+
+
+def test_a_second_process_takes_its_part_and_changes_nothing(
+    results_folder: Path, campaign_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fusion.beside._processors", lambda: 2)
+    with second_process() as second:
+        beside = Noting(second)
+        run_campaign(campaign_folder / "campaign.toml", tmp_path / "results", beside=beside)
+    assert beside.names == [
+        "evaluate_interferometry", "correlate_field", "_draw_measured", "check_fields", "write_exr", "_draw_found",
+    ]  # fmt: skip
+    for name in ("results.json", "maps/cycle_0001.exr"):
+        assert (tmp_path / "results" / name).read_bytes() == (results_folder / name).read_bytes()
+    charts, same = (
+        re.findall(r'id="figure-(\w+)"', (folder / "report.html").read_text())
+        for folder in (tmp_path / "results", results_folder)
+    )
+    assert charts == same and len(charts) > 20
 
 
 def test_an_older_result_is_not_overwritten(results_folder: Path, campaign_folder: Path) -> None:

@@ -66,7 +66,7 @@ def run_one(campaign: str, group: str, name: str, figures: bool) -> Row:
         truth = write(lie.world(RECIPES[campaign]), folder)
         lie.plant(folder)
         if not figures:
-            stack.enter_context(mock.patch("fusion.pipeline.run.render_report", return_value=""))
+            stack.enter_context(mock.patch("fusion.report.html.render_report", return_value=""))
         wrong: list[str] = []
         said: tuple[str, ...] = ()
         try:

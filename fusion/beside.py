@@ -1,0 +1,229 @@
+"""A second process beside a run, for work that the next stage does not wait for.
+
+Most of that work holds the interpreter's lock, so that threads would not shorten it.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import pickle
+import queue
+import signal
+import subprocess
+import sys
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import partial
+from importlib import import_module
+from typing import IO, TYPE_CHECKING, Any, TypeAlias, TypeVar
+
+from threadpoolctl import threadpool_limits
+
+if TYPE_CHECKING:
+    from fusion.products.progress import Report
+
+Answer = TypeVar("Answer")
+#: Work, and whether it reports.
+_Sent: TypeAlias = "tuple[Callable[..., Any], bool]"
+_PROGRESS, _RETURNED, _RAISED = "progress", "returned", "raised"
+#: What the second process loads while the first reads the campaign.
+_LIBRARIES = ("fusion.pipeline.run", "fusion.report.html")
+
+
+class Beside(ABC):
+    """Takes work that is not waited for at once."""
+
+    @abstractmethod
+    def start(self, work: Callable[..., Answer], report: Report | None = None) -> Callable[[], Answer]:
+        """Begin a piece of work.
+
+        Parameters
+        ----------
+        work : callable
+            A function of a module, or a `functools.partial` of one; it, its arguments and what it returns can be pickled.
+        report : callable, optional
+            ``report(label, done, total)``, which the work is given as its argument ``report``; it may be called from another thread.
+            None: the work takes no argument.
+
+        Returns
+        -------
+        callable
+            Waits for the work and returns, or raises, what it came to.
+        """
+
+
+class InTurn(Beside):
+    """No second process: the work is done when it is asked for."""
+
+    def start(self, work: Callable[..., Answer], report: Report | None = None) -> Callable[[], Answer]:
+        """Return the work itself, see `Beside.start`.
+
+        Parameters
+        ----------
+        work : callable
+            The work.
+        report : callable, optional
+            For progress.
+        """
+        return partial(work, **_given(report))
+
+
+class _SecondProcess(Beside):
+    """Sends work through a pipe, one piece after the other."""
+
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        self._process = process
+        self._line = ThreadPoolExecutor(1, "beside")
+
+    def start(self, work: Callable[..., Answer], report: Report | None = None) -> Callable[[], Answer]:
+        """Send the work, see `Beside.start`. Where the process has ended, for want of memory say, the work is done here when asked for.
+
+        Parameters
+        ----------
+        work : callable
+            The work.
+        report : callable, optional
+            For progress.
+        """
+        answer = self._line.submit(self._send, work, report)
+
+        def wait() -> Answer:
+            try:
+                kind, content = answer.result()
+                # Not before it is asked for: what it holds may have to be imported here.
+                value = pickle.loads(content)
+            except Exception:
+                # The process has ended, or sent what cannot be read here: what is wrong with the work shows when it is done again.
+                return work(**_given(report))
+            if kind == _RAISED:
+                raise value
+            returned: Answer = value
+            return returned
+
+        return wait
+
+    def _send(self, work: Callable[..., Any], report: Report | None) -> tuple[str, bytes]:
+        """Send work, pass its progress on, and return how it ended, and with what, pickled."""
+        to_second, from_second = self._process.stdin, self._process.stdout
+        assert to_second is not None and from_second is not None
+        # Whole before it is sent: half of what cannot be pickled would be read as the beginning of the next piece.
+        to_second.write(pickle.dumps((work, report is not None), pickle.HIGHEST_PROTOCOL))
+        to_second.flush()
+        while (said := pickle.load(from_second))[0] == _PROGRESS:
+            if report is not None:
+                report(*said[1])
+        answer: tuple[str, bytes] = said
+        return answer
+
+    def end(self) -> None:
+        """End the process, whatever it is doing."""
+        self._process.kill()
+        self._process.wait()
+        self._line.shutdown(cancel_futures=True)
+        for pipe in (self._process.stdin, self._process.stdout):
+            assert pipe is not None
+            with suppress(OSError):
+                pipe.close()
+
+
+def _processors() -> int:
+    """Return how many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def collect_garbage_less() -> None:
+    """Let a process that loads libraries and draws charts look for garbage seldom: the very many small objects that it makes are none.
+
+    Looking takes a tenth of a run.
+    """
+    gc.set_threshold(50_000)
+
+
+def _given(report: Report | None) -> dict[str, Report]:
+    """Return the arguments that work is called with."""
+    return {} if report is None else {"report": report}
+
+
+@contextmanager
+def second_process(*, wanted: bool = True, libraries: Sequence[str] = _LIBRARIES) -> Iterator[Beside]:
+    """Start a process of the same interpreter that loads its libraries at once, and end it at the end.
+
+    Parameters
+    ----------
+    wanted : bool
+        False: the work is done in this process. So it is too where this process may use one processor alone.
+    libraries : sequence of str
+        Modules that the second process imports before any work.
+
+    Yields
+    ------
+    Beside
+    """
+    if not wanted or _processors() < 2:
+        yield InTurn()
+        return
+    process = subprocess.Popen(
+        [sys.executable, "-m", __name__, *libraries], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    second = _SecondProcess(process)
+    try:
+        yield second
+    finally:
+        second.end()
+
+
+def main(libraries: Sequence[str]) -> None:
+    """Do the work that comes from the first process until that closes the pipe, then end at once.
+
+    Parameters
+    ----------
+    libraries : sequence of str
+        Modules that are imported first.
+    """
+    collect_garbage_less()
+    # Ctrl-C reaches both; the first process decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    answers = os.fdopen(os.dup(1), "wb")
+    # Whatever a library prints must not come between the answers.
+    os.dup2(2, 1)
+    waiting: queue.Queue[_Sent] = queue.Queue()
+    threading.Thread(target=_receive, args=(sys.stdin.buffer, waiting), daemon=True).start()
+    for name in libraries:
+        import_module(name)
+    with threadpool_limits(limits=1, user_api="blas"):
+        while True:
+            _answer(*waiting.get(), answers)
+
+
+def _receive(pipe: IO[bytes], waiting: queue.Queue[_Sent]) -> None:
+    """Take in work; where the first process has ended, or sends what cannot be read, there is nothing left to do."""
+    try:
+        while True:
+            waiting.put(pickle.load(pipe))
+    except EOFError:
+        os._exit(0)
+    finally:
+        os._exit(1)
+
+
+def _answer(work: Callable[..., Any], reports: bool, answers: IO[bytes]) -> None:
+    """Do a piece of work; send its progress where it reports, then what it came to or what it raised."""
+
+    def send(kind: str, content: Any) -> None:
+        pickle.dump((kind, content), answers, pickle.HIGHEST_PROTOCOL)
+        answers.flush()
+
+    try:
+        value = work(**_given((lambda *progress: send(_PROGRESS, progress)) if reports else None))
+    except Exception as error:
+        send(_RAISED, pickle.dumps(error, pickle.HIGHEST_PROTOCOL))
+    else:
+        send(_RETURNED, pickle.dumps(value, pickle.HIGHEST_PROTOCOL))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
