@@ -20,9 +20,12 @@ import pytest
 import xarray as xr
 from flirpy.io.seq import Seq
 
+from tests.benchmarks.test_speed_fields import median_of, take_turns
 from tests.thermography.flir_mutations import frame
 from thermography.io.flir import index_frames, read_frame
 from thermography.io.flir_writer import write_jpeg, write_sequence
+from thermography.io.frame import FrameReference
+from thermography.io.frame_index.by_threads import call_by_threads, usable_threads
 from thermography.io.frame_index.flir_frame import FlirFrameReference
 from thermography.io.xarray_backend import FlirBackendEntrypoint
 from thermography.radiometry.planck import calibrate
@@ -77,6 +80,36 @@ def test_jpeg_to_temperature_against_flyr(real_file, tmp_path: Path, payload: st
     # The two agree to what the half-path formula errs, 0.1 K near ambient and 0.2 K at 97 degC: both do the whole work.
     np.testing.assert_allclose(_ours(path), flyr.unpack(str(path)).celsius, atol=0.1, rtol=0.003)
     _compare(f"R-JPEG {payload}", lambda: _ours(path), lambda: flyr.unpack(str(path)).celsius, peer="flyr", repeats=30)
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("payload", ["raw", "png 640 x 480", "png 128 x 96"])
+def test_folder_of_jpegs_to_temperature_against_flyr(real_file, tmp_path: Path, payload: str) -> None:
+    """From a list of files to the warmest pixel of each, by threads, and to one array of temperatures; flyr reads ten of the files."""
+    files, theirs = 100, 10
+    original = read_frame(real_file(C3X if payload.endswith("96") else SC660))
+    paths = [tmp_path / f"{number:03}.jpg" for number in range(files)]
+    for second, path in enumerate(paths):
+        time_then = original.time + np.timedelta64(second, "s")
+        write_jpeg(path, original.counts, original.parameters, time_then, encoding=payload[:3])  # type: ignore[arg-type]
+    threads = usable_threads()
+
+    def warmest(reference: FrameReference) -> float:
+        return float(calibrate(reference.read_counts(), reference.parameters).max())
+
+    works: list[Callable[[], object]] = [
+        lambda: list(call_by_threads(warmest, index_frames(paths)[0], threads)),
+        lambda: xr.open_dataset(paths, engine=FlirBackendEntrypoint)["temperature"].load(),
+        lambda: index_frames(paths),
+        lambda: [flyr.unpack(str(path)).celsius.max() for path in paths[:theirs]],
+    ]
+    wall, processor = take_turns(*works, rounds=7)
+    ratios, of_processor = (times[3] / theirs * files / times[:2] for times in (wall, processor))
+    each, whole = (f"{median_of(ratios[i])} x flyr, by processor time {median_of(of_processor[i])} x" for i in range(2))
+    print(
+        f"\n{files} R-JPEG {payload}, {threads} threads: {median_of(files / wall[0])} frames/s, {each}; "
+        f"as one array {whole}; headers {1e6 * np.median(processor[2]) / files:.0f} us of processor a file"
+    )
 
 
 def test_sequence_to_temperature_against_flirpy(tmp_path: Path) -> None:
