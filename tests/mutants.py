@@ -36,7 +36,12 @@ from cosmic_ray.plugins import get_operator, operator_names
 
 _FORK = multiprocessing.get_context("fork")
 #: Quick tests elsewhere that hold promises of a module, beside the file of its name.
-_ALSO: dict[str, tuple[str, ...]] = {}
+_ALSO = {
+    "interferometry/drift/kalman.py": (
+        "tests/interferometry/drift/test_gls.py",
+        "tests/interferometry/drift/test_state_space.py",
+    )
+}
 #: Decorators that change no value, only speed and form.
 _FORM = re.compile("njit|dataclass")
 

@@ -273,3 +273,13 @@ def test_a_permutation_test_ranks_every_series_among_the_largest_of_all(rng: np.
     expected = (values[:, 0] - first.mean(axis=1)) / first.std(axis=1)
     np.testing.assert_allclose(strength, expected)
     np.testing.assert_allclose(p, [(1 + (scaled.max(axis=0) >= one - 1e-12).sum()) / 100 for one in expected])
+
+
+def test_one_outlier_is_marked_from_its_percentage_point_on() -> None:
+    """Ten values, one side at 0.05: 2.176 standard deviations (Grubbs 1969, Technometrics 11, 1, table 1)."""
+    nine = np.linspace(-1.0, 1.0, 9)
+    for deviate, marked in ((2.16, False), (2.19, True)):
+        # With x beside nine values of mean 0 and sum of squares q, x - mean = 0.9 x and 9 s^2 = q + 0.9 x^2.
+        x = np.sqrt((nine**2).sum() * deviate**2 / 9.0 / (0.81 - 0.1 * deviate**2))
+        found = generalised_esd(np.append(nine, x), most=1, high_only=True)
+        assert found.tolist() == [False] * 9 + [marked]

@@ -85,6 +85,10 @@ def test_a_family_wise_p_value_is_the_rank_among_the_simulated_maxima():
     (p,), threshold = module._family_wise([np.array([0.5, 10.0, 18.5, 25.0])], maxima, np.zeros(1))
     np.testing.assert_allclose(p, [20 / 20, 11 / 20, 2 / 20, 1 / 20])
     assert threshold[0] == pytest.approx(19.0)
+    # Of 39 the second largest has p = 2 / 40; nine cannot reach the level, and their largest is the limit.
+    for draws, limit in ((39, 38.0), (9, 9.0)):
+        _, threshold = module._family_wise([np.array([0.5])], np.arange(1.0, draws + 1.0)[None, :], np.zeros(1))
+        assert threshold[0] == pytest.approx(limit)
 
 
 def test_every_row_is_ranked_among_the_largest_maxima_of_all_rows():
@@ -137,7 +141,7 @@ def test_the_detection_limit_is_the_threshold_and_the_quantile_of_80_percent_pow
 def test_false_discovery_rates_follow_benjamini_and_hochberg():
     """Of 99 pooled values 49 reach the statistic 1, 4 the statistic 2, and none 3: p = 0.5, 0.05, 0.01."""
     counts = np.zeros(module._BINS.size - 1)
-    counts[[0, 12, 21]] = [50, 45, 4]
+    counts[[0, 9, 12, 21]] = [30, 20, 45, 4]
     q = module._false_discovery(np.array([1.0, 3.0, 2.0]), counts)
     np.testing.assert_allclose(q, [0.5, 3 * 0.01, 1.5 * 0.05])
     # A smaller p-value never has the larger q-value: 3 of 4 columns at p = 0.05 pull the fourth down with them.
@@ -169,6 +173,7 @@ def test_the_width_of_a_tile_changes_nothing_and_progress_reaches_the_end(rng, m
         np.testing.assert_allclose(parts[name].statistic, test.statistic, atol=1e-4)
         np.testing.assert_allclose(parts[name].coefficient, test.coefficient, rtol=1e-4)
         assert parts[name].p_value.tolist() == test.p_value.tolist()
+        np.testing.assert_allclose(parts[name].q_value, test.q_value, rtol=1e-2)
 
 
 def test_a_series_with_a_missing_reading_is_permuted_as_the_others(rng, monkeypatch):

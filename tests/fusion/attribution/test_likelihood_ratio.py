@@ -84,6 +84,8 @@ def test_redrawn_series_have_the_fitted_drift(rng):
     seconds = np.arange(100) * 252.0
     values = np.cumsum(rng.standard_normal(100)) * 0.5 + 0.1 * rng.standard_normal(100)
     bank = null_bank(values, seconds, np.ones(100), np.ones((100, 1)))
+    # 0.5 um a cycle of 252 s are 1.9 um in an hour; the grid has steps of three.
+    assert 0.6 < bank.drift_per_hour < 6.0
     orders = np.argsort(rng.random((400, 100)), axis=1)
     drawn = resample(bank, orders, rng=rng)
     # Increments carry the drift: 99 measured ones know their size to 7 %, the draws add the spread of the grid (factor 3 in size).
@@ -163,6 +165,10 @@ def test_the_noise_of_a_white_series_is_its_root_mean_square_in_any_unit(rng):
         bank = null_bank(values, seconds, np.full(400, variance), np.empty((400, 0)), integrated=False)
         assert bank.fitted.order == 0 and bank.freedom == 400
         assert bank.sigma == pytest.approx(np.sqrt(np.mean(values**2)))
+    # A regressor of given length is known to sigma over that length.
+    regressor = rng.standard_normal((400, 1)).astype(np.float32)
+    null_u = estimate_effects(bank, regressor).null_u
+    assert null_u[0] == pytest.approx(bank.sigma / np.linalg.norm(regressor), rel=1e-5)
     drawn = resample(with_odds(bank, {0: 1.0}), np.zeros((50, 400), int), rng=rng, gaussian=True)
     # 20,000 normal values: 4 standard deviations of their root mean square are 2 %; none beyond 6 sigma, as a ratio of normals has.
     assert np.sqrt(np.mean(drawn**2)) == pytest.approx(bank.sigma, rel=0.02)

@@ -31,6 +31,8 @@ def test_a_source_that_both_sessions_show_is_a_cause(first):
     joint = verdict(comparison)
     assert joint.verdict == "attributable"
     assert joint.p_value <= 0.05
+    # 99 simulated series each.
+    assert comparison.least_p == (0.01, 0.01)
     assert simulator.distance_cells(joint.y_mm / 10 - 0.5, joint.x_mm / 10 - 0.5, 0) <= 7
     assert (comparison.maps["p_value"].sel(channel="joint") <= 0.05).any()
 
@@ -138,7 +140,7 @@ def test_a_place_on_which_both_agree_is_told_apart_from_its_neighbour():
     assert (second.x_mm, second.agrees, second.cause, second.shown_by) == (345.0, True, False, (0, 1))
     assert first.agreed_near_mm == (345.0, 155.0, 100.0) and not first.agrees
     # A cause at that place already, be it in another part of the drift, is not listed a second time.
-    cause = module._source_at(pair, "common", (345.0, 115.0), (11, 34), (0, 1), True)
+    cause = module._source_at(pair, "common", (345.0, 105.0), (10, 34), (0, 1), True)
     assert module._tell_apart([cause], [agreed], plan, {"joint": pair}) == [cause]
     # A cause elsewhere hides nothing.
     far = module._source_at(pair, "common", (290.0, 155.0), (15, 29), (0, 1), True)
@@ -187,17 +189,50 @@ def test_the_candidate_of_a_cell_is_itself_or_the_mode_that_has_its_peak_there()
     assert module._candidates(session_by_hand(3.0), "joint")["p_value"][1, 2] == 0.5
 
 
-def test_a_candidate_is_seen_from_every_cell_within_reach_and_from_no_other():
+def test_a_session_without_modes_has_its_cells(monkeypatch):
+    plan = session_by_hand().to_dataset()
+    found, none = (xr.DataTree(plan.assign_attrs(verdict=verdict)) for verdict in ("attributable", "not attributable"))
+    assert module._candidates(found, "joint")["p_value"][1, 2] == 0.5
+    monkeypatch.setattr(
+        module, "find_source", lambda session: SimpleNamespace(kind="cell", channel="joint", x_mm=5.0, y_mm=15.0)
+    )
+    assert module._sources_of(found) == [("joint", 5.0, 15.0, True)]
+    assert module._sources_of(none) == []
+
+
+def test_every_mode_that_passes_is_a_source_of_the_part_of_the_drift_that_it_goes_with_most(monkeypatch):
+    """Modes: passes in both parts, with 2.5 and 1.9 thresholds; in the second alone, and adds nothing; in none."""
+    dims = ("channel", "mode")
+    modes = xr.Dataset(
+        {
+            "statistic": (dims, [[25.0, 40.0, 1.0], [19.0, 12.0, 1.0]]),
+            "threshold": ("channel", [10.0, 10.0]),
+            "p_value": (dims, [[0.01, 0.06, 0.9], [0.02, 0.05, 0.9]]),
+            "p_beside": (dims, [[np.nan, 0.01, 0.9], [0.8, 0.3, 0.9]]),
+            "at_x": ("mode", [10.0, 20.0, 30.0]),
+            "at_y": ("mode", [1.0, 2.0, 3.0]),
+        },
+        {"channel": ["common", "joint"]},
+    )
+    session = xr.DataTree(xr.Dataset(attrs={"verdict": "attributable"}), children={"modes": xr.DataTree(modes)})
+    monkeypatch.setattr(module, "find_source", lambda session: SimpleNamespace(kind="mode"))
+    # The leading mode has none beside it, and counts as told apart.
+    assert module._sources_of(session) == [("common", 10.0, 1.0, True), ("joint", 20.0, 2.0, False)]
+
+
+@pytest.mark.parametrize("reach", [2, 3])
+def test_a_candidate_is_seen_from_every_cell_within_reach_and_from_no_other(reach):
     statistic = np.zeros((7, 8))
     statistic[3, 4] = 5.0
     statistic[0, 0] = 1.0
     row, column = np.mgrid[:7, :8]
     blank = {name: np.zeros((7, 8)) for name in ("p_value", "sensitivity", "sensitivity_u", "lag")}
-    found = module._strongest_nearby({"statistic": statistic, "x": column, "y": row, **blank}, 2)
-    near = np.hypot(row - 3, column - 4) <= 2
+    found = module._strongest_nearby({"statistic": statistic, "x": column, "y": row, **blank}, reach)
+    near = np.hypot(row - 3, column - 4) <= reach
     assert ((found["statistic"] == 5.0) == near).all()
     assert (found["x"][near] == 4).all() and (found["y"][near] == 3).all()
-    assert found["statistic"][0, 2] == found["statistic"][1, 1] == 1.0 and found["statistic"][1, 2] == 0.0
+    # Of two within reach the stronger one is seen.
+    assert found["statistic"][0, 1] == 1.0 and found["statistic"][6, 0] == 0.0
 
 
 def test_two_sizes_at_one_place_are_told_with_both_values():

@@ -122,3 +122,12 @@ def test_the_most_prominent_come_first_and_no_more_than_asked_for():
     field = plane((120.0, 90.0, 1.0, 20.0), (350.0, 90.0, 3.0, 20.0), (580.0, 90.0, 2.0, 20.0))
     assert [round(spot.x_mm) for spot in detect_hotspots(field)] == [350, 580, 120]
     assert [round(spot.x_mm) for spot in detect_hotspots(field, limit=2)] == [350, 580]
+
+
+@pytest.mark.parametrize(
+    ("place", "at_edge"),
+    [((2.5, 92.5), True), ((697.5, 92.5), True), ((302.5, 2.5), True), ((302.5, 177.5), True), ((302.5, 92.5), False)],
+)
+def test_a_zone_that_reaches_any_edge_is_marked(place, at_edge):
+    (spot,) = detect_hotspots(plane((*place, 3.0, 20.0)))
+    assert spot.at_edge is at_edge
