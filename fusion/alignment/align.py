@@ -6,6 +6,7 @@ The camera sees the table with the axis at position 0; the point of the table un
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from fusion._typing import Array
-from fusion.alignment.reflection_patch import find_switching_patch
+from fusion.alignment.reflection_patch import find_switching_patch, seen_throughout
 from fusion.errors import FusionError
 
 _DIMS = ("cycle", "direction", "target")
@@ -241,23 +242,39 @@ def _reduce_fields(fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -
     Where a patch of the field switches like a reflection, its shares in the mean rise and in the integral are given beside them. The
     rise counts from the first frame; cells that are not seen in every frame are left out of the mean.
     """
-    rise = fields["frame_temperature"].values.astype(float)
-    rise -= rise[0].copy()
-    seen = np.isfinite(rise).all(axis=0)
+    frames = fields["frame_temperature"].values
+    seen = seen_throughout(frames)
     if not seen.any():
         raise AlignmentError("no plan cell is seen by every frame; check the registration and the plan's size")
-    mean_rise = rise[:, seen].mean(axis=1)
+    mean_rise = np.concatenate([rise[:, seen].mean(axis=1) for rise in rise_since_first(frames)])
     line = MeasuredLine(fields, axis, position_mm)
-    samples = line.sample(rise)
+    samples = line.sample_rise(frames)
     reach = line.reach
     local = np.stack([samples[:, max(0, k - reach) : k + reach + 1].mean(axis=1) for k in line.nearest], axis=1)
     series = {"mean_rise": mean_rise, "axis_integral": line.integrate(samples), "local_rise": local}
-    patch = find_switching_patch(rise)
+    patch = find_switching_patch(frames)
     if patch is not None:
         pattern = line.integrate(line.sample(patch.pattern[None]))[0]
         series["patch_mean_rise"] = patch.course * patch.pattern[seen].mean()
         series["patch_axis_integral"] = patch.course[:, None] * pattern
     return series
+
+
+def rise_since_first(frames: Array) -> Iterator[Array]:
+    """Yield the rise of frames since the first one, some at a time: in double precision all frames of a long test fill the memory.
+
+    Parameters
+    ----------
+    frames : (time, y, x) ndarray, degC
+        Of any precision.
+
+    Yields
+    ------
+    (some, y, x) ndarray, K
+    """
+    first = frames[0].astype(float)
+    for start in range(0, len(frames), _FRAMES_AT_ONCE):
+        yield frames[start : start + _FRAMES_AT_ONCE].astype(float) - first
 
 
 def _cell_size(fields: xr.Dataset) -> float:
@@ -318,7 +335,13 @@ class MeasuredLine:
     def sample(self, frames: Array) -> Array:
         """Return frames (time, y, x) along the line, (time, sample), in their unit; gaps are interpolated along the line."""
         starts = range(0, len(frames), _FRAMES_AT_ONCE)
-        return np.concatenate([self._sample_some(frames[start : start + _FRAMES_AT_ONCE]) for start in starts])
+        return np.concatenate(
+            [self._sample_some(frames[start : start + _FRAMES_AT_ONCE].astype(float)) for start in starts]
+        )
+
+    def sample_rise(self, frames: Array) -> Array:
+        """Return the rise of frames (time, y, x), degC, since the first one along the line, (time, sample), K."""
+        return np.concatenate([self._sample_some(rise) for rise in rise_since_first(frames)])
 
     def _sample_some(self, frames: Array) -> Array:
         place = [self._row, self._column]

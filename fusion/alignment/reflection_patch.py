@@ -7,9 +7,11 @@ radiation from elsewhere.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from fusion._typing import Array
@@ -19,6 +21,8 @@ _JUMP_SIGMAS = 8.0
 #: A patch stands out where its jump is this much larger than the same jump averaged over the table; a camera offset has 1.
 _LOCAL_RATIO = 3.0
 _MIN_FRAMES = 9
+#: Frames that are looked at together, and changes of a long test among which the patch is looked for.
+_FRAMES_AT_ONCE, _MOST_CHANGES = 256, 1000
 
 
 @dataclass(frozen=True)
@@ -37,13 +41,31 @@ class SwitchingPatch:
     course: Array
 
 
-def find_switching_patch(rise: Array) -> SwitchingPatch | None:
+def seen_throughout(frames: Array) -> NDArray[np.bool_]:
+    """Return which cells every frame shows.
+
+    Parameters
+    ----------
+    frames : (time, y, x) ndarray
+        NaN where the plan is not seen.
+
+    Returns
+    -------
+    (y, x) ndarray of bool
+    """
+    seen = np.ones(frames.shape[1:], bool)
+    for start in range(0, len(frames), _FRAMES_AT_ONCE):
+        seen &= np.isfinite(frames[start : start + _FRAMES_AT_ONCE]).all(axis=0)
+    return seen
+
+
+def find_switching_patch(frames: Array) -> SwitchingPatch | None:
     """Find the patch whose switching explains most of the sudden changes of a field.
 
     Parameters
     ----------
-    rise : (time, y, x) ndarray, K
-        Temperature rise on the plan, NaN where the plan is not seen.
+    frames : (time, y, x) ndarray, degC or K
+        Temperature of the plan or its rise, NaN where the plan is not seen.
 
     Returns
     -------
@@ -53,16 +75,23 @@ def find_switching_patch(rise: Array) -> SwitchingPatch | None:
     Notes
     -----
     Sudden changes are differences of neighbouring frames minus the median of the differences around them. Their first principal
-    component is the patch; its scores beyond 8 robust standard deviations are the jumps.
+    component is the patch; its scores beyond 8 robust standard deviations are the jumps. In a long test it is the component of the
+    thousand largest changes, brought closer to that of all by one step of the power method.
     """
-    if rise.shape[0] < _MIN_FRAMES:
+    if frames.shape[0] < _MIN_FRAMES:
         return None
-    seen = np.isfinite(rise).all(axis=0)
-    sudden = _sudden_changes(rise[:, seen])
-    if not sudden.any():
+    seen = seen_throughout(frames)
+    largest = _largest(_sudden_changes(frames, seen))
+    if not largest.any():
         return None
-    component = _leading_component(sudden)
-    score = sudden @ component / (component @ component)
+    component = _leading_component(largest)
+    if len(largest) == len(frames) - 1:
+        score = largest @ component
+    else:
+        along_all = sum(sudden.T @ (sudden @ component) for sudden in _sudden_changes(frames, seen))
+        component = along_all / np.linalg.norm(along_all)
+        score = np.concatenate([sudden @ component for sudden in _sudden_changes(frames, seen)])
+    score /= component @ component
     scatter = stats.median_abs_deviation(score, scale="normal")
     jumps = np.where(np.abs(score) > _JUMP_SIGMAS * max(scatter, 1e-9), score, 0.0)
     # The upper percent stands for the patch's own height, so that one noisy cell does not make a pattern local.
@@ -72,6 +101,18 @@ def find_switching_patch(rise: Array) -> SwitchingPatch | None:
     pattern = np.zeros(seen.shape)
     pattern[seen] = component / height
     return SwitchingPatch(pattern, np.concatenate([[0.0], np.cumsum(jumps)]) * height)
+
+
+def _largest(changes: Iterable[Array]) -> Array:
+    """The largest changes (at most a thousand, cell) of those that come some at a time, in the order of time."""
+    kept: list[Array] = []
+    for some in changes:
+        kept = [*kept, some]
+        if sum(map(len, kept)) > _MOST_CHANGES:
+            rows = np.concatenate(kept)
+            size = np.einsum("tc,tc->t", rows, rows)
+            kept = [rows[np.sort(np.argpartition(size, -_MOST_CHANGES)[-_MOST_CHANGES:])]]
+    return np.concatenate(kept)
 
 
 def _leading_component(changes: Array) -> Array:
@@ -87,11 +128,16 @@ def _leading_component(changes: Array) -> Array:
     return np.asarray(component / np.linalg.norm(component) * np.sign(component[np.argmax(np.abs(component))]))
 
 
-def _sudden_changes(values: Array) -> Array:
-    """Change between neighbouring frames beyond the median of the changes around it, (time - 1, cell)."""
-    changes = np.diff(values, axis=0)
-    sudden = np.empty_like(changes)
-    for k in range(changes.shape[0]):
-        low, high = max(0, k - 3), min(changes.shape[0], k + 4)
-        sudden[k] = changes[k] - np.median(np.delete(changes[low:high], k - low, axis=0), axis=0)
-    return sudden
+def _sudden_changes(frames: Array, seen: NDArray[np.bool_]) -> Iterator[Array]:
+    """Change between neighbouring frames beyond the median of the changes around it, (some, cell), some at a time."""
+    count = len(frames) - 1
+    for start in range(0, count, _FRAMES_AT_ONCE):
+        stop = min(start + _FRAMES_AT_ONCE, count)
+        first = max(0, start - 3)
+        changes = np.diff(frames[first : min(count, stop + 3) + 1].astype(float)[:, seen], axis=0)
+        sudden = np.empty((stop - start, changes.shape[1]))
+        for k in range(start, stop):
+            low, high = max(0, k - 3) - first, min(count, k + 4) - first
+            around = np.delete(changes[low:high], k - first - low, axis=0)
+            sudden[k - start] = changes[k - first] - np.median(around, axis=0)
+        yield sudden

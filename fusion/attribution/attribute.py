@@ -407,16 +407,16 @@ def _describe_set(test: FamilyTest) -> dict[str, tuple[tuple[str, ...], Any, dic
 def _describe_session(result: AttributionResult, excitation: Excitation) -> xr.Dataset:
     """What holds for the whole session: thresholds, noise and unexplained drift per channel, false alarm rates, verdict."""
     cells = result.sets["cells"]
-    banks = list(result.banks) + [result.banks[0]] * (len(cells.names) - len(result.banks))
+    nulls = list(result.nulls) + [result.nulls[0]] * (len(cells.names) - len(result.nulls))
     per_channel: dict[str, tuple[Any, dict[str, str]]] = {
         "threshold": (cells.threshold, _THRESHOLD),
-        "noise": ([bank.sigma for bank in banks], {"units": "um", "long_name": "noise of one value of the channel"}),
+        "noise": ([null.sigma for null in nulls], {"units": "um", "long_name": "noise of one value of the channel"}),
         "unexplained_drift": (
-            [bank.drift_per_hour for bank in banks],
+            [null.drift_per_hour for null in nulls],
             {"units": "um", "long_name": "standard deviation over one hour of the drift that nothing explains"},
         ),
         "drift_order": (
-            [float(bank.fitted.order) for bank in banks],
+            [float(null.order) for null in nulls],
             {"units": "1", "long_name": "0 none, 1 random walk, 2 integrated random walk"},
         ),
     }

@@ -31,7 +31,7 @@ from fusion.alignment.first_order_lag import lag_operators
 from fusion.attribution.attribute import flatten_field
 from fusion.attribution.drift_channels import DriftSeries, clock_readings, reduce_channels
 from fusion.attribution.family_wise import LAGS_S
-from fusion.attribution.likelihood_ratio import Grid, null_bank, whitening_grid
+from fusion.attribution.likelihood_ratio import null_bank, whitening_grid
 from fusion.attribution.warm_up import thermal_modes
 
 #: The camera is represented by at most this many thermal modes.
@@ -199,9 +199,10 @@ class _Part:
         self.task, self.kept = task, kept
         self.values = series.values[kept]
         ones = np.ones((self.values.size, 1))
-        self.grid: Grid = whitening_grid(series.seconds[kept], series.variance[kept], ones)
-        self.projects = np.stack([point.project for point in self.grid.whitenings])
-        self.penalty = np.array([point.log_penalty for point in self.grid.whitenings])
+        grid = whitening_grid(series.seconds[kept], series.variance[kept], ones)
+        self.freedom = grid.freedom
+        self.projects = np.stack([point.project for point in grid.whitenings])
+        self.penalty = np.array([point.log_penalty for point in grid.whitenings])
         self.white = self.projects @ self.values
 
     def columns(self, temperatures: Array) -> Array:
@@ -232,7 +233,7 @@ def _fit(part: _Part, temperatures: Array) -> _Fit:
     """Fit the sensitivities to temperatures (frames, p) that share one lag and one prior."""
     columns = part.columns(temperatures)
     size = float(np.sqrt((columns[0] ** 2).mean())) + 1e-30
-    freedom = part.grid.freedom
+    freedom = part.freedom
     best = _Fit(0, 0, 0.0, np.zeros(temperatures.shape[1]), np.inf)
     for drift, (project, white) in enumerate(zip(part.projects, part.white, strict=True)):
         whitened = project @ columns
@@ -266,7 +267,7 @@ def _place(parts: Sequence[_Part], fits: Sequence[_Fit], contact: Array, most: i
             informed = 1.0 + fit.prior * np.einsum("ij,ij->j", columns, moved)
             whole = float(part.values @ inverse @ part.values)
             share = fit.prior * (part.values @ moved) ** 2 / informed / whole
-            gain -= part.grid.freedom * np.log1p(-np.minimum(share, 1.0 - 1e-9)) + np.log(informed)
+            gain -= part.freedom * np.log1p(-np.minimum(share, 1.0 - 1e-9)) + np.log(informed)
         gain[chosen] = -np.inf
         # Among cells that these data cannot tell apart, the one that warms most has the highest signal over its noise.
         chosen.append(int(np.where(gain >= gain.max() - _EQUAL_NATS, swing, -1.0).argmax()))

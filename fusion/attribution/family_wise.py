@@ -108,6 +108,25 @@ class FamilyTest:
 
 
 @dataclass(frozen=True)
+class FittedNull:
+    """Drift and noise of one series without any source.
+
+    Attributes
+    ----------
+    order : int
+        0 no drift, 1 random walk, 2 integrated random walk.
+    sigma : float, um
+        Noise of one value.
+    drift_per_hour : float, um
+        Standard deviation of the drift over one hour.
+    """
+
+    order: int
+    sigma: float
+    drift_per_hour: float
+
+
+@dataclass(frozen=True)
 class AttributionResult:
     """Result for all sets together.
 
@@ -115,7 +134,7 @@ class AttributionResult:
     ----------
     sets : mapping of str to FamilyTest
         Result per set, in the order given.
-    banks : tuple of NullBank
+    nulls : tuple of FittedNull
         Fitted null model of every series.
     draws : int
         Number of simulated series behind the p-values.
@@ -124,7 +143,7 @@ class AttributionResult:
     """
 
     sets: Mapping[str, FamilyTest]
-    banks: tuple[NullBank, ...]
+    nulls: tuple[FittedNull, ...]
     draws: int
     false_alarm_rate: float
 
@@ -232,12 +251,14 @@ def _conclude(
     p_values, thresholds = _family_wise([row for tally in tallies for row in tally.statistic], maxima[:, :draws], ease)
     alarms = (maxima[:, draws:] > thresholds[:, None]).reshape(len(candidates), len(names), checks)
     rows = [slice(k * len(names), (k + 1) * len(names)) for k in range(len(candidates))]
+    banks = [source.bank for source in sources]
     return AttributionResult(
         sets={
             name: tally.finish(names, np.stack(p_values[row]), thresholds[row], _rate(alarms[k]))
             for k, (name, tally, row) in enumerate(zip(candidates, tallies, rows, strict=True))
         },
-        banks=tuple(source.bank for source in sources),
+        # The whitenings at all grid points, which are large, end here.
+        nulls=tuple(FittedNull(bank.fitted.order, bank.sigma, bank.drift_per_hour) for bank in banks),
         draws=draws,
         false_alarm_rate=_rate(alarms.reshape(len(candidates) * len(names), checks)),
     )

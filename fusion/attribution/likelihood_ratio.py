@@ -21,7 +21,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fusion._typing import Array
-from interferometry.drift.state_space import Order, drift_system
+from interferometry.drift.state_space import DriftSystem, Order, drift_system
 
 Array32 = NDArray[np.float32]
 
@@ -46,8 +46,8 @@ class Whitening:
         Standard deviation of the increment of the drift over one hour, over the noise of one value.
     project, project32 : (n, n) ndarray
         Whitens and removes the nuisance regressors, in double and single precision.
-    colour : (n, n) ndarray
-        Inverse of the whitening.
+    system : DriftSystem
+        The drift and the noise of the values.
     basis : (n, k) ndarray
         Orthonormal basis of the whitened nuisance regressors.
     log_penalty : float
@@ -58,9 +58,15 @@ class Whitening:
     per_hour: float
     project: Array
     project32: Array32
-    colour: Array
+    system: DriftSystem
     basis: Array
     log_penalty: float
+
+    @property
+    def colour(self) -> Array:
+        """Inverse of the whitening, (n, n); made when it is asked for, as few grid points are asked."""
+        white, _ = self.system.whiten(np.eye(self.system.seconds.size))
+        return np.asarray(_invert_lower(white))
 
 
 @dataclass(frozen=True)
@@ -172,9 +178,7 @@ def whitening_grid(seconds: Array, variance: Array, nuisance: Array, *, integrat
         project = white - basis @ (basis.T @ white)
         log_normal = 2.0 * float(np.log(np.abs(np.diag(triangle))).sum())
         penalty = float(log_determinant + log_normal) / freedom
-        whitenings.append(
-            Whitening(order, per_hour, project, project.astype(np.float32), _invert_lower(white), basis, penalty)
-        )
+        whitenings.append(Whitening(order, per_hour, project, project.astype(np.float32), system, basis, penalty))
     return Grid(tuple(whitenings), freedom, scale)
 
 

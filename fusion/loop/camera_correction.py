@@ -77,8 +77,7 @@ def find_field_errors(result: LoopResult, fields: xr.Dataset, fused: xr.Dataset)
             error = size * np.broadcast_to(late[:, None, None], fields["frame_temperature"].shape)
             text = f"the camera read {size:+.3f} ± {2.0 * u:.3f} K (k = 2) too high"
         else:
-            temperature = fields["frame_temperature"].values.astype(float)
-            patch = find_switching_patch(temperature - temperature[0])
+            patch = find_switching_patch(fields["frame_temperature"].values)
             if patch is None:
                 continue
             # A warm body adds to what the camera sees: the lowest state is the one without it.
@@ -114,6 +113,8 @@ def correct_fields(fields: xr.Dataset, errors: list[FieldFault]) -> xr.Dataset:
     Dataset
         The same fields with ``frame_temperature`` corrected, degC; the input is unchanged.
     """
+    if not errors:
+        return fields
     total = np.sum([one.correction for one in errors], axis=0)
     frames = fields["frame_temperature"]
     return fields.assign(frame_temperature=frames.copy(data=frames.values + total))

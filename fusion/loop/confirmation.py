@@ -42,8 +42,8 @@ _CONTRADICTED = 0.5
 _FIVE_SIGMA = 2.9e-7
 #: Share of the cycles from which the later ones are predicted.
 _EARLY_SHARE = 0.5
-#: Values of simulated campaigns that are filtered together, 16 MB.
-_VALUES_AT_ONCE = 2**21
+#: Values of simulated campaigns that are filtered together, 8 MB.
+_VALUES_AT_ONCE = 2**20
 
 
 def prior_rows(model: ModelFit, rng: np.random.Generator, *, draws: int = DRAWS) -> PriorRows:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from copy import deepcopy
 
 import numpy as np
 
@@ -12,8 +13,8 @@ from interferometry.drift.gls import DriftFit
 from interferometry.drift.state_space import DriftSystem
 
 DRAWS = 200
-#: Readings whose random numbers are drawn together, where those of all would be one more of the largest matrices.
-_READINGS_AT_ONCE = 2048
+#: Readings that are simulated together, 7 MB of random numbers.
+_READINGS_AT_ONCE = 4096
 
 
 def simulate_null(
@@ -37,44 +38,55 @@ def simulate_null(
     noise, share = fit.noise()
     system = fit.system if over is None else over
     relative = noise / np.sqrt(np.maximum(share, 1e-12))
-    # In place and some readings at a time: these are the largest matrices of a long test.
+    # Some readings at a time and in place: these are the largest numbers of a long test.
     drawn = np.empty((system.seconds.size, draws))
-    for rows in _blocks(drawn):
-        rows[:] = rng.choice(relative, size=rows.shape)
+    for rows in _blocks(system.seconds.size):
+        drawn[rows] = rng.choice(relative, size=(rows.stop - rows.start, draws))
     drawn *= np.sqrt(system.variance)[:, None]
     ratios = plausible_ratios(fit, rng, draws=draws)
     for ratio, loading in zip(ratios.T, system.loadings.T, strict=True):
-        drawn += _simulated_drift(system, fit.sigma * np.sqrt(ratio), loading, rng)
+        walks = random_walk(system, _normal_numbers(system, draws, rng))
+        for walk, rows in zip(walks, _blocks(system.seconds.size), strict=True):
+            walk *= fit.sigma * np.sqrt(ratio)
+            walk *= loading[rows, None]
+            drawn[rows] += walk
     return drawn
 
 
-def _blocks(matrix: Array) -> Iterator[Array]:
-    """Successive rows of a matrix, some at a time."""
-    for start in range(0, len(matrix), _READINGS_AT_ONCE):
-        yield matrix[start : start + _READINGS_AT_ONCE]
+def _blocks(readings: int) -> list[slice]:
+    """Successive readings, some at a time."""
+    starts = range(0, readings, _READINGS_AT_ONCE)
+    return [slice(start, min(start + _READINGS_AT_ONCE, readings)) for start in starts]
 
 
-def _simulated_drift(system: DriftSystem, rates: Array, loading: Array, rng: np.random.Generator) -> Array:
-    """What one component of the drift makes of every reading, (n, draws), with a rate (draws,) for each draw."""
-    first = rng.standard_normal((system.seconds.size, rates.size))
-    walk = random_walk(system, first, (rng.standard_normal(rows.shape) for rows in _blocks(first)))
-    walk *= rates
-    walk *= loading[:, None]
-    return walk
+def _normal_numbers(system: DriftSystem, draws: int, rng: np.random.Generator) -> Iterator[tuple[Array, Array]]:
+    """Standard normal numbers of a walk at successive readings, as if two matrices of all readings were drawn one after another."""
+    shapes = [(rows.stop - rows.start, draws) for rows in _blocks(system.seconds.size)]
+    if system.order == 1 or len(shapes) == 1:
+        for shape in shapes:
+            first = rng.standard_normal(shape)
+            yield first, first if system.order == 1 else rng.standard_normal(shape)
+        return
+    before = deepcopy(rng)
+    for shape in shapes:
+        rng.standard_normal(shape)
+    for shape in shapes:
+        yield before.standard_normal(shape), rng.standard_normal(shape)
 
 
-def random_walk(system: DriftSystem, first: Array, second: Iterable[Array]) -> Array:
+def random_walk(system: DriftSystem, numbers: Iterable[tuple[Array, Array]]) -> Iterator[Array]:
     """Random walk (order 1) or integrated random walk (order 2) of unit variance rate at the readings' own times.
 
     Parameters
     ----------
-    system : times and order of the drift
-    first : (n, draws) independent standard normal numbers; overwritten with the walk
-    second : as many further ones, (some readings, draws) after one another; overwritten. Order 1 asks for none.
+    system : times and order of the drift, n readings
+    numbers : pairs of (some, draws) independent standard normal numbers, at successive readings, n in total; order 1 uses the first of a
+        pair only. They are overwritten.
 
-    Returns
-    -------
-    (n, draws) ndarray
+    Yields
+    ------
+    (some, draws) ndarray
+        The walk at these readings.
 
     Notes
     -----
@@ -82,25 +94,28 @@ def random_walk(system: DriftSystem, first: Array, second: Iterable[Array]) -> A
     dt**3 / 12 (Durbin and Koopman 2012, Time Series Analysis by State Space Methods, section 3.8).
     """
     steps = np.diff(system.seconds, prepend=system.seconds[0])[:, None]
-    shocks = np.multiply(first, np.sqrt(steps), out=first)
-    if system.order == 1:
-        return np.asarray(np.cumsum(shocks, axis=0, out=shocks))
-    start, rate, level = 0, np.zeros(first.shape[1]), np.zeros(first.shape[1])
-    for moved in second:
-        rows = slice(start, start + len(moved))
-        here = shocks[rows]
-        moved *= np.sqrt(steps[rows] / 12.0)
-        moved += 0.5 * here
-        here[0] += rate
-        rates = np.cumsum(here, axis=0, out=here)
-        moved[0] += rate
-        moved[1:] += rates[:-1]
-        rate = rates[-1].copy()
-        moved *= steps[rows]
-        moved[0] += level
-        level = np.cumsum(moved, axis=0, out=here)[-1]
-        start = rows.stop
-    return shocks
+    rate = level = np.zeros(1)
+    start = 0
+    for first, second in numbers:
+        own = steps[start : start + len(first)]
+        start += len(first)
+        shocks = np.multiply(first, np.sqrt(own), out=first)
+        if system.order == 1:
+            shocks[0] += level
+            walk = np.cumsum(shocks, axis=0, out=shocks)
+        else:
+            moved = np.multiply(second, np.sqrt(own / 12.0), out=second)
+            moved += 0.5 * shocks
+            shocks[0] += rate
+            rates = np.cumsum(shocks, axis=0, out=shocks)
+            moved[0] += rate
+            moved[1:] += rates[:-1]
+            rate = rates[-1]
+            moved *= own
+            moved[0] += level
+            walk = np.cumsum(moved, axis=0, out=moved)
+        level = walk[-1].copy()
+        yield walk
 
 
 def tail_probability(value: float, null: Array) -> float:

@@ -188,7 +188,8 @@ def simulate_channels(model: RecordFit, rng: np.random.Generator, *, draws: int)
         drawn = pool[picked[rows]] * np.sqrt(fit.system.variance)[:, None]
         ratios = plausible_ratios(fit, rng, draws=draws)[:, 0]
         first, second = correlated[..., k][:, rows]
-        drawn += fit.sigma * np.sqrt(ratios) * random_walk(fit.system, first, [second])
+        (walk,) = random_walk(fit.system, [(first, second)])
+        drawn += fit.sigma * np.sqrt(ratios) * walk
         simulated.append(drawn)
     return simulated
 

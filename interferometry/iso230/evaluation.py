@@ -191,11 +191,12 @@ def evaluate_windows(
     windows = [numbers[start : start + length] for start in range(0, len(numbers) - length + 1, length)]
     windows = [window for window in windows if _can_be_evaluated(deviations.sel(cycle=window))] + [numbers]
     results = [
-        evaluate_iso230(deviations, cycles=window, budget=budget, drift=drift, material_degC=material_degC)
+        _of_the_axis(
+            evaluate_iso230(deviations, cycles=window, budget=budget, drift=drift, material_degC=material_degC)
+        )
         for window in windows
     ]
-    kept = [name for name in results[0].data_vars if "target" not in results[0][name].dims]
-    joined = xr.concat([result[kept] for result in results], dim="window", coords="minimal", compat="override")
+    joined = xr.concat(results, dim="window", coords="minimal", compat="override")
     names = [result.attrs["window"] for result in results]
     return joined.assign_coords(
         window=names,
@@ -203,6 +204,11 @@ def evaluate_windows(
         first_cycle=("window", [window[0] for window in windows]),
         last_cycle=("window", [window[-1] for window in windows]),
     ).assign_attrs(window="several")
+
+
+def _of_the_axis(result: xr.Dataset) -> xr.Dataset:
+    """Return what was found of the axis as a whole, without the values of single targets."""
+    return result[[name for name in result.data_vars if "target" not in result[name].dims]]
 
 
 def settled_window(windows: xr.Dataset) -> int:

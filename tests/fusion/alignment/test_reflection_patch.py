@@ -1,5 +1,7 @@
 """A patch that switches like a reflection is found; heat, camera offsets and noise are not taken for one."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -29,6 +31,31 @@ def test_a_switching_patch_is_found_with_its_size(warming):
     # Noise of 0.03 K over 12 cells, added up over two jumps.
     assert patch.course[25] == pytest.approx(1.5, abs=0.1)
     assert patch.course[-1] == pytest.approx(0.0, abs=0.1)
+
+
+def test_a_patch_of_a_long_test_is_found_among_the_largest_changes(warming, monkeypatch):
+    on = np.zeros(FRAMES)
+    on[20:35] = 1.5
+    warming[:, 3:6, 8:12] += on[:, None, None]
+    known = find_switching_patch(warming)
+    monkeypatch.setattr("fusion.alignment.reflection_patch._MOST_CHANGES", 15)
+    monkeypatch.setattr("fusion.alignment.reflection_patch._FRAMES_AT_ONCE", 7)
+    patch = find_switching_patch(warming)
+    # The noise of 0.03 K is 2 % of the jump; the component of the fifteen largest changes differs by a part of that.
+    np.testing.assert_allclose(patch.pattern, known.pattern, atol=0.02)
+    np.testing.assert_allclose(patch.course, known.course, atol=0.02)
+
+
+def test_frames_of_a_long_test_are_never_held_in_double_precision():
+    frames = np.random.default_rng(4).standard_normal((6000, 10, 20)).astype(np.float32)
+    tracemalloc.start()
+    try:
+        find_switching_patch(frames)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    # A thousand changes in double precision and a block; all of them took ten times the frames.
+    assert peak < 1.5 * frames.nbytes
 
 
 def test_heat_and_noise_are_no_patch(warming):

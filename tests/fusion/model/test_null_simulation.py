@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -25,8 +27,12 @@ def covariance_of_walk(order: int) -> np.ndarray:
     n = SECONDS.size
     system = drift_system(SECONDS, np.ones((n, 1)), order=order, ratios=np.ones(1))
     unit, nothing = np.eye(n), np.zeros((n, n))
-    parts = (unit.copy(), [nothing.copy()]), (nothing, np.split(unit, [1, 4]))
-    matrix = np.column_stack([random_walk(system, first, second) for first, second in parts])
+    walks = []
+    for first, second in ((unit, nothing), (nothing, unit)):
+        # However many readings come together.
+        pairs = zip(np.split(first.copy(), [1, 4]), np.split(second.copy(), [1, 4]), strict=True)
+        walks.append(np.concatenate([*random_walk(system, pairs)]))
+    matrix = np.column_stack(walks)
     return matrix @ matrix.T
 
 
@@ -42,8 +48,7 @@ def test_an_integrated_walk_has_the_covariance_of_theory():
 @pytest.mark.parametrize("order", [1, 2])
 def test_the_variance_of_drawn_walks_is_that_of_theory(order, rng):
     system = drift_system(SECONDS, np.ones((6, 1)), order=order, ratios=np.ones(1))
-    first, second = rng.standard_normal((2, 6, 20000))
-    draws = random_walk(system, first, [second])
+    (draws,) = random_walk(system, [tuple(rng.standard_normal((2, 6, 20000)))])
     expected = 200.0 if order == 1 else 200.0**3 / 3.0
     # A variance from 20,000 draws has a relative standard deviation of sqrt(2 / 20000) = 1 %.
     assert draws[-1].var() == pytest.approx(expected, rel=0.04)
@@ -170,3 +175,24 @@ def test_the_same_seed_simulates_the_same_campaigns():
     fit = quiet_fit(np.random.default_rng(5).standard_normal(50), order=2)
     first, second = (simulate_null(fit, np.random.default_rng(7), draws=4) for _ in range(2))
     np.testing.assert_array_equal(first, second)
+
+
+def test_however_many_readings_are_simulated_together_the_same_campaigns_come(monkeypatch):
+    fit = quiet_fit(np.random.default_rng(5).standard_normal(50), order=2)
+    whole = simulate_null(fit, np.random.default_rng(7), draws=4)
+    monkeypatch.setattr("fusion.model.null_simulation._READINGS_AT_ONCE", 7)
+    np.testing.assert_array_equal(simulate_null(fit, np.random.default_rng(7), draws=4), whole)
+
+
+def test_simulating_a_long_test_takes_little_more_memory_than_its_readings(monkeypatch):
+    """Four matrices of all readings would fill the memory at 10,000 cycles."""
+    monkeypatch.setattr("fusion.model.null_simulation._READINGS_AT_ONCE", 100)
+    fit, rng = quiet_fit(np.random.default_rng(5).standard_normal(2000), order=2), np.random.default_rng(7)
+    tracemalloc.start()
+    try:
+        draws = simulate_null(fit, rng, draws=200)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    # Of 3.2 MB a tenth in some blocks, and the matrices of the fit; two of all readings were 2.0 times.
+    assert peak < 1.5 * draws.nbytes
