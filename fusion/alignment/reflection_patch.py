@@ -88,8 +88,8 @@ def find_switching_patch(frames: Array) -> SwitchingPatch | None:
     if len(largest) == len(frames) - 1:
         score = largest @ component
     else:
-        along_all = sum(sudden.T @ (sudden @ component) for sudden in _sudden_changes(frames, seen))
-        component = along_all / np.linalg.norm(along_all)
+        along_all = np.sum([sudden.T @ (sudden @ component) for sudden in _sudden_changes(frames, seen)], axis=0)
+        component = np.asarray(along_all / np.linalg.norm(along_all))
         score = np.concatenate([sudden @ component for sudden in _sudden_changes(frames, seen)])
     score /= component @ component
     scatter = stats.median_abs_deviation(score, scale="normal")
