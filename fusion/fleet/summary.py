@@ -12,7 +12,8 @@ from typing import Any, Literal
 
 import rich.table
 
-from fusion.products.results import ResultsError, read_results
+from fusion.errors import FusionError
+from fusion.products.results import read_results
 from fusion.report.conclusions.answers import headline
 from fusion.report.wording import measured, number
 from fusion.terminal import cell
@@ -99,7 +100,7 @@ def with_findings(row: Row, folder: Path) -> Row:
     """
     try:
         results = read_results(folder)
-    except (ResultsError, OSError) as error:
+    except (FusionError, OSError) as error:
         return replace(row, state="failed", message=str(error))
     drift = results.drift
     known = [] if drift is None else [k for k, value in enumerate(drift.range_um) if value is not None]

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from fusion.attribution.two_sessions import compare_sessions
+from fusion.products.contracts import read_fusion, read_product
 from fusion.products.results import read_results
-from fusion.products.store import read_dataset, read_tree, write_dataset, write_json, write_text
+from fusion.products.store import write_dataset, write_json, write_text
 from fusion.report.html import render_report
 from fusion.report.joint_page import (
     channel_sentence,
@@ -22,8 +23,6 @@ from fusion.report.joint_page import (
     sources_table,
 )
 from fusion.report.wording import CHANNELS
-
-_READERS = {"fields": read_dataset, "deviations": read_dataset, "fusion": read_tree}
 
 
 def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
@@ -47,7 +46,8 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
         If the campaigns cannot be compared.
     """
     products: list[dict[str, Any]] = [
-        {name: read(folder / f"{name}.nc") for name, read in _READERS.items()} for folder in folders
+        {**{name: read_product(folder, name) for name in ("fields", "deviations")}, "fusion": read_fusion(folder)}
+        for folder in folders
     ]
     comparison = compare_sessions(*(product["fusion"].children["correlation"] for product in products))
     results = [read_results(folder) for folder in folders]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeGuard
 
 import xarray as xr
 
 from fusion.errors import FusionError
-from fusion.products.store import DamagedProductError, file_sha256, read_dataset, read_json_object, read_tree
+from fusion.products.store import DamagedProductError, read_dataset, read_tree, require_own
 from interferometry.contract import DEVIATIONS
 from thermography.contract import FIELDS
 
@@ -134,45 +133,6 @@ def require_kind(product: xr.Dataset, name: str, path: Path) -> xr.Dataset:
             "put the file of this run back, or run the campaign again"
         )
     return product
-
-
-def require_own(folder: Path, names: Iterable[str]) -> None:
-    """Refuse products that are not the files which the run of a folder wrote.
-
-    Parameters
-    ----------
-    folder : Path
-        Results folder; a run without ``products`` in its ``provenance.json`` is taken as it is.
-    names : iterable of str
-        Files in it; one that is absent is no matter of this check.
-
-    Raises
-    ------
-    DamagedProductError
-        If the SHA-256 of one differs from that in ``provenance.json``.
-    """
-    written = read_json_object(folder / "provenance.json").get("products")
-    known: dict[str, Any] = written if is_file_list(written) else {}
-    for name in names:
-        path = folder / name
-        if name in known and path.is_file() and file_sha256(path) != known[name]["sha256"]:
-            raise DamagedProductError(
-                f"{path}: is not the file that this run wrote (its SHA-256 is not that of provenance.json); put that file back, or run the "
-                "campaign again"
-            )
-
-
-def is_file_list(content: object) -> TypeGuard[dict[str, Any]]:
-    """Return whether JSON is a list of files as a provenance holds it: by name, with ``bytes`` and ``sha256`` of each.
-
-    Parameters
-    ----------
-    content : object
-        ``inputs`` or ``products`` of a provenance.json.
-    """
-    return isinstance(content, dict) and all(
-        isinstance(one, dict) and {"bytes", "sha256"} <= one.keys() for one in content.values()
-    )
 
 
 def _tuple(dims: tuple[object, ...]) -> str:

@@ -40,7 +40,7 @@ from fusion.products.results_loop import (
 )
 from fusion.products.results_part import ByDirection, Number, Quantity, ResultPart, TimePart
 from fusion.products.results_radiometry import ContactSensorPart, FieldPart, RadiometryPart
-from fusion.products.store import Product, plain
+from fusion.products.store import Product, plain, require_own
 
 __all__ = [
     "CAUSES",
@@ -192,18 +192,26 @@ def read_results(folder: Path) -> Results:
     ------
     ResultsError
         If the file is absent, is not JSON, or was written by another version.
+    DamagedProductError
+        If it is not what the run of the folder wrote.
     """
     path = folder / "results.json"
     if not path.is_file():
         raise ResultsError(f"{folder}: there is no results.json in it; name the results folder of a finished run")
     try:
-        return Results.model_validate(json.loads(path.read_text(encoding="utf-8")))
+        results = Results.model_validate(json.loads(path.read_text(encoding="utf-8")))
     except ValidationError as error:
-        fault = _first_fault(error)
+        raise _foreign(path, _first_fault(error)) from None
     # Also bytes that are no text, numbers of thousands of digits, and brackets without end.
     except (ValueError, RecursionError) as error:
-        fault = f"not JSON: {error}"
-    raise ResultsError(f"{path}: not the results of this version of thermofuse ({fault}); run the campaign again")
+        raise _foreign(path, f"not JSON: {error}") from None
+    require_own(folder, [path.name])
+    return results
+
+
+def _foreign(path: Path, fault: str) -> ResultsError:
+    """Return the error of a file that this version did not write."""
+    return ResultsError(f"{path}: not the results of this version of thermofuse ({fault}); run the campaign again")
 
 
 def _first_fault(error: ValidationError) -> str:

@@ -12,7 +12,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 
 import numpy as np
 
@@ -333,6 +333,45 @@ def read_json_object(path: Path) -> dict[str, Any]:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError, RecursionError):
         return {}
+
+
+def require_own(folder: Path, names: Iterable[str]) -> None:
+    """Refuse products that are not the files which the run of a folder wrote.
+
+    Parameters
+    ----------
+    folder : Path
+        Results folder; a run without ``products`` in its ``provenance.json`` is taken as it is.
+    names : iterable of str
+        Files in it; one that is absent is no matter of this check.
+
+    Raises
+    ------
+    DamagedProductError
+        If the SHA-256 of one differs from that in ``provenance.json``.
+    """
+    written = read_json_object(folder / "provenance.json").get("products")
+    known: dict[str, Any] = written if is_file_list(written) else {}
+    for name in names:
+        path = folder / name
+        if name in known and path.is_file() and file_sha256(path) != known[name]["sha256"]:
+            raise DamagedProductError(
+                f"{path}: is not the file that this run wrote (its SHA-256 is not that of provenance.json); put that file back, or run the "
+                "campaign again"
+            )
+
+
+def is_file_list(content: object) -> TypeGuard[dict[str, Any]]:
+    """Return whether JSON is a list of files as a provenance holds it: by name, with ``bytes`` and ``sha256`` of each.
+
+    Parameters
+    ----------
+    content : object
+        ``inputs`` or ``products`` of a provenance.json.
+    """
+    return isinstance(content, dict) and all(
+        isinstance(one, dict) and {"bytes", "sha256"} <= one.keys() for one in content.values()
+    )
 
 
 def finished_stages(folder: Path) -> list[str]:

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from fusion.errors import FusionError
-from fusion.products.contracts import is_file_list, read_fusion, read_product, require_own
+from fusion.products.contracts import read_fusion, read_product
 from fusion.products.results import RecordLoop, Results, read_results
+from fusion.products.store import is_file_list
 from fusion.report import record_section, summary_section
 from fusion.report.charts.campaign import Drawn, draw_campaign
 from fusion.report.charts.embedding import embed
@@ -103,7 +104,6 @@ def report_of(folder: Path) -> str:
         If the folder does not hold the products of a finished run, as that run wrote them.
     """
     results = read_results(folder)
-    require_own(folder, ["results.json"])
     origin = folder / "provenance.json"
     if not origin.is_file():
         raise ProductsError(f"{origin} is missing; run the campaign again, with --resume to keep what is finished")

@@ -64,8 +64,8 @@ def label_of(root: Path, folder: Path) -> str:
     name = folder.relative_to(root).as_posix()
     try:
         results = read_results(folder)
-    except FusionError:
-        return f"{name} (cannot be read by this version)"
+    except (FusionError, OSError):
+        return f"{name} (cannot be read)"
     day = f", {results.time.first[:10]}" if results.time else ""
     return f"{name}: {results.campaign}{day}"
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from fusion.products.contracts import read_product, require_kind, require_own
+from fusion.products.contracts import read_product, require_kind
 from fusion.products.grouped import group, has
 from fusion.products.results import RecordLoop, Results, read_results
-from fusion.products.store import DamagedProductError, read_json_object, told_if_damaged
+from fusion.products.store import DamagedProductError, read_json_object, require_own, told_if_damaged
 from fusion.report.charts.thermal_map import LAYERS, Layer, scale_of
 
 #: Cycles from which the one colour scale of all cycles is taken; of a longer test evenly spaced ones.
@@ -47,7 +47,6 @@ class Products:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.results: Results = read_results(folder)
-        require_own(folder, ["results.json"])
 
     def __del__(self) -> None:
         """Close fields.nc where it was opened."""

@@ -15,7 +15,7 @@ from fusion.campaign.inputs import read_laser
 from fusion.campaign.iso_budget import Origin, StatedBudget, material_by_cycle
 from fusion.pipeline.iso230.evaluation import evaluate_standard
 from fusion.pipeline.iso230.sheet import complete_sheet
-from fusion.products.contracts import read_product, require_own
+from fusion.products.contracts import read_product
 from fusion.products.grouped import joined
 from fusion.products.notices import left_out_notices
 from fusion.products.results import read_results
@@ -106,7 +106,6 @@ def _of_results(folder: Path, cycles: str | None) -> StandardTest:
             f'--cycles "{cycles}": {folder} holds the windows of its run; name the campaign file or the file of readings instead'
         )
     results = read_results(folder)
-    require_own(folder, ["results.json"])
     if results.iso230 is None or results.iso230.settled is None:
         raise CampaignError(
             f"{folder}: these results hold no evaluation by ISO 230-2 of this version; run the campaign again"

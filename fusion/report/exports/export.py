@@ -11,7 +11,7 @@ from pathlib import Path
 import pandas as pd
 import xarray as xr
 
-from fusion.products.contracts import read_product, require_own
+from fusion.products.contracts import read_product
 from fusion.products.grouped import has
 from fusion.products.results import Results, read_results
 from fusion.products.store import write_atomically
@@ -112,7 +112,6 @@ def export_results(
     if not (results / "deviations.nc").is_file():
         return _export_camera(results, format, out, overwrite=overwrite)
     found, deviations = read_results(results), read_product(results, "deviations")
-    require_own(results, ["results.json"])
     content: dict[str, Writer]
     if format == "csv":
         content = _csv_files(results, found, deviations, with_fields=fields)

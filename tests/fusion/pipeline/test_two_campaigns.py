@@ -10,7 +10,7 @@ import pytest
 
 from fusion.attribution.two_sessions import SessionComparisonError
 from fusion.pipeline.two_campaigns import join_campaigns
-from fusion.products.store import read_dataset, read_tree, write_dataset
+from fusion.products.store import DamagedProductError, file_sha256, read_dataset, read_tree, write_dataset, write_json
 
 
 @pytest.fixture
@@ -19,7 +19,15 @@ def folders(results_folder: Path, tmp_path: Path) -> list[Path]:
     pair = [Path(shutil.copytree(results_folder, tmp_path / name)) for name in ("monday", "tuesday")]
     path = pair[1] / "results.json"
     path.write_text(path.read_text().replace("Small campaign", "Second campaign"))
+    as_if_run(pair[1], "results.json")
     return pair
+
+
+def as_if_run(folder: Path, name: str) -> None:
+    """Enter a product into the provenance as its run would have, had it written it so."""
+    provenance = json.loads((folder / "provenance.json").read_text())
+    provenance["products"][name] |= {"sha256": file_sha256(folder / name)}
+    write_json(folder / "provenance.json", provenance)
 
 
 def test_both_reports_tell_what_the_sessions_agree_on(folders: list[Path], tmp_path: Path) -> None:
@@ -45,5 +53,15 @@ def test_other_grids_are_refused(folders: list[Path], tmp_path: Path) -> None:
         if "x" in group.to_dataset(inherit=False).coords:
             group.coords["x"] = group["x"] + 7.0
     write_dataset(folders[1] / "fusion.nc", fusion)
+    as_if_run(folders[1], "fusion.nc")
     with pytest.raises(SessionComparisonError, match="the plan grids differ along x"):
         join_campaigns(folders, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["results.json", "fusion.nc"])
+def test_products_that_no_run_wrote_are_refused(folders: list[Path], tmp_path: Path, name: str) -> None:
+    with (folders[0] / name).open("ab") as file:
+        file.write(b" ")
+    with pytest.raises(DamagedProductError, match=f"{name}: is not the file that this run wrote"):
+        join_campaigns(folders, tmp_path)
+    assert not (tmp_path / "joint.json").exists()

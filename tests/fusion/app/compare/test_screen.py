@@ -13,6 +13,7 @@ import pytest
 from fusion.app.compare.screen import CompareScreen, comparison_parts, find_results, label_of
 from fusion.app.state import State
 from fusion.comparison.campaigns import compare_campaigns
+from fusion.products.store import write_json
 from tests.fusion.app.texts import texts
 from tests.fusion.compared_tests import readings_of, repaired, write_results
 
@@ -26,7 +27,24 @@ def test_results_are_found_below_a_folder_and_no_others(tmp_path: Path) -> None:
     found, whole = find_results(tmp_path)
     assert [folder.relative_to(tmp_path).as_posix() for folder in found] == ["a", "b/results"]
     assert whole
-    assert label_of(tmp_path, tmp_path / "a") == "a (cannot be read by this version)"
+    assert label_of(tmp_path, tmp_path / "a") == "a (cannot be read)"
+
+
+def test_results_that_cannot_be_opened_or_were_edited_are_listed_as_such(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    screen = two_results(tmp_path)
+    later = tmp_path / "later"
+    write_json(later / "provenance.json", {"products": {"results.json": {"bytes": 1, "sha256": "of another file"}}})
+    screen._list()
+    assert [label for label in screen._labels if "(cannot be read)" in label] == ["later (cannot be read)"]
+
+    def locked(path: Path, **options: str) -> str:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "read_text", locked)
+    screen._list()
+    assert list(screen._labels) == ["before (cannot be read)", "later (cannot be read)"]
 
 
 def test_with_fewer_than_two_results_nothing_is_compared(tmp_path: Path) -> None:
