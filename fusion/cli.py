@@ -607,8 +607,8 @@ def report(
     from fusion.report.pdf import print_pdf
 
     with _answering():
-        file = claim_file(results, "report.pdf" if pdf else "report.html", out)
         page = report_of(results)
+        file = claim_file(results, "report.pdf" if pdf else "report.html", out)
         written = print_pdf(page, file, browser=browser, full=full) if pdf else write_text(file, page)
         console.print(str(written), soft_wrap=True)
 

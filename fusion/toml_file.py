@@ -50,7 +50,7 @@ def read_toml(path: Path) -> tuple[dict[str, Any], str]:
     Raises
     ------
     TomlError
-        If it is not TOML, has whole numbers of more than 64 bits or more than 32 levels, or is longer than 1 MB.
+        If it is not TOML or no file, has whole numbers of more than 64 bits or more than 32 levels, or is longer than 1 MB.
     UnicodeDecodeError
         If it is not UTF-8.
     OSError
@@ -60,6 +60,8 @@ def read_toml(path: Path) -> tuple[dict[str, Any], str]:
     -----
     TOML 1.0, https://toml.io/en/v1.0.0.
     """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise TomlError("it is a pipe, a socket or a device; name a file")
     with path.open("rb") as file:
         content = file.read(_MOST_BYTES + 1)
     if len(content) > _MOST_BYTES:

@@ -423,6 +423,18 @@ class InterferometryTable(_Measured):
     uncertainty: UncertaintyTable = UncertaintyTable()
 
     @model_validator(mode="after")
+    def _redo_is_asked_for(self) -> InterferometryTable:
+        """Refuse keys that say how a compensation is done again where none is."""
+        given = ['material_temperature = "camera"'] if self.material_temperature == "camera" else []
+        given += ["environment_factor"] if self.environment_factor_mm is not None else []
+        if given and self.compensation != "redo":
+            text = (
+                f'{" and ".join(given)} without compensation = "redo", to which it belongs; add that, or leave it out'
+            )
+            raise PydanticCustomError("compensation", "{text}", {"text": text})
+        return self
+
+    @model_validator(mode="after")
     def _coefficient_u_once(self) -> InterferometryTable:
         """Refuse two standard uncertainties of one coefficient."""
         one, other = self.expansion_coefficient_u_ppm_per_K, self.uncertainty.expansion_coefficient_ppm_per_K

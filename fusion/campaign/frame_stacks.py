@@ -71,7 +71,9 @@ def _read_times(path: Path, table: StackTable) -> dict[tuple[str, int], np.datet
     for line, fields in rows:
         index = fields.get("frame", "0") or "0"
         if not index.isdecimal():
-            raise CampaignError(f"{path}, line {line}: frame {index!r} is no whole number from 0")
+            raise CampaignError(
+                f"{path}, line {line}: frame {index!r} is no whole number; frames of a file are counted from 0"
+            )
         times[Path(fields["file"]).name, int(index)] = _instant(path, fields["time"], table.time_zone, order)
     return times
 

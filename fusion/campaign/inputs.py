@@ -21,6 +21,7 @@ from fusion.attribution.thermal_modes import read_regions
 from fusion.campaign.config import Campaign, relative_name
 from fusion.campaign.frame_stacks import camera_accuracy_notices, stack_options
 from fusion.campaign.logged_tables import read_drivers, split_heading
+from fusion.campaign.messages import naming
 from fusion.campaign.recompensation import RecompensationError, compensate_readings, see_material
 from fusion.campaign.sensors import read_sensors
 from fusion.campaign.sources import (
@@ -73,6 +74,12 @@ def read_source(campaign: Campaign) -> LaserInputs | CameraInputs | Source:
     ValueError
         A subclass of the instruments' packages or of this one: a file that cannot be used, cycles that overlap, clocks that never meet.
     """
+    with naming(campaign.path):
+        return _read_instruments(campaign)
+
+
+def _read_instruments(campaign: Campaign) -> LaserInputs | CameraInputs | Source:
+    """Read what the campaign names, of the instruments that it has."""
     common: dict[str, Any] = {"campaign": campaign, "drivers": _read_drivers(campaign)}
     common["duty"] = _randomised(campaign, common["drivers"])
     common["sensors"] = read_sensors(campaign)
@@ -154,28 +161,46 @@ def read_laser(campaign: Campaign) -> dict[str, Any]:
     zone = campaign.zone_of("interferometry")
     deviations = bring_to_utc(deviations, zone, file=interferometry.deviations)
     check(deviations, DEVIATIONS, name=laser.name)
-    _raise_if_too_few_readings(deviations, file=interferometry.deviations)
+    deviations, notices = _timed_cycles(deviations, file=interferometry.deviations)
+    _raise_if_too_few_readings(deviations, notices, file=interferometry.deviations)
     if _is_timed(deviations):
         cycles_of_readings(deviations)
     environment = None
     if interferometry.environment is not None:
         environment = read_environment(campaign.resolve(interferometry.environment))
         environment = bring_to_utc(environment, zone, file=interferometry.environment)
-    compensated = compensate_readings(deviations, environment, interferometry)
+    with naming(campaign.resolve(interferometry.environment or interferometry.deviations)):
+        compensated = compensate_readings(deviations, environment, interferometry)
     read = {"interferometry": interferometry, "environment": environment}
     if interferometry.material_temperature == "logged":
         return {
             **read,
             "deviations": compensated.deviations,
             "iso_budget": compensated.budget,
-            "notices": compensated.notices,
+            "notices": [*notices, *compensated.notices],
         }
     if campaign.thermography is None:
         raise RecompensationError(
             f'{campaign.path}: interferometry.material_temperature = "camera", but this campaign has no [thermography]; '
             'write "logged", or add the frames'
         )
-    return {**read, "deviations": deviations, "iso_budget": compensated.budget, "notices": []}
+    return {**read, "deviations": deviations, "iso_budget": compensated.budget, "notices": notices}
+
+
+def _timed_cycles(deviations: xr.Dataset, *, file: str) -> tuple[xr.Dataset, list[Notice]]:
+    """Leave out cycles of which no reading has a time, where others have: nothing can be set beside them."""
+    cycle = deviations["cycle"].values
+    timed = ~np.isnat(deviations["time"].values).reshape(cycle.size, -1).all(axis=1)
+    if timed.all() or not timed.any():
+        return deviations, []
+    numbers = listed(str(number) for number in cycle[~timed])
+    return deviations.isel(cycle=timed), [
+        Notice(
+            "cycles_left_out",
+            f"{counted(int((~timed).sum()), 'cycle')} of {cycle.size} in {file} left out, without a reading that has a time: {numbers}.",
+            "Give the times of their readings, or measure them again; the estimates allow for the gaps.",
+        )
+    ]
 
 
 def _is_timed(deviations: xr.Dataset) -> bool:
@@ -285,7 +310,9 @@ def compensate_by_camera(source: Source, fields: xr.Dataset) -> tuple[Source, li
     if not source.needs_camera:
         return source, []
     material = see_material(fields, source.axis, source.deviations)
-    redone = compensate_readings(source.deviations, source.environment, source.interferometry, material=material)
+    file = source.interferometry.environment or source.interferometry.deviations
+    with naming(source.campaign.resolve(file)):
+        redone = compensate_readings(source.deviations, source.environment, source.interferometry, material=material)
     return replace(source, deviations=redone.deviations, iso_budget=redone.budget), redone.notices
 
 
@@ -382,14 +409,14 @@ def _laser_notices(source: LaserInputs) -> list[Notice]:
     return notices
 
 
-def _raise_if_too_few_readings(deviations: xr.Dataset, *, file: str) -> None:
+def _raise_if_too_few_readings(deviations: xr.Dataset, left_out: Sequence[Notice], *, file: str) -> None:
     """Raise if the test has neither scatter nor drift."""
-    sizes = deviations.sizes
+    sizes, said = deviations.sizes, "".join(f" {notice.message}" for notice in left_out)
     if sizes["cycle"] < _LEAST_CYCLES or sizes["target"] < _LEAST_TARGETS:
         raise SourceError(
             f"{file}: {counted(sizes['cycle'], 'cycle')} at {counted(sizes['target'], 'target')}; "
             f"scatter and drift need at least {_LEAST_CYCLES} cycles at {_LEAST_TARGETS} targets; measure more, or look at the readings "
-            f"with thermofuse iso230 {file}"
+            f"with thermofuse iso230 {file}{'.' if said else ''}{said}"
         )
 
 

@@ -9,12 +9,17 @@ import difflib
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
 from pydantic_core import ErrorDetails
+
+from fusion.errors import FusionError
+from interferometry.errors import InterferometryError
+from thermography.errors import ThermographyError
 
 #: From the path of a key to ``"FILE, line N"``.
 Place = Callable[[tuple[str, ...]], str]
@@ -33,6 +38,39 @@ _REMEDIES = {
 _LONGEST_NAME = 255
 #: Faults of one file that are told one by one.
 _MOST_FAULTS = 30
+
+
+@contextmanager
+def naming(file: Path, *, readings: Path | None = None) -> Iterator[None]:
+    """Put the file in front of the message of an error that is raised within by what does not know the file.
+
+    Parameters
+    ----------
+    file : Path
+        The campaign file, or what else was asked for.
+    readings : Path or None
+        File of the readings, which errors of the package `interferometry` are about; None where they are about `file` too.
+
+    Raises
+    ------
+    FusionError, InterferometryError, ThermographyError
+        The same error; a message that begins with a path is left as it is.
+
+    Examples
+    --------
+    >>> with naming(Path("x/campaign.toml")):
+    ...     raise FusionError("the plan grids differ")
+    Traceback (most recent call last):
+    fusion.errors.FusionError: x/campaign.toml: the plan grids differ
+    """
+    try:
+        yield
+    except (FusionError, InterferometryError, ThermographyError) as error:
+        about = readings if readings is not None and isinstance(error, InterferometryError) else file
+        text = str(error)
+        if not text.startswith(str(file)) and not any(mark in text.split(maxsplit=1)[0] for mark in "/\\"):
+            error.args = (f"{about}: {text}",)
+        raise
 
 
 def suggest(name: str, known: Iterable[str]) -> str:

@@ -94,11 +94,6 @@ def compensate_readings(
         If the log does not cover the readings or the stated environment factor is impossible.
     """
     if table.compensation == "as recorded":
-        if table.material_temperature == "camera" or table.environment_factor_mm is not None:
-            raise RecompensationError(
-                'material_temperature = "camera" and environment_factor under [interferometry] belong to compensation = "redo"; '
-                "add it, or leave them out"
-            )
         corrected, notices = _correct_dead_path(deviations, environment, table.dead_path_mm)
         return Compensated(corrected, state_budget(table), notices)
     if environment is None:

@@ -18,6 +18,7 @@ from fusion.alignment.contact_log import describe_sensors, join_sensors
 from fusion.beside import Beside, InTurn
 from fusion.campaign.config import Campaign, load_campaign
 from fusion.campaign.inputs import compensate_by_camera, read_source
+from fusion.campaign.messages import naming
 from fusion.campaign.sources import CameraInputs, Inputs, LaserInputs, Source
 from fusion.consistency.checks import Check, doubt_notices, inputs_part, refuse_contradictions
 from fusion.effects.plugins import plugins
@@ -328,15 +329,19 @@ def run_loaded(
     seen = input_states(campaign)
     report("reading and checking", 0, 1)
     if campaign.record is not None:
-        record = record_stage.read_source(campaign)
+        with naming(campaign.path):
+            record = record_stage.read_source(campaign)
         report("reading and checking", 1, 1)
-        with open_folder(folder, resume=resume):
+        with open_folder(folder, resume=resume), naming(campaign.path):
             return _run_record(_start_run(campaign, folder, seen, report, address, beside or InTurn()), record)
     source = read_source(campaign)
     checks = check_source(source)
-    refuse_contradictions(checks)
+    with naming(campaign.path):
+        refuse_contradictions(checks)
     report("reading and checking", 1, 1)
-    with open_folder(folder, resume=resume):
+    laser = campaign.interferometry
+    readings = None if laser is None else campaign.resolve(laser.deviations)
+    with open_folder(folder, resume=resume), naming(campaign.path, readings=readings):
         run = _start_run(campaign, folder, seen, report, address, beside or InTurn())
         return _run_instruments(run, source, checks, scheduler=scheduler)
 

@@ -9,7 +9,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from fusion.attribution.two_sessions import compare_sessions
+from fusion.attribution.two_sessions import SessionComparisonError, compare_sessions
+from fusion.campaign.messages import naming
 from fusion.products.contracts import read_fusion, read_product
 from fusion.products.results import read_results
 from fusion.products.store import write_dataset, write_json, write_text
@@ -49,7 +50,14 @@ def join_campaigns(folders: Sequence[Path], out: Path) -> list[tuple[str, str]]:
         {**{name: read_product(folder, name) for name in ("fields", "deviations")}, "fusion": read_fusion(folder)}
         for folder in folders
     ]
-    comparison = compare_sessions(*(product["fusion"].children["correlation"] for product in products))
+    for folder, product in zip(folders, products, strict=True):
+        if "correlation" not in product["fusion"].children:
+            raise SessionComparisonError(
+                f"{folder}: its field was not correlated with its drift, for which it holds too little (its report says what), so that "
+                "there is nothing to compare; measure more cycles and targets"
+            )
+    with naming(Path(f"{folders[0]}, {folders[1]}")):
+        comparison = compare_sessions(*(product["fusion"].children["correlation"] for product in products))
     results = [read_results(folder) for folder in folders]
     sessions = session_names(results)
     told = describe_sources(comparison, sessions)

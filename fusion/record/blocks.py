@@ -270,7 +270,9 @@ def reduce_record(table: xr.Dataset) -> Record:
     temperature = np.column_stack([blocks.filled(name, samples[:, k]) for k, name in enumerate(sensors)])
     kept = independent(temperature)
     if not kept:
-        raise RecordError(f"{blocks.source}: no temperature changes; there is nothing that a displacement could follow")
+        raise RecordError(
+            f"{blocks.source}: no temperature changes; nothing that a displacement could follow; add sensors that warm"
+        )
     per_block = max(1.0, elapsed.size / blocks.seconds.size)
     drivers = _drivers(table, blocks)
     return Record(

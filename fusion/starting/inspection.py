@@ -77,9 +77,14 @@ def inspect_paths(paths: Sequence[Path]) -> Iterator[Inspected]:
     Yields
     ------
     Inspected
-        One per file, and one per series of thermal frames: more than three files of one folder and ending.
+        One per file, and one per series of thermal frames: more than three files of one folder and ending. One with a fault for a folder
+        without files.
     """
     named, files = set(paths), _files(paths)
+    for path in paths:
+        if path.is_dir() and not input_files(path):
+            fault = "holds no file to look into (hidden ones and results are passed over); name the folder of the measured files"
+            yield Inspected(str(path), Kind.UNKNOWN, fault=fault, named=True)
     thermal = [path for path in files if _is_thermal(path)]
     series: dict[tuple[Path, str], list[Path]] = {}
     for path in thermal:

@@ -111,11 +111,11 @@ def _counts(
     empty = sorted(set(range(cycles)) - {index[0] for index in readings})
     if empty:
         raise LaserFormatError(
-            f"{path}: there is a cycle {cycles}, but no reading of cycle {empty[0] + 1}; the file is damaged"
+            f"{path}: there is a cycle {cycles}, but no reading of cycle {empty[0] + 1}; the file is damaged, export the test again"
         )
     for name, count in (("CYCLES", cycles), ("POSITIONS", targets)):
         if name in stated and stated[name] != str(count):
             raise LaserFormatError(
-                f"{path}: {name}={stated[name]}, but {count} were found; the file is cut short or joined from two"
+                f"{path}: {name}={stated[name]}, but {count} were found; the file is cut short or joined from two, export the test again"
             )
     return cycles, targets

@@ -224,7 +224,7 @@ def _drop_misplaced(path: Path, readings: list[Reading], left_out: list[Rejected
         if len(off) > max(1, 0.1 * len(group)):
             raise LaserFormatError(
                 f"{path}: target {target} stands at {off[0].position} {unit} on line {off[0].line} but at {typical} {unit} elsewhere "
-                f"({len(off)} of {len(group)} readings disagree); the position is the programmed one, the same in every cycle"
+                f"({len(off)} of {len(group)} readings disagree); the position is the programmed one, the same in every cycle: correct it"
             )
         for reading in off:
             reason = f"target {target} stands at {typical} {unit} elsewhere"

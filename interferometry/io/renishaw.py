@@ -76,7 +76,7 @@ def read_rtl(
     kind = _keyed(sections.get("HEADER", [])).get("filetype", "rtl")
     if kind.lower() != "rtl":
         raise LaserFormatError(
-            f"{path}: File type is {kind}, not rtl; only linear tests hold positioning deviations in um"
+            f"{path}: File type is {kind}, not rtl; only linear tests hold positioning deviations in um: name the file of that test"
         )
     targets = _parse_targets(path, sections)
     runs, left_out = _parse_runs(path, sections, len(targets))
@@ -184,11 +184,12 @@ def _parse_targets(path: Path, sections: dict[str, list[tuple[int, str]]]) -> np
             numbers += [parse_number(word) for word in content.replace(",", ".").split()]
         except BadReading:
             raise LaserFormatError(
-                f"{path}, line {line}: {content.strip()!r} is not a row of target positions in mm"
+                f"{path}, line {line}: {content.strip()!r} is not a row of target positions in mm; copy the file again"
             ) from None
     if len(numbers) != count or count == 0:
         raise LaserFormatError(
-            f"{path}: Target-count is {count}, but {len(numbers)} target positions follow; the file is damaged"
+            f"{path}: Target-count is {count}, but {len(numbers)} target positions follow; the file is damaged, "
+            "copy it again from the measuring computer"
         )
     return np.array(numbers)
 
@@ -244,7 +245,8 @@ def _parse_runs(
     stated = _whole(path, sections.get("RUNS", []), "Run-count", max(runs, default=0))
     if not runs or max(runs) > stated:
         raise LaserFormatError(
-            f"{path}: Run-count is {stated}, but DEVIATIONS holds runs {sorted(runs)}; the file is damaged"
+            f"{path}: Run-count is {stated}, but DEVIATIONS holds runs {sorted(runs)}; the file is damaged, "
+            "copy it again from the measuring computer"
         )
     return [runs[number] for number in sorted(runs)], left_out
 
@@ -388,13 +390,16 @@ def read_rtx(path: str | Path) -> xr.Dataset:
     data = content[begin + len(b"Data:\r\n") : end]
     rate = _header_number(path, lines, "Actual sample rate") or _header_number(path, lines, "Sample rate") or 0.0
     if rate <= 0:
-        raise LaserFormatError(f"{path}: no 'Actual sample rate' or 'Sample rate' above 0 in the header")
+        raise LaserFormatError(
+            f"{path}: no 'Actual sample rate' or 'Sample rate' above 0 in the header; copy it again from the measuring computer"
+        )
     usable = len(data) // 8 * 8
     displacement = np.frombuffer(data[:usable], dtype="<f8")
     stated = displacement.size if "sampleno" not in keyed else _header_number(path, lines, "Sample no")
     if stated != displacement.size:
         raise LaserFormatError(
-            f"{path}: 'Sample no' is {keyed['sampleno']}, but {displacement.size} samples follow; the file is cut short"
+            f"{path}: 'Sample no' is {keyed['sampleno']}, but {displacement.size} samples follow; the file is cut short, "
+            "copy it again from the measuring computer"
         )
     damaged = np.flatnonzero(~np.isfinite(displacement) | (np.abs(displacement) >= SENTINEL_MAGNITUDE))
     if damaged.size:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 
@@ -135,3 +136,9 @@ def test_text_without_its_end_is_told_in_time(tmp_path: Path, part: str) -> None
     with pytest.raises(TomlError):
         read_toml(path)
     assert time.process_time() - begun < 10.0
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "campaign.toml")
+    with pytest.raises(TomlError, match="it is a pipe, a socket or a device; name a file"):
+        read_toml(tmp_path / "campaign.toml")

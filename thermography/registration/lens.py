@@ -158,7 +158,7 @@ def _entry(entries: dict[str, Any], path: Path, names: tuple[str, ...], count: i
     except (TypeError, ValueError, OverflowError) as error:
         raise LensError(f"{path}: {name} is damaged ({error}); write the calibration again") from None
     if count is not None and values.size != count:
-        raise LensError(f"{path}: {name} holds {values.size} numbers instead of {count}")
+        raise LensError(f"{path}: {name} holds {values.size} numbers instead of {count}; write the calibration again")
     return values
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pandas as pd
 import xarray as xr
 
+from fusion.campaign.messages import naming
 from fusion.products.contracts import read_product
 from fusion.products.grouped import has
 from fusion.products.results import Results, read_results
@@ -129,11 +130,12 @@ def export_results(
             "by ISO 230-2"
         )
     run = _Run(results, found, deviations, read_origin(results, found, read_thermal_state(results, deviations)))
-    texts, notes = (
-        _temperature_text(run, axis, reference_mm, force=force)
-        if format == TEMPERATURE_FORMAT
-        else _table_texts(run, CONTROLS[format], axis, spacing_mm, reference_mm, force=force)
-    )
+    with naming(results):
+        texts, notes = (
+            _temperature_text(run, axis, reference_mm, force=force)
+            if format == TEMPERATURE_FORMAT
+            else _table_texts(run, CONTROLS[format], axis, spacing_mm, reference_mm, force=force)
+        )
     writers = {name: _text_writer(text) for name, text in texts.items()}
     return Exported(_write(out, writers, overwrite=overwrite), tuple(notes))
 

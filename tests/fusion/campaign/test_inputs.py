@@ -11,7 +11,10 @@ import pytest
 from fusion.alignment.align import AlignmentError
 from fusion.campaign.config import CampaignError, load_campaign
 from fusion.campaign.inputs import SourceError, frames_notices, read_source
+from fusion.campaign.sources import LaserInputs
 from fusion.pipeline.interferometry import evaluate_interferometry
+from interferometry.io.readers import read_deviations
+from interferometry.io.writers import write_rtl
 from tests.fusion.campaign_parts import without
 
 
@@ -133,3 +136,25 @@ def test_a_frame_of_another_size_is_not_called_damaged() -> None:
     assert notice.remedy == "Name the frames of one camera and one size only in thermography.frames."
     (notice,) = frames_notices([other, {"file": "c.seq", "index": 0, "reason": "c.seq: cut off"}])
     assert notice.remedy.startswith("Copy damaged files again")
+
+
+def test_cycles_without_a_time_are_left_out_by_number(copied: Path) -> None:
+    """A .rtl file of which some runs hold no reading: the other cycles are evaluated under their own numbers."""
+    read = read_deviations(copied / "laser.csv")
+    lost = read["deviation"].where(~read["cycle"].isin([2, 5]))
+    write_rtl(copied / "laser.rtl", read.assign(deviation=lost))
+    alone = without(copied / "campaign.toml", "thermography", "plan", "model")
+    reconstructed = '"laser.rtl"\ntime_zone = "UTC"\nfeed = "1000 mm/min"\ndwell = "3 s"'
+    alone.write_text(alone.read_text().replace('"laser.csv"', reconstructed))
+    source = read_source(load_campaign(alone))
+    assert isinstance(source, LaserInputs)
+    numbers = source.deviations["cycle"].values.tolist()
+    assert numbers == [n for n in range(1, numbers[-1] + 1) if n not in (2, 5)]
+    told = {notice.code: notice.message for notice in source.notices}["cycles_left_out"]
+    assert told == f"2 cycles of {numbers[-1]} in laser.rtl left out, without a reading that has a time: 2; 5."
+    lost = read["deviation"].where(read["cycle"] == 1)
+    write_rtl(copied / "laser.rtl", read.assign(deviation=lost))
+    with pytest.raises(
+        SourceError, match=r"part\.toml: laser\.rtl: 1 cycle at .* cycles of \d+ in laser\.rtl left out"
+    ):
+        read_source(load_campaign(alone))

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from fusion.campaign.messages import describe, find_line, key_lines, suggest
+from fusion.campaign.messages import describe, find_line, key_lines, naming, suggest
+from fusion.errors import FusionError
+from interferometry.errors import InterferometryError
+from thermography.errors import ThermographyError
 
 TEXT = """\
 [plan]            # the table
@@ -48,3 +54,18 @@ def test_a_fault_names_place_key_and_value() -> None:
         sentences = [describe(item, Table, lambda key: f"file, line {len(key)}") for item in error.errors()]
     assert sentences[0].startswith("file, line 1: cycles = [true, 2]: ")
     assert sentences[1] == "file, line 1: unknown key circles; did you mean cycles? known here: cycles"
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        (InterferometryError("no reading has a time"), "c/laser.csv: no reading has a time"),
+        (FusionError("the clocks disagree"), "c/campaign.toml: the clocks disagree"),
+        (FusionError("c/campaign.toml, line 3: no"), "c/campaign.toml, line 3: no"),
+        (ThermographyError("c/thermal/1.jpg: cut short"), "c/thermal/1.jpg: cut short"),
+    ],
+)
+def test_a_message_without_a_file_gets_one(told: ValueError, message: str) -> None:
+    with pytest.raises(type(told)) as error, naming(Path("c/campaign.toml"), readings=Path("c/laser.csv")):
+        raise told
+    assert str(error.value) == message

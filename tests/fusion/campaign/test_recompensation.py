@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from pydantic import ValidationError
 
 from fusion.alignment.align import AxisGeometry
 from fusion.campaign.config import InterferometryTable, load_campaign
@@ -91,8 +92,10 @@ def test_a_factor_in_a_rtl_is_taken_out_and_the_logged_conditions_put_in(
 def test_what_cannot_be_redone_is_refused(readings: xr.Dataset, log: xr.Dataset) -> None:
     with pytest.raises(RecompensationError, match=r'compensation = "redo" needs the air: log air temperature'):
         compensate_readings(readings, None, table(compensation="redo"))
-    with pytest.raises(RecompensationError, match=r'belong to compensation = "redo"; add it, or leave them out'):
-        compensate_readings(readings, log, table(material_temperature="camera"))
+    with pytest.raises(
+        ValidationError, match=r'material_temperature = "camera" without compensation = "redo", to which it belongs'
+    ):
+        table(material_temperature="camera")
     wrong = table(compensation="redo", environment_factor=["0.3 um", "0.3 um"])
     with pytest.raises(CompensationError, match=r"the environment factor 0.3 um differs by \d+ ppm"):
         compensate_readings(readings, log, wrong)

@@ -105,7 +105,7 @@ def test_what_never_moves_is_refused(rng):
     displacement, temperature, speed = linear_samples(rng)
     with pytest.raises(RecordError, match='channel "ch2" never moves; leave it out'):
         reduce_record(table_of(displacement * [1.0, 0.0], temperature, speed))
-    with pytest.raises(RecordError, match="no temperature changes; there is nothing that a displacement could follow"):
+    with pytest.raises(RecordError, match="no temperature changes; nothing that a displacement could follow"):
         reduce_record(table_of(displacement, np.full_like(temperature, 20.0), speed))
 
 

@@ -72,3 +72,9 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(pipe)
     (found,) = inspect_paths([pipe])
     assert found.kind is Kind.UNREADABLE and found.fails and "name a file" in found.fault
+
+
+def test_a_folder_without_files_is_told(tmp_path: Path) -> None:
+    (tmp_path / ".hidden").touch()
+    (found,) = inspect_paths([tmp_path])
+    assert found.fails and found.fault.startswith("holds no file to look into")
