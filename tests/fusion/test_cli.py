@@ -349,3 +349,12 @@ def test_results_that_were_edited_are_not_reported(results_folder: Path, tmp_pat
         assert "edited/results.json: is not the file that this run wrote (its SHA-256 is not" in told.output.replace(
             "\n", ""
         )
+
+
+@pytest.mark.parametrize("pdf", [(), ("--pdf",)])
+def test_a_report_of_no_results_writes_nothing(tmp_path: Path, pdf: tuple[str, ...]) -> None:
+    (tmp_path / "mine").mkdir()
+    for folder in (tmp_path / "mine", tmp_path / "absent"):
+        told = invoke("report", folder, *pdf)
+        assert told.exit_code == 2 and "there is no results.json in it" in told.output.replace("\n", "")
+    assert [path.name for path in tmp_path.rglob("*")] == ["mine"]
