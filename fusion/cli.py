@@ -163,10 +163,10 @@ def run(
 def _watch(campaign: Path, *, until_idle_s: float | None, wanted: str, quiet: bool) -> None:
     """Follow a test until it is over, a line per finished cycle."""
     from fusion.campaign.config import CampaignError, load_campaign
-    from fusion.campaign.quantities import read_quantity
+    from fusion.campaign.quantities import read_option
     from fusion.pipeline.watch import follow, live_line
 
-    wanted_u_um = read_quantity(wanted, "um")
+    wanted_u_um = read_option("--wanted", wanted, "um")
     if not wanted_u_um > 0.0:
         raise CampaignError(f'--wanted "{wanted}": the wanted uncertainty lies above 0; write for example "0.1 um"')
     with interrupt_ends_step() as asked:
@@ -562,7 +562,7 @@ def export(
     A compensation table is written where the drift is explained and the inputs are sound, with a header that says in which thermal
     state it holds and how to try it.
     """
-    from fusion.campaign.quantities import read_quantity
+    from fusion.campaign.quantities import read_option
     from fusion.report.exports.export import export_results
 
     with _answering():
@@ -571,8 +571,8 @@ def export(
             format.value,
             out or results / "export",
             axis=axis,
-            spacing_mm=None if spacing is None else read_quantity(spacing, "mm"),
-            reference_mm=None if reference is None else read_quantity(reference, "mm"),
+            spacing_mm=None if spacing is None else read_option("--spacing", spacing, "mm"),
+            reference_mm=None if reference is None else read_option("--reference", reference, "mm"),
             fields=fields,
             force=force,
             overwrite=overwrite,

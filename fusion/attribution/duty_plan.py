@@ -61,7 +61,7 @@ class Machine:
     Raises
     ------
     DutyPlanError
-        If sources and time constants differ in number, or a quantity is not greater than 0.
+        If sources and time constants differ in number, a source is named twice, or a quantity is not greater than 0.
     """
 
     sources: tuple[str, ...]
@@ -78,8 +78,14 @@ class Machine:
                 f"{len(self.sources)} sources and {len(self.time_constants_s)} time constants: name every source once, with one "
                 "time constant each"
             )
-        if min(*self.time_constants_s, self.effect_um, self.noise_um, self.cycle_s, self.cycle_s) <= 0:
-            raise DutyPlanError("time constants, effect, noise and cycle length must be greater than 0")
+        repeated = next((name for name in self.sources if self.sources.count(name) > 1), None)
+        if repeated is not None:
+            raise DutyPlanError(f"source {repeated!r} is named more than once; name every source once")
+        values = {f"time constant of {name}": s for name, s in zip(self.sources, self.time_constants_s, strict=True)}
+        values |= {"effect": self.effect_um, "noise": self.noise_um, "cycle": self.cycle_s}
+        wrong = next((name for name, value in values.items() if not value > 0.0), None)
+        if wrong is not None:
+            raise DutyPlanError(f"{wrong}: {values[wrong]:g} is not greater than 0; give what the machine has")
 
 
 def plan_duty(

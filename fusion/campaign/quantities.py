@@ -121,6 +121,29 @@ def read_quantity(value: object, target: str) -> float:
     return result
 
 
+def read_option(option: str, text: str, target: str) -> float:
+    """Return the value of an option of the command in its canonical unit.
+
+    Parameters
+    ----------
+    option : str
+        As it is written, ``"--spacing"``.
+    text : str
+        Its value, ``"25 mm"``.
+    target : str
+        Canonical unit, as `read_quantity` takes it.
+
+    Raises
+    ------
+    QuantityError
+        As `read_quantity`, with the option and what was written.
+    """
+    try:
+        return read_quantity(text, target)
+    except QuantityError as error:
+        raise QuantityError(f'{option} "{text}": {error}') from None
+
+
 def split_uncertainty(text: str) -> tuple[str, str | None]:
     """Return value and standard uncertainty of a text such as ``"22 +- 1 degC"``, each with its unit.
 

@@ -45,8 +45,8 @@ def open_folder(folder: Path, *, resume: bool) -> Iterator[Path]:
     Raises
     ------
     OutputError
-        If the folder has a name that is no text, is a file, cannot be written to, is held by another run, holds something and `resume` is
-        false, or holds something that no run has written.
+        If the folder has a name that is no text, is a file, lies in another results folder, cannot be written to, is held by another run,
+        holds something and `resume` is false, or holds something that no run has written.
 
     Notes
     -----
@@ -57,6 +57,14 @@ def open_folder(folder: Path, *, resume: bool) -> Iterator[Path]:
         raise OutputError(f"{str(folder)!a} is no text in UTF-8; name another folder for the results with --out")
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder} is a file; name a folder for the results with --out")
+    outer = next(
+        (one for one in folder.absolute().parents if (one / "results.json").is_file() and (one / MANIFEST).is_file()),
+        None,
+    )
+    if outer is not None:
+        raise OutputError(
+            f"{folder} lies in {outer}, which holds the results of a run; name a folder beside it with --out"
+        )
     content = {item.name for item in folder.iterdir()} if folder.is_dir() else set()
     if content and not (folder / _HOLDER).exists():
         _refuse_strange(folder, content, resume=resume)

@@ -98,19 +98,21 @@ def write_iso230(path: Path, page: str) -> None:
     Parameters
     ----------
     path : Path
-        A file that does not exist yet; one that ends with ``.pdf`` is printed by an installed browser.
+        A file that does not exist yet and ends with ``.html``, or with ``.pdf``: an installed browser prints it then.
     page : str
         HTML text.
 
     Raises
     ------
     Iso230PageError
-        If the file exists.
+        If the file exists, or has another ending.
     PrintError
         If it cannot be printed.
     """
     if path.exists():
         raise Iso230PageError(f"{path} exists already; name another file with --out, or remove it")
+    if path.suffix.lower() not in (".html", ".htm", ".pdf"):
+        raise Iso230PageError(f"{path}: the sheet is written as .html or .pdf; name such a file with --out")
     if path.suffix.lower() == ".pdf":
         print_pdf(page, path)
     else:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import rich.table
 
-from fusion.campaign.quantities import read_quantity
+from fusion.campaign.quantities import read_option
 from fusion.products.results import Results
 from fusion.products.results_axis import RegistrationPart
 from fusion.products.results_inputs import Figures
@@ -157,10 +157,10 @@ def duty_lines(
     machine = Machine(
         sources=tuple(name for name, _ in named),
         time_constants_s=tuple(seconds for _, seconds in named),
-        effect_um=read_quantity(effect, "um"),
-        drift_um_per_sqrt_h=read_quantity(drift, "um"),
-        noise_um=read_quantity(noise, "um"),
-        cycle_s=read_quantity(cycle, "s"),
+        effect_um=read_option("--effect", effect, "um"),
+        drift_um_per_sqrt_h=read_option("--drift", drift, "um"),
+        noise_um=read_option("--noise", noise, "um"),
+        cycle_s=read_option("--cycle", cycle, "s"),
     )
     proposed = plan_duty(machine, power=power, seed=seed)
     reached = float(proposed["power"].sel(hours=float(proposed["test_hours"])).max())
@@ -182,4 +182,4 @@ def _source(text: str) -> tuple[str, float]:
         raise DutyPlanError(
             f'--source "{text}" is no source; write its name and time constant, for example "spindle=40 min"'
         )
-    return name.strip(), read_quantity(time_constant, "s")
+    return name.strip(), read_option(f"--source {name.strip()}", time_constant, "s")

@@ -66,13 +66,17 @@ def write_campaign(folder: Path, asker: Asker) -> tuple[Path, list[str]]:
     Raises
     ------
     DraftError
-        If the folder has a campaign file already, or holds nothing that can be evaluated.
+        If the folder has a campaign file already, is one of results, or holds nothing that can be evaluated.
     """
     path = folder / _FILE
     if not folder.is_dir():
         raise DraftError(f"{folder}: no such folder; name the folder that holds the files of the measurement")
     if path.exists():
         raise DraftError(f"{path} exists already and is not replaced; thermofuse check {path} says what it lacks")
+    if (folder / "results.json").is_file():
+        raise DraftError(
+            f"{folder}: holds the results of a run; name the folder that holds the files of the measurement"
+        )
     content = scan_folder(folder.resolve())
     lines = list(draft_lines(content, asker))
     unnamed = next((line for line in lines if not is_text(line)), None)

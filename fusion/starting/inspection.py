@@ -82,7 +82,7 @@ def inspect_paths(paths: Sequence[Path]) -> Iterator[Inspected]:
     """
     named, files = set(paths), _files(paths)
     for path in paths:
-        if path.is_dir() and not input_files(path):
+        if path.is_dir() and not any(True for _ in input_files(path)):
             fault = "holds no file to look into (hidden ones and results are passed over); name the folder of the measured files"
             yield Inspected(str(path), Kind.UNKNOWN, fault=fault, named=True)
     thermal = [path for path in files if _is_thermal(path)]

@@ -170,7 +170,7 @@ def read_window(text: str, deviations: xr.Dataset) -> list[int]:
         raise CampaignError(f'--cycles "{text}" is not a window of cycles; write for example 1-5')
     first, last = int(match.group(1)), int(match.group(2) or match.group(1))
     cycles = deviations["cycle"].values.tolist()
-    window = [cycle for cycle in range(first, last + 1) if cycle in cycles]
+    window = [cycle for cycle in cycles if first <= cycle <= last]
     if first > last:
         raise CampaignError(f'--cycles "{text}" ends before it begins; write for example {last}-{first}')
     if len(window) != last - first + 1:

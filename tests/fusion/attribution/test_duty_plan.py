@@ -1,6 +1,7 @@
 """The plan of a randomised duty: its power, its schedule, and what it refuses."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,3 +44,16 @@ def test_a_plan_without_sources_is_refused():
 def test_a_plan_without_usable_dwells_is_refused():
     with pytest.raises(DutyPlanError, match="is longer than the least dwell of 7200 s"):
         plan_duty(Machine(("a",), (1200.0,), 3.0), least_dwell_s=7200.0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"sources": ("x", "x")}, "source 'x' is named more than once"),
+        ({"time_constants_s": (60.0, -5.0)}, "time constant of b: -5 is not greater than 0"),
+        ({"cycle_s": 0.0}, "cycle: 0 is not greater than 0"),
+    ],
+)
+def test_what_cannot_be_planned_is_named(changed: dict[str, Any], message: str) -> None:
+    with pytest.raises(DutyPlanError, match=message):
+        Machine(**{"sources": ("a", "b"), "time_constants_s": (60.0, 90.0), "effect_um": 1.0, **changed})

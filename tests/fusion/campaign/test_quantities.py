@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fusion.campaign.quantities import QuantityError, conversion, read_quantity, unit_name
+from fusion.campaign.quantities import QuantityError, conversion, read_option, read_quantity, unit_name
 
 
 @pytest.mark.parametrize(
@@ -43,3 +43,9 @@ def test_anything_else_is_refused_with_an_example(value: object, message: str) -
 def test_a_temperature_has_an_offset() -> None:
     assert conversion("K", "degC") == (1.0, -273.15)
     assert unit_name(" \u2103 ") == "degC" and unit_name("furlong") == "furlong"
+
+
+def test_an_option_is_named_with_what_was_written() -> None:
+    assert read_option("--spacing", "2 cm", "mm") == 20.0
+    with pytest.raises(QuantityError, match=r'^--spacing "0": a length needs its unit in the value; write for example'):
+        read_option("--spacing", "0", "mm")

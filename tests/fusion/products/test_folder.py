@@ -123,3 +123,16 @@ def test_a_file_that_is_made_later_replaces_nothing_of_others(tmp_path: Path) ->
     mine.write_text("of somebody")
     with pytest.raises(OutputError, match=r"mine\.html exists already; name another file with --out"):
         claim_file(results, "report.html", mine)
+
+
+def test_results_within_results_are_refused(tmp_path: Path) -> None:
+    for name in ("results.json", "manifest.json"):
+        (tmp_path / name).write_text("{}")
+    with (
+        pytest.raises(
+            OutputError, match=f"lies in {tmp_path}, which holds the results of a run; name a folder beside it"
+        ),
+        open_folder(tmp_path / "a" / "b", resume=False),
+    ):
+        pass
+    assert not (tmp_path / "a").exists()

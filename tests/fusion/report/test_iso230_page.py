@@ -167,6 +167,8 @@ def test_names_from_files_are_escaped_and_no_file_is_replaced(
 ) -> None:
     page = render_iso230("<i>A</i>", *test_sheet, remarks=("<script>",), versions=VERSIONS)
     assert "<i>A</i>" not in page and "<li>&lt;script&gt;</li>" in page
+    with pytest.raises(Iso230PageError, match=r"page\.docx: the sheet is written as \.html or \.pdf"):
+        write_iso230(tmp_path / "page.docx", page)
     write_iso230(tmp_path / "page.html", page)
     with pytest.raises(Iso230PageError, match="exists already"):
         write_iso230(tmp_path / "page.html", page)

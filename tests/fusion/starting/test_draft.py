@@ -210,3 +210,10 @@ def test_a_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DraftError, match=r"is not UTF-8 .*\\udcff.*another name"):
         write_campaign(tmp_path, Asker(None, print))
     assert not (tmp_path / "campaign.toml").exists()
+
+
+def test_a_folder_of_results_gets_no_campaign_file(tmp_path: Path) -> None:
+    (tmp_path / "results.json").write_text("{}")
+    with pytest.raises(DraftError, match="holds the results of a run; name the folder that holds the files"):
+        write_campaign(tmp_path, Asker(None, print))
+    assert [path.name for path in tmp_path.iterdir()] == ["results.json"]

@@ -82,6 +82,8 @@ def test_a_window_of_cycles_is_read() -> None:
         read_window("4-2", deviations)
     with pytest.raises(CampaignError, match="were not measured; there are 1 to 8"):
         read_window("7-9", deviations)
+    with pytest.raises(CampaignError, match="asks for cycles that were not measured"):
+        read_window(f"1-{10**30}", deviations)
 
 
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
