@@ -36,6 +36,8 @@ _SIGNAL_BASE = 128
 _STOPPING = (signal.SIGINT, signal.SIGTERM)
 #: What a disk answers that takes no more; a file that is being written has no name in the answer.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+#: What a damaged disk or a lost network answers in the middle of a file.
+_LOST = (errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.ENODEV, errno.ENXIO, errno.EHOSTUNREACH)
 #: Codes from here on count failed campaigns, up to the last that means nothing to a shell.
 _FAILED_BASE, _MOST_FAILED = 100, 25
 
@@ -120,6 +122,12 @@ def answering(console: Console, *, kept: Callable[[], str] = lambda: "") -> Iter
         if error.errno in _NO_ROOM:
             say(
                 f"a file cannot be written ({error.strerror}); make room, or name a folder on another disk, and start again"
+            )
+            raise typer.Exit(ExitCode.BAD_INPUT) from None
+        if error.errno in _LOST:
+            place = "" if error.filename is None else f"{error.filename}: "
+            say(
+                f"{place}a file cannot be read or written ({error.strerror}); check the disk or the network, and start again"
             )
             raise typer.Exit(ExitCode.BAD_INPUT) from None
         if error.filename is None:

@@ -45,6 +45,7 @@ from fusion.campaign.value_types import (
     check_pattern,
     corner_words,
     matching_files,
+    not_a_file,
 )
 from fusion.effects.effect import Effect
 from fusion.effects.library import library
@@ -86,6 +87,8 @@ def _existing(name: str, info: ValidationInfo) -> str:
     if isinstance(info.context, _Surroundings):
         path = info.context.folder / name
         path = path if "\0" in name else Path(os.path.realpath(path))
+        if text := not_a_file(path):
+            raise PydanticCustomError("file", "{text}", {"text": text})
         if not os.path.isfile(path):  # noqa: PTH113 - a name that is too long raises there, and is told here
             text = f"no such file {path}; {near_file(path)}paths are relative to the campaign file"
             raise PydanticCustomError("file", "{text}", {"text": text})
@@ -98,9 +101,12 @@ def _matching(pattern: str, info: ValidationInfo) -> str:
         check_pattern(info.context.folder, pattern)
         found = matching_files(info.context.folder, pattern)
         lost = [path for path in found if not path.exists()]
+        strange = next((text for path in found if (text := not_a_file(path))), "")
         unnamed = [path for path in found if not is_text(str(path).removeprefix(str(info.context.folder)))]
         if lost:
             text = f"{lost[0]} is a link to a file that is gone; bring it back or remove the link"
+        elif strange:
+            text = strange
         elif unnamed:
             text = f"{str(unnamed[0])!a} has a name that is no text in UTF-8; rename it"
         elif not found:

@@ -19,6 +19,8 @@ from fusion.campaign.quantities import QuantityError, read_quantity
 _MOST_PARTS = 64
 #: Most files and folders that are looked through for one pattern: a test of 10,000 cycles with 100 frames in each.
 _MOST_SEARCHED = 1_000_000
+#: Files that Linux makes when they are read, some of which wait or never end.
+_OF_THE_SYSTEM = ("/proc/", "/sys/")
 _WILDCARD = re.compile(r"[*?[]")
 
 
@@ -144,6 +146,26 @@ def corner_words(corners: tuple[tuple[float, float], ...]) -> str:
         In order.
     """
     return ", ".join(f"({x:g}, {y:g})" for x, y in corners) + " mm"
+
+
+def not_a_file(path: str | Path) -> str:
+    """Return why a path that is there is no file of somebody, or nothing.
+
+    Parameters
+    ----------
+    path : str or Path
+        What a campaign file names.
+    """
+    if "\0" in str(path):
+        return ""
+    real = os.path.realpath(path)
+    if real.startswith(_OF_THE_SYSTEM):
+        return f"{path} is a part of the system and no file that was written; name a measured file"
+    if os.path.isdir(real):  # noqa: PTH112 - a name that is too long is none
+        return f"{path} is a folder; name a file in it"
+    if os.path.exists(real) and not os.path.isfile(real):  # noqa: PTH110, PTH113
+        return f"{path} is a pipe, a socket or a device; name a file"
+    return ""
 
 
 def matching_files(folder: Path, pattern: str) -> list[Path]:

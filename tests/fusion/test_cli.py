@@ -238,7 +238,7 @@ def test_plan_proposes_a_schedule_and_refuses_half_a_source() -> None:
     assert {row.split()[2] for row in rows} == {"on", "off"}
     for bad, message in (
         ("spindle", '--source "spindle" is no source; write its name and time constant, for example "spindle=40 min"'),
-        ("spindle=40", 'a time needs its unit in the value; write for example "37 s"'),
+        ("spindle=40", '--source spindle "40": a time needs its unit in the value; write for example "37 s"'),
     ):
         refused = invoke("plan", "--source", bad)
         assert (refused.exit_code, refused.stderr) == (2, f"thermofuse: {message}\n")

@@ -34,6 +34,9 @@ def test_faults_of_input_end_with_their_message() -> None:
     full = OSError(errno.ENOSPC, "No space left on device")
     told = "thermofuse: a file cannot be written (No space left on device); make room, or name a folder on another disk, and start again\n"
     assert ending(full) == (ExitCode.BAD_INPUT, told)
+    lost = OSError(errno.EIO, "Input/output error")
+    told = "thermofuse: a file cannot be read or written (Input/output error); check the disk or the network, and start again\n"
+    assert ending(lost) == (ExitCode.BAD_INPUT, told)
     assert ending(missing) == (ExitCode.BAD_INPUT, "thermofuse: IR_0007.jpg: No such file or directory\n")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -67,3 +68,13 @@ def test_a_pattern_searches_a_million_files_at_most(tmp_path: Path, monkeypatch:
     value_types.check_pattern(tmp_path, "day1/thermal/*.jpg")
     with pytest.raises(PydanticCustomError, match=f"more than 4 files and folders in {tmp_path}; name the folder"):
         value_types.check_pattern(tmp_path, "**/*.jpg")
+
+
+def test_what_is_no_file_is_told(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "laser.csv")
+    (tmp_path / "kernel.csv").symlink_to("/proc/kmsg")
+    assert value_types.not_a_file(tmp_path) == f"{tmp_path} is a folder; name a file in it"
+    assert value_types.not_a_file(tmp_path / "laser.csv").endswith("is a pipe, a socket or a device; name a file")
+    assert "is a part of the system" in value_types.not_a_file(tmp_path / "kernel.csv")
+    (tmp_path / "file.csv").touch()
+    assert not value_types.not_a_file(tmp_path / "file.csv") and not value_types.not_a_file(tmp_path / "absent.csv")
