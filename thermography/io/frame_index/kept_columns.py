@@ -12,6 +12,7 @@ import os
 import zipfile
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -63,12 +64,14 @@ def recall(file: BinaryIO, path: Path, start: int, empty: Mapping[str, Array]) -
                 return None
             if about != _about(file):
                 _log.warning("%s has changed since its headers were read; they are read again", path)
+                _remove(kept)
                 return None
             columns = {name: stored[name] for name in empty}
     except FileNotFoundError:
         return None
     except (OSError, ValueError, LookupError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         _log.warning("%s, which keeps the headers of %s, is damaged (%s); they are read again", kept, path, error)
+        _remove(kept)
         return None
     alike = all(
         (columns[name].dtype, columns[name].shape[1:]) == (array.dtype, array.shape[1:])
@@ -117,6 +120,12 @@ def _about(file: BinaryIO) -> dict[str, Any]:
         file.seek(place)
         edges.update(file.read(_EDGE))
     return {"version": _VERSION, "bytes": status.st_size, "changed_ns": status.st_mtime_ns, "edges": edges.hexdigest()}
+
+
+def _remove(kept: Path) -> None:
+    """Remove a file that is of no use, so that it is told once; Windows keeps one that is open."""
+    with suppress(OSError):
+        kept.unlink()
 
 
 def _remove_first_written(folder: Path) -> None:

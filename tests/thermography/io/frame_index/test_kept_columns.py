@@ -82,6 +82,19 @@ def test_frames_that_were_recorded_since_are_read_and_the_change_is_said(
     assert len(index_frames(path)[0]) == FRAMES + 1 and caplog.messages == []
 
 
+def test_a_recording_that_is_too_short_now_is_told_once(
+    tmp_path: Path, cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "a.seq"
+    record(path)
+    index_frames(path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 280 // FRAMES])
+    for said in (1, 0):
+        caplog.clear()
+        assert len(index_frames(path)[0]) == 280 and len(caplog.messages) == said
+    assert not list(cache.iterdir())
+
+
 @pytest.mark.parametrize("kept_time", [True, False])
 def test_another_file_of_the_same_size_is_read_anew(
     tmp_path: Path, cache: Path, caplog: pytest.LogCaptureFixture, kept_time: bool
