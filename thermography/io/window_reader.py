@@ -172,9 +172,13 @@ class _File:
         self.buffer = mmap.mmap(-1, _PAGE)
         # First and last byte of the file that the buffer holds.
         self.held = (0, 0)
-        # Never accessed: the mapping only serves to ask which pages are in memory. An empty file cannot be mapped.
-        size = os.fstat(self.cached.fileno()).st_size
-        self.pages = mmap.mmap(self.cached.fileno(), 0, access=mmap.ACCESS_READ) if size else None
+        self.pages: mmap.mmap | None
+        # Never accessed: the mapping only serves to ask which pages are in memory. Empty files cannot be mapped,
+        # nor those of some network shares.
+        try:
+            self.pages = mmap.mmap(self.cached.fileno(), 0, access=mmap.ACCESS_READ)
+        except (OSError, ValueError):
+            self.pages = None
         self.in_memory = True
 
     def check(self, place: int, length: int) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.thermography.flir_mutations import frame
+from thermography.io import window_reader
 from thermography.io.flir import index_frames
 from thermography.io.flir_writer import write_sequence
 from thermography.io.window_reader import WindowReader, in_memory
@@ -108,6 +109,22 @@ def test_an_error_ends_the_reading_ahead(tmp_path):
     forget(references[0].path)
     with pytest.raises(OSError, match="ends early"), WindowReader(WINDOW) as reader:
         list(reader.read_in_chunks(references, 2))
+
+
+def test_a_file_system_that_cannot_map_files_is_read_through_its_cache(tmp_path, monkeypatch):
+    references, counts = film(tmp_path / "a.seq")
+    forget(references[0].path)
+    original = window_reader.mmap.mmap
+
+    def refuse(descriptor, *arguments, **options):
+        if descriptor >= 0:
+            raise OSError(19, "No such device")
+        return original(descriptor, *arguments, **options)
+
+    monkeypatch.setattr(window_reader.mmap, "mmap", refuse)
+    with WindowReader(WINDOW) as reader:
+        assert (reader.read(references, np.empty((12, 164, 320), np.uint16)) == counts[:, 37:201]).all()
+    assert in_memory(references[0].path)
 
 
 def test_whether_a_file_is_in_memory(tmp_path):
