@@ -127,6 +127,10 @@ def test_windows_that_cannot_be_evaluated_are_refused(rng: np.random.Generator) 
         ValueError, match="no target has two readings from one side in a window of one cycle; ISO 230-2"
     ):
         evaluate_iso230(test, cycles=[5])
+    once = test["deviation"].values.copy()
+    once[3, :, :2], once[4, :, 2:] = np.nan, np.nan
+    with pytest.raises(ValueError, match="no target has two readings from one side in a window of 2 cycles"):
+        evaluate_iso230(test_made(once), cycles=[4, 5])
     one_way = test_made(np.where(np.arange(2)[:, None] == 0, test["deviation"].values, np.nan))
     with pytest.raises(ValueError, match="no target has two readings from one side in a window of one cycle"):
         evaluate_iso230(one_way, cycles=[5])
@@ -135,6 +139,8 @@ def test_windows_that_cannot_be_evaluated_are_refused(rng: np.random.Generator) 
 def test_short_tests_and_empty_windows_have_the_windows_that_can_be_evaluated(rng: np.random.Generator) -> None:
     short = evaluate_windows(test_made(rng.normal(0, 1, (4, 2, 4))))
     assert short["window"].values.tolist() == ["cycles 1 to 4 (4 cycles, not the 5 of the standard's acceptance test)"]
+    # Two cycles beyond two windows make no window of their own.
+    assert evaluate_windows(test_made(rng.normal(0, 1, (12, 2, 4)))).sizes["window"] == 3
     x = rng.normal(0, 1, (15, 2, 4))
     x[5:10] = np.nan
     assert evaluate_windows(test_made(x))["window"].values[:2].tolist() == ["cycles 1 to 5", "cycles 11 to 15"]
@@ -177,17 +183,27 @@ def test_the_settled_window_is_that_of_the_second_half_whose_drift_varies_least(
     drift = xr.zeros_like(test["deviation"])
     # Cycles 31 to 35 stand still; so do cycles 1 to 5, which are in the first half; elsewhere the drift goes on.
     drift[:] = np.arange(40.0)[:, None, None]
-    drift[30:35], drift[0:5] = 30.0, 0.0
+    drift[30:35], drift[0:5] = 30.0 + 0.01 * np.resize([1.0, -1.0], 5)[:, None, None], 0.0
     windows = evaluate_windows(test, drift=drift)
     chosen = settled_window(windows)
     assert (int(windows["first_cycle"][chosen]), int(windows["last_cycle"][chosen])) == (31, 35)
-    assert float(windows["drift_variation"][chosen]) == 0.0
+    assert float(windows["drift_variation"][chosen]) == pytest.approx(0.01 * np.sqrt(1.2))
     assert float(windows["drift_variation"][1]) == pytest.approx(np.std(np.arange(5.0), ddof=1))
     assert settled_window(evaluate_windows(test)) == 7
     assert settled_window(evaluate_windows(test.isel(cycle=slice(0, 4)))) == 0
     # Readings in the first half only: the last window of them.
-    test["deviation"][15:] = np.nan
-    assert settled_window(evaluate_windows(test)) == 2
+    for last, chosen in ((15, 2), (10, 1)):
+        test["deviation"][last:] = np.nan
+        assert settled_window(evaluate_windows(test)) == chosen
+
+
+def test_two_estimates_of_the_drift_at_a_position_have_a_variation_and_one_has_none() -> None:
+    test = test_made(np.random.default_rng(8).normal(0.0, 0.5, (5, 2, 4)))
+    drift = xr.full_like(test["deviation"], np.nan)
+    drift[0] = 1.0
+    assert np.isnan(evaluate_iso230(test, drift=drift)["drift_variation"])
+    drift[3, 0, 2] = 3.0
+    assert float(evaluate_iso230(test, drift=drift)["drift_variation"]) == pytest.approx(np.sqrt(2.0))
 
 
 def test_the_drift_and_the_temperature_of_a_window_enter_its_budget() -> None:

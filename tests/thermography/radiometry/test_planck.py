@@ -214,6 +214,22 @@ def test_parameters_without_meaning_are_refused_by_name(change: dict[str, float]
         calibrate(np.full(3, 18000, np.uint16), broken)
 
 
+@pytest.mark.parametrize("name", ["reflected_temperature_K", "atmospheric_temperature_K", "window_temperature_K"])
+def test_temperatures_from_100_to_3000_kelvin_and_fractions_from_none_to_all_are_taken(name: str) -> None:
+    behind_glass = replace(PARAMETERS, window_transmission=0.9, stored_transmission=0.9)
+    for value in (100.0, 3000.0):
+        check_parameters(replace(behind_glass, **{name: value}))
+    for value in (99.9, 3000.1):
+        with pytest.raises(RadiometryError, match=f"{name} = "):
+            check_parameters(replace(behind_glass, **{name: value}))
+    for fraction in ("relative_humidity", "stored_transmission"):
+        check_parameters(replace(behind_glass, **{fraction: 0.0}))
+        check_parameters(replace(behind_glass, **{fraction: 1.0}))
+        for value in (-0.01, 1.01):
+            with pytest.raises(RadiometryError, match=f"{fraction} = "):
+                check_parameters(replace(behind_glass, **{fraction: value}))
+
+
 def test_all_faults_come_in_one_message() -> None:
     with pytest.raises(RadiometryError, match=r"emissivity = 2.*relative_humidity = 3"):
         check_parameters(replace(PARAMETERS, emissivity=2.0, relative_humidity=3.0))
