@@ -53,14 +53,15 @@ benchmarks: $(VENV)/.test
 	$(BIN)/pytest tests/benchmarks -m "slow or not slow" --benchmark-enable -s
 
 # Share of small changes to a module (signs, limits, comparisons) that its tests notice, on a copy of what is staged or committed; fails
-# below 90 %. A sample takes a minute or two: make mutants MODULE=fusion/attribution/two_sessions.py SAMPLE=60; SAMPLE=0 takes every change.
+# below 90 %. A sample takes some minutes: make mutants MODULE=fusion/attribution/two_sessions.py SAMPLE=60 SEED=2; SAMPLE=0 takes every change.
 MODULE ?= fusion/loop/verdict.py
 SAMPLE ?= 60
+SEED ?= 1
 mutants: $(VENV)/.test
 	$(BIN)/pip install --quiet "cosmic-ray>=8.4"
 	rm -rf build/mutants && git checkout-index --all --prefix=build/mutants/
 	cd build/mutants && PYTHONPATH=$(CURDIR)/build/mutants OPENBLAS_NUM_THREADS=1 \
-	  $(abspath $(BIN))/python tests/mutants.py $(MODULE) --sample $(SAMPLE)
+	  $(abspath $(BIN))/python tests/mutants.py $(MODULE) --sample $(SAMPLE) --seed $(SEED)
 
 # What the program needs at run time: known vulnerabilities (needs a network), licences, and a bill of materials (CycloneDX), in build/audit.
 audit:

@@ -68,6 +68,21 @@ def test_readings_outside_the_frames_get_no_field_and_are_marked():
     assert int(fused["inside_frames"].sum()) == 96
 
 
+def test_readings_at_the_first_and_at_the_last_frame_are_inside():
+    readings = deviations()
+    time = readings["time"].values.copy()
+    field = fields(lambda x, y, s: s + 0 * x + 0 * y)
+    time[0, 1, 0], time[3, 1, 0] = field["time"].values[[0, -1]]
+    fused = align(readings.assign(time=readings["time"].copy(data=time)), field, AXIS)
+    assert bool(fused["inside_frames"][0, 1, 0]) and bool(fused["inside_frames"][3, 1, 0])
+
+
+def test_the_only_cycle_ends_after_its_last_reading():
+    one = deviations(cycles=1)
+    ((first, end),) = cycle_bounds(one)
+    assert (first, end) == (one["time"].values.min(), one["time"].values.max() + np.timedelta64(1, "ns"))
+
+
 def test_environment_is_interpolated_and_never_extrapolated():
     time = START + np.array([300, 600], "timedelta64[s]")
     log = xr.Dataset({"air_temperature": ("time", [20.0, 23.0], {"units": "degC"})}, coords={"time": time})
@@ -160,6 +175,7 @@ def test_the_mean_over_the_surroundings_of_a_target_is_centred_on_it():
         ((301.0, 90.0), True),
         ((299.0, 90.0), False),
         ((500.0, 1.0), True),
+        ((500.0, -6.0), True),
         ((500.0, -10.0), False),
         ((500.0, 179.0), True),
         ((500.0, 190.0), False),
@@ -184,7 +200,7 @@ def test_frames_and_readings_must_overlap_in_time():
     for frames in (seconds(0.0, 50.0, 150.0), seconds(0.0, 100.0), seconds(200.0, 300.0), seconds(0.0, 300.0)):
         module._check_overlap(readings, frames)
     for frames in (seconds(0.0, 50.0, 99.0), seconds(201.0, 300.0), seconds(150.0)):
-        with pytest.raises(AlignmentError, match="never meet"):
+        with pytest.raises(AlignmentError, match=rf"frames \({frames[0].astype('datetime64[s]')}Z \.\. .* never meet"):
             module._check_overlap(readings, frames)
     module._check_overlap(readings[:1], seconds(0.0, 300.0))
     with pytest.raises(AlignmentError, match="no reading has a time"):

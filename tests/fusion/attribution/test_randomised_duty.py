@@ -1,5 +1,7 @@
 """Randomised duty: the stated law, and a test that keeps its level in a warm-up."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -121,3 +123,37 @@ def test_every_source_is_ranked_among_the_largest_statistics_of_all_sources(rng,
     monkeypatch.setattr(module, "_statistics", lambda series, banks, responses: next(answers))
     found = randomisation_test(driven(duty, 1, rng, um=6.0), duty, law, draws=19)
     assert found["p_value"].values.tolist() == [1 / 20, *[1.0] * (sources - 1)]
+
+
+def test_the_logged_state_is_held_on_an_even_grid_to_the_end_of_the_log():
+    time = np.datetime64("2026-03-09T06:30", "ns") + np.array([0, 7, 13, 15]) * np.timedelta64(int(module.GRID_S), "s")
+    duty = xr.DataArray(
+        [[0.0], [1.0], [0.0], [0.0]], dims=("time", "source"), coords={"time": time, "source": ["pump"]}
+    )
+    seconds, grid, courses = module._hold(duty)
+    np.testing.assert_allclose(seconds, module.GRID_S * np.arange(16))
+    assert grid[0] == time[0] and grid[-1] == time[-1]
+    assert courses[:, 0].tolist() == [0.0] * 7 + [1.0] * 6 + [0.0] * 3
+
+
+def test_effects_of_common_and_stretch_add_up_at_the_far_end_and_their_uncertainties_in_square(monkeypatch):
+    answers = iter(
+        SimpleNamespace(coefficient=np.array([value]), coefficient_u=np.array([u]))
+        for value, u in ((2.0, 0.3), (-0.5, 0.4))
+    )
+    monkeypatch.setattr(module, "estimate_effects", lambda bank, columns: next(answers))
+    size, u = module._effects([SimpleNamespace(sampling=np.eye(3))] * 2, [None, None], np.ones((3, 1)))
+    assert (size[0], u[0]) == (1.5, pytest.approx(0.5))
+
+
+def test_a_dwell_is_counted_from_change_to_change_within_two_steps_of_the_log():
+    """Logged every minute: a dwell of 480 s may have been 600 s, one of 420 s may not; so may one before a longer one."""
+    law = DutyLaw(1800.0, 600.0)
+    seconds = 60.0 * np.arange(120)
+    module._check_law("speed", seconds, ((seconds >= 1800.0) & (seconds < 2280.0)).astype(float), law)
+    with pytest.raises(
+        RandomisationError, match="speed was switched again after 420 s, before the least dwell of 600 s"
+    ):
+        module._check_law("speed", seconds, ((seconds >= 1800.0) & (seconds < 2220.0)).astype(float), law)
+    # A change in the last step of the log is one.
+    module._check_law("speed", seconds, (seconds == seconds[-1]).astype(float), law)

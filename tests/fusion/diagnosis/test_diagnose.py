@@ -232,6 +232,16 @@ def test_scatter_by_direction_must_gain_its_bar_over_scatter_alike(kind, bar):
         assert probability["stick_slip"] / probability["structural"] == pytest.approx(np.exp(beyond))
 
 
+@pytest.mark.parametrize(
+    ("name", "cause", "candidates"), [("temperature", "local_temperature", 4), ("step", "step", 91)]
+)
+def test_a_regressor_pays_for_its_coefficient_and_for_the_search_of_its_candidates(name, cause, candidates):
+    """100 cycles: half their logarithm for the coefficient, the logarithm of 4 lags or of 91 instants for the search."""
+    case = fitted(**{name: {"log_likelihood": 0.5 * np.log(100) + np.log(candidates) + 1.0}})
+    probability = _probabilities(case)
+    assert probability[cause] / probability["structural"] == pytest.approx(np.e)
+
+
 def test_a_walk_in_one_direction_pays_for_its_parameter_and_its_bar():
     """As likely as white noise by 2 nats and half the logarithm of 100 cycles more."""
     case = fitted()
@@ -246,6 +256,12 @@ def test_few_readings_have_their_degrees_of_freedom():
     for negative_um, equal in ((0.46, True), (0.44, False)):
         residual = SimpleNamespace(values=np.stack([row, row]), scatter_um=(1.0, negative_um))
         assert _directions_sentence(residual).startswith("standard deviations equal") is equal
+
+
+def test_two_readings_have_a_standard_deviation_and_one_has_none():
+    for readings, words in ((2, "standard deviations equal"), (1, "directions not compared")):
+        residual = SimpleNamespace(values=np.resize([1.0, -1.0], (2, readings)), scatter_um=(1.0, 1.0))
+        assert _directions_sentence(residual).startswith(words)
 
 
 def test_a_random_walk_needs_no_threshold_to_leave_the_cause_open():

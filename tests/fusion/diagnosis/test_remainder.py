@@ -179,3 +179,7 @@ def test_a_column_explains_the_share_of_what_it_fits_beside_the_model():
     )
     assert remainder.share_of(np.array([[1.0], [0.0], [0.0]])) == pytest.approx(9 / 25)
     assert not remainder.is_tested
+
+
+def test_targets_are_told_as_ranges():
+    assert module._runs([1, 2, 5, 6, 7, 9]) == "1-2, 5-7, 9"

@@ -213,6 +213,16 @@ def test_a_process_noise_scale_multiplies_the_variance_of_its_own_steps(rng, ord
     np.testing.assert_allclose(drift[:, 0], walk @ inverse @ (y - design @ beta), atol=1e-8)
 
 
+def test_the_rate_of_a_drift_is_its_standard_deviation_after_an_hour():
+    """A walk of variance r t, and an integrated one of variance r t^3 / 3, in units of sigma^2."""
+    seconds, ones = np.arange(20.0) * 60.0, np.ones((20, 1))
+    y = np.resize([0.5, -0.5, 0.2], 20)
+    for order, ratio, variance in ((1, 0.01, 36.0), (2, 3e-9, 3e-9 * 3600.0**3 / 3.0)):
+        system = drift_system(seconds, ones, order=order, ratios=[ratio])
+        fit = fit_fixed_effects(system, y, start_columns(seconds, ones, order))
+        assert fit.drift_rate == pytest.approx(fit.sigma * np.sqrt(variance))
+
+
 def test_a_drift_that_settles_has_larger_process_noise_at_the_start_only(rng):
     seconds = np.arange(600) * 40.0
     loadings = np.ones((600, 1))

@@ -89,3 +89,15 @@ def test_many_columns_are_smoothed_as_few_are(rng: np.random.Generator, monkeypa
     monkeypatch.setattr("interferometry.drift.state_space.MANY_COLUMNS", 2)
     for told, expected in zip(system.smooth(columns), at_once, strict=True):
         np.testing.assert_array_equal(told, expected)
+
+
+def test_readings_at_one_instant_share_their_drift_and_other_shapes_are_refused():
+    """Two readings at once of a drift that starts at zero: the second innovation lacks what the first told."""
+    system = drift_system(np.array([0.0, 100.0, 100.0]), np.ones((3, 1)), order=1, ratios=[0.01])
+    innovations, variances = system.innovations(np.array([[0.0], [2.0], [2.0]]))
+    np.testing.assert_allclose(innovations[:, 0], [0.0, 2.0, 1.0])
+    np.testing.assert_allclose(variances, [1.0, 2.0, 1.5])
+    with pytest.raises(
+        DriftModelError, match=r"loadings has shape \(3, 1, 1\); expected \(3, number of drift components\)"
+    ):
+        drift_system(np.arange(3.0), np.ones((3, 1, 1)), order=1, ratios=[0.01])
