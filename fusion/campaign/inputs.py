@@ -86,6 +86,7 @@ def _read_instruments(campaign: Campaign) -> LaserInputs | CameraInputs | Source
     if campaign.interferometry is not None:
         common |= read_laser(campaign)
     _refuse_mixed_zones(campaign, common)
+    _refuse_two_of_one_name(campaign, common)
     if campaign.thermography is None:
         laser = LaserInputs(**common)
         laser.notices[:0] = _laser_notices(laser)
@@ -220,6 +221,19 @@ def _refuse_mixed_zones(campaign: Campaign, read: Mapping[str, Any]) -> None:
     if campaign.sensors is not None and read["sensors"] is not None:
         logs[campaign.sensors.file] = read["sensors"].temperature.to_dataset(name="temperature")
     refuse_mixed_zones(logs, source=str(campaign.path))
+
+
+def _refuse_two_of_one_name(campaign: Campaign, read: Mapping[str, Any]) -> None:
+    """Refuse a driver with the name of a quantity of the environment log, in whose place it would stand."""
+    drivers, environment = read.get("drivers"), read.get("environment")
+    if drivers is None or environment is None:
+        return
+    both = sorted({str(name) for name in drivers.data_vars} & {str(name) for name in environment.data_vars})
+    if both:
+        assert campaign.drivers is not None and campaign.interferometry is not None
+        raise SourceError(
+            f"{campaign.drivers.file}: the driver {both[0]!r} is logged in {campaign.interferometry.environment} too; rename its column"
+        )
 
 
 def _read_camera(campaign: Campaign, cycles: Cycles | None) -> dict[str, Any]:

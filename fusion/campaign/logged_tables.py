@@ -29,6 +29,31 @@ from interferometry.io.workbook import refuse_bomb
 
 #: Warning of pandas about a line with more fields than the header.
 _SKIPPED = re.compile(r"Skipping line (\d+): expected (\d+) fields, saw (\d+)")
+#: Names that a variable of NetCDF can have (netCDF-C, Users Guide, "names"), and that are short enough to be read.
+_NAME = re.compile(r"\w[^/\x00-\x1f\x7f]{0,99}")
+#: What the readings and the model call their own variables: a driver of that name would stand in their place.
+_TAKEN = frozenset(
+    [
+        "cycle",
+        "direction",
+        "target",
+        "position",
+        "time",
+        "deviation",
+        "quality_flag",
+        "inside_frames",
+        "effect",
+        "period",
+        "mean_rise",
+        "axis_integral",
+        "local_rise",
+        "patch_mean_rise",
+        "patch_axis_integral",
+        "driver_time",
+        "environment_time",
+        "frame_time",
+    ]
+)
 _HEADING = re.compile(r"\s*(.+?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
 
 
@@ -107,12 +132,22 @@ def read_drivers(path: Path) -> xr.Dataset:
     Raises
     ------
     TableError, LaserFormatError
-        If the file is no table, a heading has no unit, or most lines cannot be used.
+        If the file is no table, a heading has no unit or a name that cannot be kept, or most lines cannot be used.
     """
     table = read_table(path, ("time",))
     headings = {column: split_heading(path, column) for column in table.columns if column != "time"}
     if not headings:
         raise TableError(f'{path}: there is no column beside time; add one named "name [unit]", or leave [drivers] out')
+    for column, (name, _) in headings.items():
+        if not _NAME.fullmatch(name):
+            raise TableError(
+                f'{path}: the column "{column}" has a name that no product can hold; begin it with a letter, leave / out, and write up to '
+                "100 characters"
+            )
+        if name in _TAKEN or name.startswith("loop_") or name.endswith("_series"):
+            raise TableError(
+                f'{path}: the column "{column}" has the name of a result; rename it, for example "logged {name}"'
+            )
     variables = {name: {"units": unit, "long_name": name} for name, unit in headings.values()}
     if len(variables) < len(headings):
         names = [name for name, _ in headings.values()]

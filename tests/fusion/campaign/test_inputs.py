@@ -158,3 +158,12 @@ def test_cycles_without_a_time_are_left_out_by_number(copied: Path) -> None:
         SourceError, match=r"part\.toml: laser\.rtl: 1 cycle at .* cycles of \d+ in laser\.rtl left out"
     ):
         read_source(load_campaign(alone))
+
+
+def test_a_driver_of_the_name_of_a_logged_condition_is_refused(copied: Path) -> None:
+    path = copied / "drivers.csv"
+    path.write_text(path.read_text().replace("duty [1]", "air_temperature [degC]"))
+    with pytest.raises(
+        SourceError, match=r"drivers\.csv: the driver 'air_temperature' is logged in environment\.csv too"
+    ):
+        read_source(load_campaign(copied / "campaign.toml"))

@@ -200,3 +200,20 @@ def test_one_mark_for_no_reading_costs_one_reading(tmp_path: Path) -> None:
         np.testing.assert_array_equal(table["displacement"].values.ravel(), [1.5, np.nan, -2.5, 3.0])
     (tmp_path / "log.csv").write_text("\n".join(rows).replace("\u2212", "-") + "\n", encoding="cp1252")
     assert read_record(load_campaign(path))["temperature"].values[2, 0] == 22.5
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("oil in/out", "a name that no product can hold; begin it with a letter, leave / out"),
+        ("=HYPERLINK", "a name that no product can hold"),
+        ("x" * 101, "a name that no product can hold"),
+        ("deviation", 'the name of a result; rename it, for example "logged deviation"'),
+        ("duty_series", "the name of a result"),
+    ],
+)
+def test_names_that_the_products_cannot_keep_are_refused(tmp_path: Path, name: str, message: str) -> None:
+    path = tmp_path / "drivers.csv"
+    path.write_text(f"time,{name} [1]\n2026-03-09T06:00:00Z,1\n2026-03-09T06:01:00Z,2\n")
+    with pytest.raises(TableError, match=message):
+        read_drivers(path)
