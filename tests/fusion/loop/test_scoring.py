@@ -104,6 +104,13 @@ def test_a_closer_look_raises_gain_and_excess_by_the_same_and_leaves_the_p_value
     score = refine(coarse, lambda _: neighbours, lambda looked: gains_of([3.0, 5.5], np.zeros((2, 0))))
     assert (score.candidate, score.gain, score.excess) == (neighbours[1], 5.5, 4.0)
     assert (score.p_value, score.family_wise_p, score.drift_place) == (0.01, 0.02, 11)
+    # A neighbour that the model holds does not hide the next best, and one that is worse is not taken.
+    held = refine(
+        coarse, lambda _: neighbours, lambda looked: gains_of([9.0, 5.5], np.zeros((2, 0)), separable=[False, True])
+    )
+    assert (held.candidate, held.gain) == (neighbours[1], 5.5)
+    worse = refine(coarse, lambda _: neighbours, lambda looked: gains_of([3.0, 3.5], np.zeros((2, 0))))
+    assert (worse.candidate, worse.gain) == (coarse.candidate, 4.0)
 
 
 def test_a_closer_look_moves_while_the_gain_grows_but_three_times_at_most():
