@@ -172,8 +172,9 @@ def read_manifest(folder: Path) -> dict[str, str]:
         If ``manifest.json`` is not the one of a results folder.
     """
     content = _read_object(folder / MANIFEST)
-    if content is None:
+    if content is None and not (folder / MANIFEST).exists():
         return {}
+    content = content or {}
     written = content.get("written")
     if content.get("software") != "thermofuse" or not isinstance(written, dict):
         raise OutputError(

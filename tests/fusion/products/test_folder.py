@@ -136,3 +136,14 @@ def test_results_within_results_are_refused(tmp_path: Path) -> None:
     ):
         pass
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("text", ["[1, 2]", "no JSON", '{"name": "a page"}'])
+def test_the_manifest_of_somebody_else_is_not_replaced(tmp_path: Path, text: str) -> None:
+    (tmp_path / MANIFEST).write_text(text)
+    with (
+        pytest.raises(OutputError, match=r"manifest\.json is not the manifest of a results folder"),
+        open_folder(tmp_path, resume=True) as folder,
+    ):
+        claim(folder, "report.html")
+    assert (tmp_path / MANIFEST).read_text() == text
