@@ -13,6 +13,8 @@ from fusion.effects.jumps import cycle_starts, event_instants, instants_near
 
 #: Periods that are tried at most: all down to 3 min in a record of 7.5 h, down to 11 min in one of 28 h.
 _MOST_PERIODS = 300
+#: So many readings have waves that are held: computed once they take 60 MB, and the search a twentieth less time than if computed for every block.
+_HELD_READINGS = 12_000
 
 
 def _step_event(readings: Readings, _: Mapping[str, float], near: Candidate | None) -> Iterator[Candidate]:
@@ -75,7 +77,11 @@ def _periodic_disturbance(readings: Readings, _: Mapping[str, float], near: Cand
     place, share = readings.target_index, readings.positions_mm / readings.span_mm
     weights = {"flat": np.ones((share.size, 2)), "linear": np.column_stack([share, share])}
     for period in periods:
-        waves = tuple(Wave(shape, readings.seconds, 60.0 * period) for shape in (np.cos, np.sin))
+        waves: tuple[Array | Wave, ...] = tuple(
+            Wave(shape, readings.seconds, 60.0 * period) for shape in (np.cos, np.sin)
+        )
+        if readings.seconds.size <= _HELD_READINGS:
+            waves = tuple(map(np.asarray, waves))
         for shape, weight in weights.items():
             yield Candidate(
                 Separable(waves, place, weight), {"period_min": float(period), "shape": shape}, ("um", "um")

@@ -46,8 +46,9 @@ def test_a_wave_has_its_period_in_minutes_flat_or_along_the_axis():
     assert linear.parameters["period_min"] == period
 
 
-def test_waves_are_not_held_at_all_readings():
+def test_waves_of_a_long_test_are_not_held_at_all_readings(monkeypatch):
     """Three hundred periods of them would take 0.3 GB at 10,000 cycles of six readings."""
+    monkeypatch.setattr("fusion.effects.events._HELD_READINGS", 100)
     readings = campaign(cycles=400)
     candidates = list(PERIODIC_DISTURBANCE.candidates(readings, {}, None))
     waves = {id(course): course for candidate in candidates for course in candidate.columns.courses}
