@@ -13,7 +13,7 @@ from fusion.effects.jumps import cycle_starts, event_instants, instants_near
 
 #: Periods that are tried at most: all down to 3 min in a record of 7.5 h, down to 11 min in one of 28 h.
 _MOST_PERIODS = 300
-#: So many readings have waves that are held: computed once they take 60 MB, and the search a twentieth less time than if computed for every block.
+#: So many readings have waves that are held: they take 60 MB, and the search 1/20 less time than if computed for every block.
 _HELD_READINGS = 12_000
 
 
