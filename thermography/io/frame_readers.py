@@ -35,6 +35,9 @@ START_BYTES = 512
 class FrameReader(Protocol):
     """What a reader of thermal files does.
 
+    One object reads all files of its kind, and up to eight threads call its methods at once, each for another file: what a call needs stays
+    in the call or is guarded by a lock.
+
     Attributes
     ----------
     name : str
@@ -131,6 +134,8 @@ def index_recordings(
     ------
     StackError
         Temperatures without a unit, or frames without any time, of a whole file: `options` must say more.
+    FrameReaderError
+        A plug-in cannot be used.
 
     See Also
     --------
@@ -149,6 +154,7 @@ def index_recordings(
     frames: list[FrameReference | FrameTable] = []
     rejected: list[RejectedFrame] = []
     files = list(map(Path, paths))
+    readers()  # Loaded here once: threads that ask first would each load the plug-ins.
     for results in call_by_threads(partial(_index_file, options=options), files, opening_threads(files)):
         for result in results:
             (rejected if isinstance(result, RejectedFrame) else frames).append(result)  # type: ignore[arg-type]

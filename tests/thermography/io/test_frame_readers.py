@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.metadata
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -80,6 +82,31 @@ def test_a_plug_in_is_found_by_its_entry_point(tmp_path: Path, plug_in: pytest.M
     assert frames[3].time == np.datetime64("2026-03-09T06:30:30")
     # The scale of counts resolves 5 mK.
     assert frames[3].read_temperature() == pytest.approx(np.ones((4, 5)))  # type: ignore[attr-defined]
+
+
+def test_plug_ins_are_loaded_once_before_the_threads(tmp_path: Path, plug_in: pytest.MonkeyPatch) -> None:
+    loaded = []
+
+    def load(self: importlib.metadata.EntryPoint) -> type:
+        loaded.append(threading.current_thread())
+        time.sleep(0.05)  # long enough that other threads would begin to load meanwhile
+        return ReaderOfOnes
+
+    named(plug_in, "ReaderOfOnes")
+    plug_in.setattr(importlib.metadata.EntryPoint, "load", load)
+    plug_in.setattr(frame_readers, "opening_threads", lambda files: 8)
+    paths = [tmp_path / f"{number}.one" for number in range(8)]
+    for path in paths:
+        path.write_bytes(b"ONES")
+    index_recordings(paths, OPTIONS)
+    assert loaded == [threading.current_thread()]
+
+
+def test_a_plug_in_that_cannot_be_used_is_no_fault_of_the_files(tmp_path: Path, plug_in: pytest.MonkeyPatch) -> None:
+    named(plug_in, "Unusable")
+    np.save(tmp_path / "a.npy", IMAGE)
+    with pytest.raises(FrameReaderError, match="the plug-in mine = "):
+        index_recordings([tmp_path / "a.npy"], OPTIONS)
 
 
 def test_a_plug_in_that_keeps_no_protocol_is_named(plug_in: pytest.MonkeyPatch) -> None:

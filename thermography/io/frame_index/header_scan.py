@@ -11,6 +11,7 @@ What was found of a long run is kept for the next time (`thermography.io.frame_i
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import BinaryIO, NamedTuple
@@ -59,6 +60,8 @@ _PNG_START = np.frombuffer(bytes(RAW_HEADER_SIZE) + PNG_SIGNATURE, np.uint8)
 _JPEGLS_START = np.frombuffer(bytes(RAW_HEADER_SIZE) + b"\xff\xd8\xff\xf7", np.uint8)
 #: Name under which the parameters that occur are kept.
 _SETS = "parameter_sets"
+#: Numbers of sets of parameters are of this type.
+_NUMBERS = np.empty(0, np.uint32)
 _NO_TIME = np.iinfo(np.int64).min
 
 
@@ -108,6 +111,47 @@ class _Columns(NamedTuple):
         )
 
 
+@dataclass(frozen=True)
+class _Run:
+    """What a scan found, and what is kept of it.
+
+    Attributes
+    ----------
+    columns : _Columns
+        The parameters as indices, (n,), of `parameter_bytes`.
+    parameter_bytes : list of bytes
+        Those that occur, as stored.
+    """
+
+    columns: _Columns
+    parameter_bytes: list[bytes]
+
+    def arrays(self) -> dict[str, Array]:
+        """Arrays to be kept, by name."""
+        return {**self.columns._asdict(), _SETS: np.array([list(data) for data in self.parameter_bytes], np.uint8)}
+
+    @classmethod
+    def from_arrays(cls, stored: Mapping[str, Array], sensors: int, room: int) -> _Run:
+        """The run of arrays that were kept, of frames with so many sensors that take at most `room` bytes.
+
+        Raises a ValueError or KeyError where they are not those of such a run.
+        """
+        columns, sets = _Columns(*(stored[name] for name in _Columns._fields)), stored[_SETS]
+        empty = _Columns.empty(0, sensors)
+        pairs = [*zip(columns, empty._replace(parameters=_NUMBERS), strict=True), (sets, empty.parameters)]
+        fits = (
+            all((array.dtype, array.shape[1:]) == (like.dtype, like.shape[1:]) for array, like in pairs)
+            and len({len(column) for column in columns}) == 1
+            and len(columns.length) > 0
+            and min(columns.length.min(), columns.raw_length.min()) > 0
+            and columns.length.sum() <= room
+            and columns.parameters.max() < len(sets)
+        )
+        if not fits:
+            raise ValueError("its arrays are not those of one run of frames")
+        return cls(columns, [row.tobytes() for row in sets])
+
+
 class FlirTable(FrameTable):
     """Frames of a SEQ or CSQ file that share the layout of a first frame, which is not among them.
 
@@ -119,17 +163,14 @@ class FlirTable(FrameTable):
         Byte order of the camera information.
     names : list of str
         Of the sensors inside the camera.
-    columns : _Columns
-        The parameters as indices, (n,), of `parameter_bytes`.
-    parameter_bytes : list of bytes
-        Those that occur, as stored.
+    run : _Run
+        The frames.
     """
 
-    def __init__(
-        self, first: FlirFrameReference, order: str, names: list[str], columns: _Columns, parameter_bytes: list[bytes]
-    ) -> None:
+    def __init__(self, first: FlirFrameReference, order: str, names: list[str], run: _Run) -> None:
+        columns = run.columns
         self.first, self.order, self.names, self.columns = first, order, names, columns
-        self._parameters = [parse_parameters(order, data) for data in parameter_bytes]
+        self._parameters = [parse_parameters(order, data) for data in run.parameter_bytes]
         self.path, self.first_index, self.shape = first.path, first.index + 1, first.shape
         self.parameter_set = columns.parameters
         self.parameter_sets: list[CameraParameters] = [parameters for parameters, _ in self._parameters]
@@ -242,12 +283,20 @@ def scan_table(file: BinaryIO, first: FlirFrameReference, size: int) -> FlirTabl
     layout = _layout(file, first)
     if layout is None:
         return None
-    kept = _recall(file, first, layout, size)
-    if kept is not None:
-        return kept
+    take = partial(_Run.from_arrays, sensors=layout.expected.sensors, room=size - start)
+    run = recall(file, first.path, start, take)
+    if run is None:
+        run = _scan_run(file, layout, first.segments[0][1], start, size)
+        if run is not None and len(run.columns.length) >= FEWEST_KEPT:
+            keep(file, first.path, start, run.arrays())
+    return FlirTable(first, layout.order, layout.names, run) if run is not None else None
+
+
+def _scan_run(file: BinaryIO, layout: _Layout, length: int, start: int, size: int) -> _Run | None:
+    """Read the headers from `start` on, of frames of about `length` bytes; None where no frame fits."""
     largest = _LARGEST_BATCH if layout.expected.encoding == 0 else 1
     batch = min(_FIRST_BATCH, largest)
-    reader = _HeaderReader(file, layout, first.segments[0][1], largest)
+    reader = _HeaderReader(file, layout, length, largest)
     gathered = _Gathered(layout.expected.sensors)
     known: dict[bytes, int] = {}
     while start < size:
@@ -259,27 +308,7 @@ def scan_table(file: BinaryIO, first: FlirFrameReference, size: int) -> FlirTabl
         batch = min(4 * batch, largest)
     if not gathered.frames:
         return None
-    columns = gathered.columns()
-    if gathered.frames >= FEWEST_KEPT:
-        sets = np.array([list(data) for data in known], np.uint8)
-        keep(file, first.path, sum(first.segments[0]), {**columns._asdict(), _SETS: sets})
-    return FlirTable(first, layout.order, layout.names, columns, list(known))
-
-
-def _recall(file: BinaryIO, first: FlirFrameReference, layout: _Layout, size: int) -> FlirTable | None:
-    """Return the frames that a scan of this file found before, None where nothing fit is kept."""
-    start = sum(first.segments[0])
-    empty = _Columns.empty(0, layout.expected.sensors)
-    numbered = empty._replace(parameters=np.empty(0, np.uint32))
-    kept = recall(file, first.path, start, {**numbered._asdict(), _SETS: empty.parameters})
-    if kept is None:
-        return None
-    sets = kept.pop(_SETS)
-    columns = _Columns(**kept)
-    alike = len({len(column) for column in columns}) == 1
-    if not alike or start + columns.length.sum() > size or columns.parameters.max() >= len(sets):
-        return None
-    return FlirTable(first, layout.order, layout.names, columns, [row.tobytes() for row in sets])
+    return _Run(gathered.columns(), list(known))
 
 
 def _layout(file: BinaryIO, first: FlirFrameReference) -> _Layout | None:
@@ -389,7 +418,7 @@ class _Gathered:
             place = self.frames % self._ROWS
             if place == 0:
                 fresh = _Columns.empty(self._ROWS, self.sensors)
-                self.full.append(fresh._replace(parameters=np.empty(self._ROWS, np.uint32)))
+                self.full.append(fresh._replace(parameters=np.empty(self._ROWS, _NUMBERS.dtype)))
             number = min(len(columns.length) - done, self._ROWS - place)
             for target, source in zip(self.full[-1], columns, strict=True):
                 target[place : place + number] = source[done : done + number]

@@ -9,13 +9,11 @@ from __future__ import annotations
 import json
 import logging
 import os
-import zipfile
-import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 import platformdirs
@@ -37,8 +35,10 @@ _ABOUT = "about"
 
 _log = logging.getLogger(__name__)
 
+Run = TypeVar("Run")
 
-def recall(file: BinaryIO, path: Path, start: int, empty: Mapping[str, Array]) -> dict[str, Array] | None:
+
+def recall(file: BinaryIO, path: Path, start: int, take: Callable[[Mapping[str, Array]], Run]) -> Run | None:
     """Return what was kept of a run of frames; None where nothing was, or not of the file as it is now.
 
     Parameters
@@ -49,39 +49,46 @@ def recall(file: BinaryIO, path: Path, start: int, empty: Mapping[str, Array]) -
         Its path.
     start : int
         Where the run begins, bytes.
-    empty : mapping of str to ndarray
-        Arrays of the types and of the shapes, but for the first dimension, that must be found.
+    take : callable
+        Makes the run of the arrays that were kept; raises a ValueError or LookupError where they are not those of a run.
 
     Returns
     -------
-    dict of str to ndarray, or None
+    Run or None
+        What `take` has made.
+
+    Raises
+    ------
+    OSError
+        If the recording cannot be read; no fault of the cache is raised.
     """
     kept = _place(path, start)
     try:
-        with kept.open("rb") as opened, np.load(opened, allow_pickle=False) as stored:
-            about = json.loads(str(stored[_ABOUT]))
-            if about["version"] != _VERSION:
-                return None
-            if about != _about(file):
-                _log.warning("%s has changed since its headers were read; they are read again", path)
-                _remove(kept)
-                return None
-            columns = {name: stored[name] for name in empty}
-    except FileNotFoundError:
+        opened = kept.open("rb")
+    except OSError:
+        # Nothing was kept, or the cache cannot be used: where that costs time, `keep` says it.
         return None
-    except (OSError, ValueError, LookupError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        _log.warning("%s, which keeps the headers of %s, is damaged (%s); they are read again", kept, path, error)
-        _remove(kept)
-        return None
-    alike = all(
-        (columns[name].dtype, columns[name].shape[1:]) == (array.dtype, array.shape[1:])
-        for name, array in empty.items()
-    )
-    return columns if alike else None
+    with opened:
+        about = _about(file)
+        try:
+            with np.load(opened, allow_pickle=False) as stored:
+                about_then = json.loads(str(stored[_ABOUT]))
+                if about_then == about:
+                    return take(stored)
+                same_version = about_then["version"] == _VERSION
+            fault = f"{path} has changed since its headers were read" if same_version else ""
+        # What is kept can be made again, so no fault of it may end a run. Damaged bytes raise nearly everything: NotImplementedError and
+        # RuntimeError from the directory of the zip file, SyntaxError and TokenError from the headers of its arrays.
+        except Exception as error:
+            fault = f"{kept}, which keeps the headers of {path}, is damaged ({error})"
+    if fault:
+        _log.warning("%s; they are read again", fault)
+    _remove(kept)
+    return None
 
 
 def keep(file: BinaryIO, path: Path, start: int, columns: Mapping[str, Array]) -> None:
-    """Keep what was found of a run of frames; nothing where the cache cannot be written to.
+    """Keep what was found of a run of frames; where the cache cannot be written to, that is said.
 
     Parameters
     ----------
@@ -101,15 +108,21 @@ def keep(file: BinaryIO, path: Path, start: int, columns: Mapping[str, Array]) -
 
     try:
         write_atomically(place, write)
-        _remove_first_written(place.parent)
     except OSError as error:
-        _log.info("the headers of %s are not kept: %s", path, error)
+        # Another process that keeps the same has put its file in place first.
+        if isinstance(error, FileNotFoundError) and place.exists():
+            return
+        _log.warning("the headers of %s cannot be kept and will be read again the next time: %s", path, error)
+        return
+    _remove_first_written(place.parent)
 
 
 def _place(path: Path, start: int) -> Path:
     """Where a run of frames of a file is kept."""
     cache = Path(os.environ.get(CACHE_VARIABLE) or platformdirs.user_cache_dir("thermofuse"))
-    return cache / "frame_index" / f"{sha256(f'{start} {path.resolve()}'.encode()).hexdigest()[:32]}.npz"
+    # The bytes of the path, which need not be text.
+    key = f"{start} ".encode() + os.fsencode(path.resolve())
+    return cache / "frame_index" / f"{sha256(key).hexdigest()[:32]}.npz"
 
 
 def _about(file: BinaryIO) -> dict[str, Any]:
@@ -130,9 +143,14 @@ def _remove(kept: Path) -> None:
 
 def _remove_first_written(folder: Path) -> None:
     """Remove the files that were written first where all together are too large."""
-    kept = sorted(folder.glob("*.npz"), key=lambda each: each.stat().st_mtime_ns, reverse=True)
+    kept = []
+    for each in folder.glob("*.npz"):
+        # Another process may have removed it meanwhile.
+        with suppress(OSError):
+            status = each.stat()
+            kept.append((status.st_mtime_ns, status.st_size, each))
     total = 0
-    for each in kept:
-        total += each.stat().st_size
+    for _, size, each in sorted(kept, reverse=True):
+        total += size
         if total > _MOST_KEPT:
-            each.unlink(missing_ok=True)
+            _remove(each)

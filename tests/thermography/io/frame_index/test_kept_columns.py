@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
+import zipfile
 from dataclasses import replace
 from pathlib import Path
+from typing import BinaryIO, NoReturn
 
 import numpy as np
 import pytest
@@ -111,7 +114,7 @@ def test_another_file_of_the_same_size_is_read_anew(
     assert "has changed" in caplog.text
 
 
-@pytest.mark.parametrize("damage", ["cut", "bytes", "empty", "text", "folder"])
+@pytest.mark.parametrize("damage", ["cut", "bytes", "empty", "text"])
 def test_a_damaged_kept_file_is_made_again_and_said(
     tmp_path: Path, cache: Path, caplog: pytest.LogCaptureFixture, scans: list[int], damage: str
 ) -> None:
@@ -122,11 +125,7 @@ def test_a_damaged_kept_file_is_made_again_and_said(
     data = bytearray(kept.read_bytes())
     if damage == "bytes":
         data[len(data) // 2] ^= 255
-    kept.unlink()
-    if damage == "folder":
-        kept.mkdir()
-    else:
-        kept.write_bytes({"cut": data[: len(data) // 2], "bytes": data, "empty": b"", "text": b"what is this?"}[damage])
+    kept.write_bytes({"cut": data[: len(data) // 2], "bytes": data, "empty": b"", "text": b"what is this?"}[damage])
     scans.clear()
     assert list(index_frames(path)[0]) == list(scanned) and sum(scans) == FRAMES - 1
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
@@ -139,7 +138,12 @@ def test_every_damaged_byte_leaves_the_frames_as_they_are(tmp_path: Path, cache:
     scanned = list(index_frames(path)[0])
     (kept,) = cache.iterdir()
     data, rng = kept.read_bytes(), np.random.default_rng(3)
-    for place in rng.integers(0, len(data), 60):
+    with zipfile.ZipFile(kept) as archive:
+        directory = np.arange(archive.start_dir, len(data))
+        # The header of a member and that of its array stand before the values.
+        headers = [each.header_offset + np.arange(200) for each in archive.infolist()]
+    structure = rng.choice(np.concatenate([directory, *headers]), 150, replace=False)
+    for place in [*rng.integers(0, len(data), 40), *structure]:
         damaged = bytearray(data)
         damaged[place] ^= 1 << int(rng.integers(8))
         kept.write_bytes(damaged)
@@ -169,6 +173,108 @@ def test_a_cache_that_cannot_be_written_to_costs_nothing_but_time(
     record(path)
     cache.parent.write_text("a file where a folder should be")
     assert len(index_frames(path)[0]) == FRAMES
+    # Not that anything is damaged: nothing was kept yet.
+    (said,) = caplog.messages
+    assert said.startswith(f"the headers of {path} cannot be kept and will be read again the next time: ")
+    assert str(cache.parent) in said and cache.parent.is_file()
+
+
+def test_a_kept_file_that_cannot_be_opened_is_not_told_as_damaged(
+    tmp_path: Path, cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "a.seq"
+    record(path)
+    index_frames(path)
+    (kept,) = cache.iterdir()
+    kept.unlink()
+    kept.mkdir()
+    assert len(index_frames(path)[0]) == FRAMES and kept.is_dir()
+    (said,) = caplog.messages
+    assert "cannot be kept" in said and "damaged" not in said
+
+
+def test_a_recording_that_cannot_be_read_is_not_told_as_a_damaged_cache(
+    tmp_path: Path, cache: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.seq"
+    record(path)
+    index_frames(path)
+    kept = list(cache.iterdir())
+
+    def fail(file: BinaryIO) -> NoReturn:
+        raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+
+    monkeypatch.setattr(kept_columns, "_about", fail)
+    frames, rejected = index_frames(path)
+    assert len(frames) == 1 and "Input/output error" in rejected[0].reason and str(path) in rejected[0].reason
+    assert caplog.messages == [] and list(cache.iterdir()) == kept
+
+
+@pytest.mark.skipif(os.name != "posix", reason="paths that are not text occur on POSIX systems")
+def test_a_recording_whose_path_is_not_text_is_kept_as_any_other(tmp_path: Path, cache: Path, scans: list[int]) -> None:
+    path = tmp_path / os.fsdecode(b"gr\xfcn.seq")
+    try:
+        record(path)
+    except OSError as error:
+        pytest.skip(f"this file system stores no such name: {error}")
+    scanned = list(index_frames(path)[0])
+    scans.clear()
+    assert list(index_frames(path)[0]) == scanned and len(scanned) == FRAMES and scans == []
+
+
+@pytest.mark.parametrize("change", ["none", "length", "raw_length", "number", "room", "missing"])
+def test_arrays_that_no_scan_found_are_refused(tmp_path: Path, cache: Path, change: str) -> None:
+    path = tmp_path / "a.seq"
+    record(path)
+    index_frames(path)
+    (kept,) = cache.iterdir()
+    with np.load(kept) as stored:
+        arrays = {name: stored[name] for name in stored if name != "about"}
+    sensors, room = arrays["sensors"].shape[1] // 4 - 4, int(arrays["length"].sum())
+    whole = header_scan._Run.from_arrays(arrays, sensors, room).arrays()
+    assert all(np.array_equal(whole[name], array) for name, array in arrays.items()) and len(whole) == len(arrays)
+    match change:
+        case "none":
+            arrays = {name: array if name == header_scan._SETS else array[:0] for name, array in arrays.items()}
+        case "length" | "raw_length":
+            arrays[change][7] *= -1
+        case "number":
+            arrays["parameters"][7] = len(arrays[header_scan._SETS])
+        case "room":
+            room -= 1
+        case "missing":
+            del arrays["time"]
+    with pytest.raises((ValueError, KeyError)):
+        header_scan._Run.from_arrays(arrays, sensors, room)
+
+
+def test_a_kept_file_that_another_process_removes_meanwhile_is_no_fault(
+    tmp_path: Path, cache: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caplog.set_level(logging.INFO)
+    path = tmp_path / "a.seq"
+    record(path)
+    original = Path.glob
+    monkeypatch.setattr(Path, "glob", lambda self, pattern: [*original(self, pattern), self / "removed.npz"])
+    index_frames(path)
+    assert len(list(cache.iterdir())) == 1 and caplog.messages == []
+
+
+def test_what_another_process_has_kept_at_the_same_time_is_no_fault(
+    tmp_path: Path, cache: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caplog.set_level(logging.INFO)
+    path = tmp_path / "a.seq"
+    record(path)
+    original = Path.replace
+
+    def replace_twice(self: Path, target: Path) -> Path:
+        original(self, target)
+        return original(self, target)
+
+    monkeypatch.setattr(Path, "replace", replace_twice)
+    index_frames(path)
+    assert len(list(cache.iterdir())) == 1 and caplog.messages == []
 
 
 def test_what_was_kept_first_is_removed_where_all_is_too_large(tmp_path: Path, cache: Path, monkeypatch) -> None:
