@@ -6,6 +6,7 @@ Most of that work holds the interpreter's lock, so that threads would not shorte
 from __future__ import annotations
 
 import gc
+import logging
 import os
 import pickle
 import queue
@@ -26,10 +27,12 @@ from threadpoolctl import threadpool_limits
 if TYPE_CHECKING:
     from fusion.products.progress import Report
 
+_log = logging.getLogger(__name__)
+
 Answer = TypeVar("Answer")
 #: Work, and whether it reports.
 _Sent: TypeAlias = "tuple[Callable[..., Any], bool]"
-_PROGRESS, _RETURNED, _RAISED = "progress", "returned", "raised"
+_PROGRESS, _DONE, _FAILED = "progress", "done", "failed"
 #: What the second process loads while the first reads the campaign.
 _LIBRARIES = ("fusion.pipeline.run", "fusion.report.html")
 
@@ -55,6 +58,10 @@ class Beside(ABC):
             Waits for the work and returns, or raises, what it came to.
         """
 
+    @abstractmethod
+    def end(self) -> None:
+        """Leave what was begun and is not done; what is begun later is done when it is asked for."""
+
 
 class InTurn(Beside):
     """No second process: the work is done when it is asked for."""
@@ -71,6 +78,9 @@ class InTurn(Beside):
         """
         return partial(work, **_given(report))
 
+    def end(self) -> None:
+        """Nothing was begun, see `Beside.end`."""
+
 
 class _SecondProcess(Beside):
     """Sends work through a pipe, one piece after the other."""
@@ -80,7 +90,10 @@ class _SecondProcess(Beside):
         self._line = ThreadPoolExecutor(1, "beside")
 
     def start(self, work: Callable[..., Answer], report: Report | None = None) -> Callable[[], Answer]:
-        """Send the work, see `Beside.start`. Where the process has ended, for want of memory say, the work is done here when asked for.
+        """Send the work, see `Beside.start`.
+
+        What fails there, for want of memory say, or because the process has ended, is done here when it is asked for: a fault of the work
+        is then raised with its own stack.
 
         Parameters
         ----------
@@ -89,38 +102,49 @@ class _SecondProcess(Beside):
         report : callable, optional
             For progress.
         """
+        if self._process.returncode is not None:
+            return partial(work, **_given(report))
         answer = self._line.submit(self._send, work, report)
 
         def wait() -> Answer:
             try:
-                kind, content = answer.result()
+                done, content = answer.result()
                 # Not before it is asked for: what it holds may have to be imported here.
-                value = pickle.loads(content)
-            except Exception:
-                # The process has ended, or sent what cannot be read here: what is wrong with the work shows when it is done again.
-                return work(**_given(report))
-            if kind == _RAISED:
-                raise value
-            returned: Answer = value
-            return returned
+                value: Answer = pickle.loads(content)
+            except Exception as error:
+                # Nothing is lost by any fault of the way there and back: the work is done here.
+                done, why = False, repr(error)
+            else:
+                why = str(value)
+            if done:
+                return value
+            _log.warning("the second process did not do its part (%s); it is done in the first one", why)
+            return work(**_given(report))
 
         return wait
 
-    def _send(self, work: Callable[..., Any], report: Report | None) -> tuple[str, bytes]:
-        """Send work, pass its progress on, and return how it ended, and with what, pickled."""
+    def _send(self, work: Callable[..., Any], report: Report | None) -> tuple[bool, bytes]:
+        """Send work, pass its progress on, and return whether it was done, and what it came to or why it failed, pickled."""
         to_second, from_second = self._process.stdin, self._process.stdout
         assert to_second is not None and from_second is not None
         # Whole before it is sent: half of what cannot be pickled would be read as the beginning of the next piece.
         to_second.write(pickle.dumps((work, report is not None), pickle.HIGHEST_PROTOCOL))
         to_second.flush()
+        fault: BaseException | None = None
         while (said := pickle.load(from_second))[0] == _PROGRESS:
-            if report is not None:
-                report(*said[1])
-        answer: tuple[str, bytes] = said
-        return answer
+            if report is not None and fault is None:
+                try:
+                    report(*said[1])
+                except BaseException as error:
+                    # The answer is still to be read: the next piece would take it for its own.
+                    fault = error
+        if fault is not None:
+            raise fault
+        kind, content = said
+        return kind == _DONE, content
 
     def end(self) -> None:
-        """End the process, whatever it is doing."""
+        """End the process, whatever it is doing, see `Beside.end`."""
         self._process.kill()
         self._process.wait()
         self._line.shutdown(cancel_futures=True)
@@ -148,6 +172,14 @@ def _given(report: Report | None) -> dict[str, Report]:
     return {} if report is None else {"report": report}
 
 
+def same_python() -> tuple[list[str], dict[str, str]]:
+    """Return the beginning of a command, and the environment, for a process that finds the same modules as this one.
+
+    Without this, ``python -m`` looks into the working folder first, where files of a user may have the names of modules.
+    """
+    return [sys.executable, "-P"], {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
 @contextmanager
 def second_process(*, wanted: bool = True, libraries: Sequence[str] = _LIBRARIES) -> Iterator[Beside]:
     """Start a process of the same interpreter that loads its libraries at once, and end it at the end.
@@ -166,9 +198,20 @@ def second_process(*, wanted: bool = True, libraries: Sequence[str] = _LIBRARIES
     if not wanted or _processors() < 2:
         yield InTurn()
         return
-    process = subprocess.Popen(
-        [sys.executable, "-m", __name__, *libraries], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
+    command, environment = same_python()
+    try:
+        # A session of its own: Ctrl-C in the terminal reaches the first process alone, which decides.
+        process = subprocess.Popen(
+            [*command, "-m", __name__, *libraries],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=environment,
+            start_new_session=True,
+        )
+    except OSError as error:
+        _log.warning("no second process could be started (%s); its part is done in the first one", error)
+        yield InTurn()
+        return
     second = _SecondProcess(process)
     try:
         yield second
@@ -185,7 +228,7 @@ def main(libraries: Sequence[str]) -> None:
         Modules that are imported first.
     """
     collect_garbage_less()
-    # Ctrl-C reaches both; the first process decides.
+    # Where there are no sessions Ctrl-C reaches both.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     answers = os.fdopen(os.dup(1), "wb")
     # Whatever a library prints must not come between the answers.
@@ -219,10 +262,10 @@ def _answer(work: Callable[..., Any], reports: bool, answers: IO[bytes]) -> None
 
     try:
         value = work(**_given((lambda *progress: send(_PROGRESS, progress)) if reports else None))
+        answer = _DONE, pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
     except Exception as error:
-        send(_RAISED, pickle.dumps(error, pickle.HIGHEST_PROTOCOL))
-    else:
-        send(_RETURNED, pickle.dumps(value, pickle.HIGHEST_PROTOCOL))
+        answer = _FAILED, pickle.dumps(repr(error))
+    send(*answer)
 
 
 if __name__ == "__main__":

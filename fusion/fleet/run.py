@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import psutil
 
+from fusion.beside import same_python
 from fusion.fleet.members import Member, is_unchanged
 from fusion.fleet.page import render_fleet
 from fusion.fleet.summary import SUMMARY, Row, as_csv, as_json, read_rows, with_findings
@@ -176,12 +176,13 @@ class _Fleet:
         log = f"{_LOGS}/{name}.log"
         (self.out / log).parent.mkdir(parents=True, exist_ok=True)
         row = replace(self.rows[name], log=log)
-        command = [sys.executable, "-m", "fusion.cli", "run", str(member.campaign), "--out", str(folder)]
+        python, inherited = same_python()
+        command = [*python, "-m", "fusion.cli", "run", str(member.campaign), "--out", str(folder)]
         command += ["--processes", "1"]
         if self.resume and folder.is_dir():
             command.append("--resume")
         threads = str(max((os.cpu_count() or 1) // self.jobs, 1))
-        environment = dict.fromkeys(_THREAD_VARIABLES, threads) | os.environ | {"PYTHONUNBUFFERED": "1"}
+        environment = dict.fromkeys(_THREAD_VARIABLES, threads) | inherited | {"PYTHONUNBUFFERED": "1"}
         with self.starting:
             if self.stopped:
                 return

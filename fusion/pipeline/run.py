@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import xarray as xr
 from threadpoolctl import threadpool_limits
@@ -60,6 +61,8 @@ from fusion.remote import fetched_campaign, is_address, require_outside_cache
 if TYPE_CHECKING:
     from fusion.report.charts.campaign import Drawn
 
+AnyLaser = TypeVar("AnyLaser", bound=LaserInputs)
+
 #: Where each stage keeps its Dataset; what ends up in fusion.nc is kept apart while it may have to be resumed.
 FILES = {
     "fields": "fields.nc",
@@ -99,6 +102,12 @@ class Stage(Generic[Product]):
     after: tuple[str, ...]
     compute: Callable[..., Outcome[Product]]
     read: Callable[[Path], Product]
+
+
+def _timed(compute: Callable[..., Outcome[Product]], *, report: Report) -> tuple[Outcome[Product], float]:
+    """Compute a stage; return the wall time that it took too, s."""
+    begun = time.monotonic()
+    return compute(report=report), time.monotonic() - begun
 
 
 @dataclass
@@ -162,15 +171,32 @@ class Run:
         stage : Stage
             What is to be done.
         """
+        return self._finish(stage, partial(_timed, stage.compute, report=self.report))
+
+    def begin(self, stage: Stage[Product]) -> Callable[[], Product]:
+        """Begin a stage beside what follows, where it is not kept; return what waits for it and gives its product, as `stage` does.
+
+        Parameters
+        ----------
+        stage : Stage
+            Its work can be pickled.
+        """
+        if self.stamps.done(stage.name, self.key_of(stage)):
+            return partial(self.stage, stage)
+        return partial(self._finish, stage, self.beside.start(partial(_timed, stage.compute), self.report))
+
+    def _finish(self, stage: Stage[Product], compute: Callable[[], tuple[Outcome[Product], float]]) -> Product:
+        """Write and stamp what a stage computes in so many seconds, or read what is kept of it."""
         name, key = stage.name, self.key_of(stage)
         path = self.folder / FILES[name]
+        kept = self.stamps.done(name, key)
+        computed, spent_s = (None, 0.0) if kept else compute()
         begun = time.monotonic()
-        if self.stamps.done(name, key):
+        if computed is None:
             note = self.stamps.note(name)
             outcome = Outcome(stage.read(path), note["parts"], tuple(Notice(**item) for item in note["notices"]))
             self.report(f"{interferometry.LABELS[name]} (kept)", 1, 1)
         else:
-            computed = stage.compute(report=self.report)
             outcome = replace(computed, dataset=self.described(computed.dataset))
             write_dataset(path, outcome.dataset)
             self.stamps.record(
@@ -180,21 +206,8 @@ class Run:
         self.products.append(path)
         self.parts.update(outcome.parts)
         self.notices.extend(outcome.notices)
-        self.seconds[name] = time.monotonic() - begun
+        self.seconds[name] = spent_s + time.monotonic() - begun
         return outcome.dataset
-
-    def begun(self, stage: Stage[Product]) -> Stage[Product]:
-        """Return the stage with its work begun beside what follows, where it is not kept; its product comes from `stage`.
-
-        Parameters
-        ----------
-        stage : Stage
-            Its work can be pickled.
-        """
-        if self.stamps.done(stage.name, self.key_of(stage)):
-            return stage
-        waiting = self.beside.start(stage.compute, self.report)
-        return replace(stage, compute=lambda *, report: waiting())
 
     def draw_measured(self, fields: xr.Dataset | None, deviations: xr.Dataset | None) -> None:
         """Begin to draw what was measured.
@@ -341,9 +354,20 @@ def run_loaded(
     report("reading and checking", 1, 1)
     laser = campaign.interferometry
     readings = None if laser is None else campaign.resolve(laser.deviations)
-    with open_folder(folder, resume=resume), naming(campaign.path, readings=readings):
+    with open_folder(folder, resume=resume), naming(campaign.path, readings=readings), _leaving(beside):
         run = _start_run(campaign, folder, seen, report, address, beside or InTurn())
         return _run_instruments(run, source, checks, scheduler=scheduler)
+
+
+@contextmanager
+def _leaving(beside: Beside | None) -> Iterator[None]:
+    """Let a run that fails leave nobody behind who writes into its folder."""
+    try:
+        yield
+    except BaseException:
+        if beside is not None:
+            beside.end()
+        raise
 
 
 def _start_run(
@@ -398,28 +422,26 @@ def _join_sensors(run: Run, source: Inputs, fields: xr.Dataset | None) -> dict[s
 
 def _run_both(run: Run, source: Source, *, scheduler: str | None) -> tuple[dict[str, Any], list[Check]]:
     """Fields, deviations, and what both show together."""
-    begun = None if source.needs_camera else run.begun(_evaluation(source, after=()))
+    evaluated = None if source.needs_camera else run.begin(_evaluation(source, after=()))
     fields = _reduce(run, source, ("thermography", "plan", "interferometry"), scheduler=scheduler)
-    if fields.nbytes > _MOST_SENT:
-        run.beside = InTurn()
     source, redone = compensate_by_camera(source, fields)
     run.notices.extend(redone)
-    deviations = _evaluate(run, source, begun or _evaluation(source, after=("fields",)))
+    deviations = _evaluate(run, source, evaluated or partial(run.stage, _evaluation(source, after=("fields",))))
     fused, outside = interferometry.align_recordings(source, fields, deviations)
     run.notices.extend(outside)
     too_small = [*lacks_for_model(deviations), *lacks_for_correlation(fields)]
     modelled, left_out = choose_targets(fused)
     run.notices.extend(too_small or left_out)
-    correlation = None if too_small else run.begun(_correlation(source, fields, modelled))
+    correlated = None if too_small else run.begin(_correlation(source, fields, modelled))
     run.draw_measured(fields, deviations)
-    checked = run.beside.start(partial(check_fields, source, fields, fused))
+    checked = run.beside.start(partial(check_fields, _without_frames(source), fields, fused))
     written = _write_maps(run, fields)
     maps = model = None
-    if correlation is None:
+    if correlated is None:
         run.parts["hotspots"] = attribution.describe_hotspots(fields)
     else:
         model = _model(run, source, fields, modelled, deviations, after=("fields", "deviations"))
-        maps = run.stage(correlation)
+        maps = correlated()
     fusion = _write_fusion(run, fused, modelled, maps, model)
     written()
     checks = [*check_plan(source, run.parts["registration"]), *checked()]
@@ -439,7 +461,7 @@ def _run_camera(run: Run, source: CameraInputs, *, scheduler: str | None) -> tup
 
 def _run_laser(run: Run, source: LaserInputs) -> tuple[dict[str, Any], list[Check]]:
     """Deviations, and the model of the drift from what was logged."""
-    deviations = _evaluate(run, source, _evaluation(source, after=()))
+    deviations = _evaluate(run, source, partial(run.stage, _evaluation(source, after=())))
     run.draw_measured(None, deviations)
     if "drift" not in run.parts:
         # Readings without times: nothing can be set beside them.
@@ -459,20 +481,26 @@ def _reduce(run: Run, source: CameraInputs, tables: tuple[str, ...], *, schedule
     stage = Stage("fields", tables, (), partial(thermal.reduce_thermography, source, scheduler=scheduler), read_dataset)
     checkpoint = run.checkpoint(run.key_of(stage))
     fields = run.stage(replace(stage, compute=partial(stage.compute, checkpoint=checkpoint)))
+    if fields.nbytes > _MOST_SENT:
+        run.beside = InTurn()
     run.parts["field"] = describe_field(fields, run.parts["radiometry"])
     return fields
 
 
+def _without_frames(source: AnyLaser) -> AnyLaser:
+    """Return inputs as another process needs them where it reads no frame: there may be very many."""
+    return replace(source, frames=()) if isinstance(source, Source) else source
+
+
 def _evaluation(source: LaserInputs, *, after: tuple[str, ...]) -> Stage[xr.Dataset]:
-    """What the stage of the deviations does."""
-    return Stage(
-        "deviations", ("interferometry",), after, partial(interferometry.evaluate_interferometry, source), read_dataset
-    )
-
-
-def _evaluate(run: Run, source: LaserInputs, evaluation: Stage[xr.Dataset]) -> xr.Dataset:
     """The stage of the deviations."""
-    deviations = run.stage(evaluation)
+    evaluate = partial(interferometry.evaluate_interferometry, _without_frames(source))
+    return Stage("deviations", ("interferometry",), after, evaluate, read_dataset)
+
+
+def _evaluate(run: Run, source: LaserInputs, evaluated: Callable[[], xr.Dataset]) -> xr.Dataset:
+    """Return the deviations, and tell what is stated of the test."""
+    deviations = evaluated()
     # What is stated of the test is no input of the stage: a corrected serial number computes nothing again.
     run.parts["iso230"] = complete_sheet(
         run.parts["iso230"], deviations, campaign=run.campaign, environment=source.environment
@@ -486,7 +514,7 @@ def _correlation(source: Source, fields: xr.Dataset, fused: xr.Dataset) -> Stage
         "correlation",
         ("plan", "interferometry", "drivers"),
         ("fields", "deviations"),
-        partial(attribution.correlate_field, source, fields, fused),
+        partial(attribution.correlate_field, _without_frames(source), fields, fused),
         read_tree,
     )
 
@@ -566,6 +594,11 @@ def _draw_found(results: Results, datasets: Mapping[str, Any]) -> Drawn:
     return draw_found(results, datasets)
 
 
+def _together(measured: Callable[[], Drawn], found: Callable[[], Drawn]) -> Drawn:
+    """Wait for all charts."""
+    return measured().with_more(found())
+
+
 def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
     """Write results, provenance and report from what the stages found."""
     _discard_stale(run, datasets)
@@ -573,7 +606,10 @@ def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
     run.notices.extend(note_changes(run.seen, input_states(run.campaign)))
     results = assemble(run.campaign.campaign.title, run.parts, run.notices)
     run.report("report", 0, 1)
-    found = run.beside.start(partial(_draw_found, results, datasets))
+    drawn = None
+    if run.measured is not None:
+        found = run.beside.start(partial(_draw_found, results, datasets))
+        drawn = partial(_together, run.measured, found)
     content = write_json(run.folder / "results.json", results.as_json())
     provenance = describe_run(
         run.campaign,
@@ -587,8 +623,6 @@ def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
     write_json(run.folder / "provenance.json", provenance)
     from fusion.report.html import render_report
 
-    measured = run.measured
-    drawn = None if measured is None else lambda: measured().with_more(found())
     page = render_report(results, provenance, datasets, drawn=drawn)
     write_text(run.folder / "report.html", page)
     stamp_run(run.stamps, run.campaign, run.inputs, [*run.products, *(run.folder / name for name in PAGES)])

@@ -8,9 +8,11 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -25,7 +27,7 @@ def counted(upto: int, *, report: Callable[[str, int, int], None]) -> int:
 
 
 def refused(name: str) -> None:
-    raise FusionError(f"{name}: cannot be used")
+    raise FusionError(f"{name}: cannot be used in {os.getpid()}")
 
 
 def killed_elsewhere(here: int) -> int:
@@ -51,11 +53,24 @@ def test_work_is_done_in_another_process_and_tells_its_progress(beside: Beside) 
     assert later() == 4.0
 
 
-def test_an_error_of_the_work_is_raised_where_its_answer_is_asked_for(beside: Beside) -> None:
+def test_an_error_of_the_work_is_raised_here_with_its_own_stack(beside: Beside) -> None:
     waiting = beside.start(partial(refused, "laser.csv"))
     assert beside.start(partial(math.sqrt, 4.0))() == 2.0
-    with pytest.raises(FusionError, match=r"laser\.csv: cannot be used"):
+    with pytest.raises(FusionError, match=rf"laser\.csv: cannot be used in {os.getpid()}") as caught:
         waiting()
+    assert caught.traceback[-1].name == "refused"
+
+
+def test_progress_that_cannot_be_told_spoils_no_later_answer(beside: Beside) -> None:
+    """In the thread that reads the answers a window may not be touched, say; here it may."""
+
+    def told(label: str, done: int, total: int) -> None:
+        if threading.current_thread() is not threading.main_thread():
+            raise RuntimeError("not in this thread")
+
+    waiting = beside.start(partial(counted, 3), told)
+    assert beside.start(partial(math.sqrt, 16.0))() == 4.0
+    assert waiting() == os.getpid()
 
 
 def test_what_cannot_be_sent_is_done_here(beside: Beside) -> None:
@@ -76,6 +91,32 @@ def test_a_single_processor_does_the_work_when_it_is_asked_for(monkeypatch: pyte
     with second_process() as one, second_process(wanted=False) as other:
         assert isinstance(one, InTurn) and isinstance(other, InTurn)
         assert one.start(partial(counted, 1), lambda *_: None)() == os.getpid()
+
+
+def test_files_of_the_working_folder_are_no_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "queue.py").write_text("raise SystemExit('a file of the user was run')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("fusion.beside._processors", lambda: 2)
+    with second_process(libraries=[]) as second:
+        assert second.start(os.getpid)() != os.getpid()
+
+
+def test_where_no_process_can_be_started_the_work_is_done_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **options: object) -> None:
+        raise BlockingIOError("no more processes")
+
+    monkeypatch.setattr("fusion.beside._processors", lambda: 2)
+    monkeypatch.setattr(subprocess, "Popen", full)
+    with second_process() as none:
+        assert none.start(os.getpid)() == os.getpid()
+
+
+def test_what_is_begun_after_the_end_is_done_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fusion.beside._processors", lambda: 2)
+    with second_process(libraries=[]) as second:
+        begun = second.start(partial(time.sleep, 0.01))
+        second.end()
+        assert begun() is None and second.start(os.getpid)() == os.getpid()
 
 
 def test_it_ends_with_the_first_process_even_in_the_middle_of_its_work() -> None:

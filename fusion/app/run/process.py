@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import sys
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -13,6 +12,7 @@ from threading import Lock, Thread
 from typing import IO
 
 from fusion.app.run.progress import Progress
+from fusion.beside import same_python
 from fusion.errors import FusionError
 
 #: Seconds that a run has to end when the application does.
@@ -53,9 +53,11 @@ class RunProcess:
         self.progress = Progress()
         self.messages: list[str] = []
         self.version = 0
-        command = [sys.executable, "-m", "fusion.app.run.child", str(campaign), str(results)]
+        python, environment = same_python()
+        command = [*python, "-m", "fusion.app.run.child", str(campaign), str(results)]
         self._process = subprocess.Popen(
             [*command, "--resume"] if self.resumed else command,
+            env=environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
