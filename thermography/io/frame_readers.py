@@ -103,6 +103,8 @@ def find_reader(path: Path) -> FrameReader | None:
     ------
     OSError
         The file cannot be opened.
+    FrameReaderError
+        A plug-in cannot be used.
     """
     start = b""
     if not path.is_dir():

@@ -112,7 +112,8 @@ def keep(file: BinaryIO, path: Path, start: int, columns: Mapping[str, Array]) -
         # Another process that keeps the same has put its file in place first.
         if isinstance(error, FileNotFoundError) and place.exists():
             return
-        _log.warning("the headers of %s cannot be kept and will be read again the next time: %s", path, error)
+        remedy = f"let {CACHE_VARIABLE} name a folder that can be written to"
+        _log.warning("the headers of %s cannot be kept, every opening reads them (%s); %s", path, error, remedy)
         return
     _remove_first_written(place.parent)
 

@@ -175,8 +175,9 @@ def test_a_cache_that_cannot_be_written_to_costs_nothing_but_time(
     assert len(index_frames(path)[0]) == FRAMES
     # Not that anything is damaged: nothing was kept yet.
     (said,) = caplog.messages
-    assert said.startswith(f"the headers of {path} cannot be kept and will be read again the next time: ")
+    assert said.startswith(f"the headers of {path} cannot be kept, every opening reads them (")
     assert str(cache.parent) in said and cache.parent.is_file()
+    assert said.endswith("let THERMOFUSE_CACHE name a folder that can be written to")
 
 
 def test_a_kept_file_that_cannot_be_opened_is_not_told_as_damaged(
