@@ -201,8 +201,8 @@ def _run_or_keep(
 
 def _joining(campaigns: list[Path]) -> Callable[[Sequence[Path], Path], Iterable[tuple[str, str]]]:
     """Return what joins the results of two campaigns, or of two records."""
-    from fusion.pipeline.two_campaigns import join_campaigns
-    from fusion.pipeline.two_records import join_records, of_one_kind
+    from fusion.pipeline.joining.campaigns import join_campaigns
+    from fusion.pipeline.joining.records import join_records, of_one_kind
 
     return join_records if of_one_kind(campaigns) else join_campaigns
 

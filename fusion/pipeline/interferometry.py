@@ -14,6 +14,7 @@ from fusion.campaign.sources import LaserInputs, Source
 from fusion.consistency.place import find_gaps, gap_words, in_gaps
 from fusion.consistency.readings import find_gross_readings
 from fusion.pipeline.iso230.evaluation import evaluate_standard
+from fusion.pipeline.stages import LABELS
 from fusion.products.grouped import group, joined
 from fusion.products.notices import counted, listed
 from fusion.products.progress import Report, silent
@@ -25,14 +26,6 @@ from interferometry.drift.estimate import estimate_drift, flag_outliers
 
 #: Share of the readings that may lie outside the frames' time before the next test should be filmed otherwise.
 _OUTSIDE_SHARE = 0.05
-#: What each stage is called in progress and provenance.
-LABELS = {
-    "fields": "thermal fields",
-    "deviations": "deviations",
-    "correlation": "correlation",
-    "model": "anomalies and closed loop",
-    "record": "closed loop on the record",
-}
 
 
 def evaluate_interferometry(source: LaserInputs, *, report: Report = silent) -> Outcome:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import xarray as xr
 from threadpoolctl import threadpool_limits
@@ -30,7 +28,6 @@ from fusion.pipeline.consistency import check_fields, check_fields_alone, check_
 from fusion.pipeline.iso230.sheet import complete_sheet
 from fusion.pipeline.provenance import (
     FileState,
-    dependencies,
     describe_run,
     forget_run,
     hash_files,
@@ -38,18 +35,15 @@ from fusion.pipeline.provenance import (
     kept_results,
     note_changes,
     stamp_run,
-    versions,
 )
 from fusion.pipeline.radiometry import describe_field
 from fusion.pipeline.sizes import choose_targets, lacks_for_correlation, lacks_for_model
+from fusion.pipeline.stages import FILES, Run, Stage
 from fusion.products.folder import claim, discard, open_folder, read_manifest
 from fusion.products.progress import Report, silent
-from fusion.products.results import Notice, Outcome, Results, assemble
+from fusion.products.results import Results, assemble
 from fusion.products.store import (
-    Product,
     StageStamps,
-    annotate,
-    digest,
     read_dataset,
     read_tree,
     write_dataset,
@@ -63,182 +57,12 @@ if TYPE_CHECKING:
 
 AnyLaser = TypeVar("AnyLaser", bound=LaserInputs)
 
-#: Where each stage keeps its Dataset; what ends up in fusion.nc is kept apart while it may have to be resumed.
-FILES = {
-    "fields": "fields.nc",
-    "deviations": "deviations.nc",
-    "correlation": ".stages/correlation.nc",
-    "model": ".stages/model.nc",
-    "record": "fusion.nc",
-}
 #: The contact sensors, made from the logs in a moment.
 _SENSORS = "sensors.nc"
 #: Fields above this size are not sent to a second process, which would hold them once more, bytes.
 _MOST_SENT = 200e6
 #: What a run writes last.
 PAGES = ("results.json", "provenance.json", "report.html")
-
-
-@dataclass(frozen=True)
-class Stage(Generic[Product]):
-    """A stage of a run.
-
-    Attributes
-    ----------
-    name : str
-        Name of the stage.
-    tables : tuple of str
-        Tables of the campaign file that its result depends on, with the files that they name.
-    after : tuple of str
-        Stages that its result depends on; it is computed again whenever one of them is.
-    compute : callable
-        ``compute(report=report)`` computes the stage.
-    read : callable
-        Reads the product that a kept stage has written.
-    """
-
-    name: str
-    tables: tuple[str, ...]
-    after: tuple[str, ...]
-    compute: Callable[..., Outcome[Product]]
-    read: Callable[[Path], Product]
-
-
-def _timed(compute: Callable[..., Outcome[Product]], *, report: Report) -> tuple[Outcome[Product], float]:
-    """Compute a stage; return the wall time that it took too, s."""
-    begun = time.monotonic()
-    return compute(report=report), time.monotonic() - begun
-
-
-@dataclass
-class Run:
-    """One run of a campaign into one folder.
-
-    Attributes
-    ----------
-    campaign : Campaign
-        The checked campaign file.
-    folder : Path
-        Results folder.
-    report : callable
-        ``report(label, done, total)``, for progress.
-    stamps : StageStamps
-        Stages that are done.
-    inputs : mapping
-        Size and SHA-256 of each input.
-    seen : mapping
-        Size and time of change of each input before it was read.
-    started : datetime
-        Start of the run, UTC.
-    address : str or None
-        Where the campaign file was fetched from.
-    beside : Beside
-        Takes stages that the next one does not wait for.
-    depends : tuple
-        What every stage depends on beside campaign and files, as it was at the start.
-    measured : callable, optional
-        Returns the charts of what was measured.
-    parts, notices : dict, list
-        Parts of results.json and notices of the stages so far.
-    seconds, keys : dict
-        Wall time (s) and input digest by stage.
-    products : list of Path
-        What the run wrote or kept.
-    """
-
-    campaign: Campaign
-    folder: Path
-    report: Report
-    stamps: StageStamps
-    inputs: Mapping[str, Mapping[str, Any]]
-    seen: Mapping[str, FileState]
-    started: datetime
-    address: str | None = None
-    beside: Beside = field(default_factory=InTurn)
-    depends: tuple[Any, ...] = field(default_factory=dependencies)
-    measured: Callable[[], Drawn] | None = None
-    parts: dict[str, Any] = field(default_factory=dict)
-    notices: list[Notice] = field(default_factory=list)
-    seconds: dict[str, float] = field(default_factory=dict)
-    keys: dict[str, str] = field(default_factory=dict)
-    products: list[Path] = field(default_factory=list)
-
-    def stage(self, stage: Stage[Product]) -> Product:
-        """Return the product of a stage: computed and stamped, or kept where its input has not changed.
-
-        Parameters
-        ----------
-        stage : Stage
-            What is to be done.
-        """
-        return self._finish(stage, partial(_timed, stage.compute, report=self.report))
-
-    def begin(self, stage: Stage[Product]) -> Callable[[], Product]:
-        """Begin a stage beside what follows, where it is not kept; return what waits for it and gives its product, as `stage` does.
-
-        Parameters
-        ----------
-        stage : Stage
-            Its work can be pickled.
-        """
-        if self.stamps.done(stage.name, self.key_of(stage)):
-            return partial(self.stage, stage)
-        return partial(self._finish, stage, self.beside.start(partial(_timed, stage.compute), self.report))
-
-    def _finish(self, stage: Stage[Product], compute: Callable[[], tuple[Outcome[Product], float]]) -> Product:
-        """Write and stamp what a stage computes in so many seconds, or read what is kept of it."""
-        name, key = stage.name, self.key_of(stage)
-        path = self.folder / FILES[name]
-        kept = self.stamps.done(name, key)
-        computed, spent_s = (None, 0.0) if kept else compute()
-        begun = time.monotonic()
-        if computed is None:
-            note = self.stamps.note(name)
-            outcome = Outcome(stage.read(path), note["parts"], tuple(Notice(**item) for item in note["notices"]))
-            self.report(f"{interferometry.LABELS[name]} (kept)", 1, 1)
-        else:
-            outcome = replace(computed, dataset=self.described(computed.dataset))
-            write_dataset(path, outcome.dataset)
-            self.stamps.record(
-                name, key, [path], {"parts": outcome.parts, "notices": [vars(item) for item in outcome.notices]}
-            )
-        self.keys[name] = key
-        self.products.append(path)
-        self.parts.update(outcome.parts)
-        self.notices.extend(outcome.notices)
-        self.seconds[name] = spent_s + time.monotonic() - begun
-        return outcome.dataset
-
-    def draw_measured(self, fields: xr.Dataset | None, deviations: xr.Dataset | None) -> None:
-        """Begin to draw what was measured.
-
-        Parameters
-        ----------
-        fields, deviations : Dataset, optional
-            Of the stages.
-        """
-        self.measured = self.beside.start(partial(_draw_measured, fields, deviations))
-
-    def key_of(self, stage: Stage[Any]) -> str:
-        """Return a digest of everything that the result of a stage depends on."""
-        asked = self.campaign.model_dump(mode="json", include=set(stage.tables))
-        files = {file: self.inputs[file] for table in stage.tables for file in self.campaign.files_of(table)}
-        zone = self.campaign.campaign.time_zone
-        return digest(stage.name, *self.depends, zone, asked, files, [self.keys[earlier] for earlier in stage.after])
-
-    def checkpoint(self, key: str) -> Path:
-        """Return the folder that keeps the finished cycles of a long recording; folders of other inputs are removed."""
-        chosen = self.folder / ".stages" / f"cycles_{key[:16]}"
-        for stale in chosen.parent.glob("cycles_*"):
-            if stale != chosen:
-                shutil.rmtree(stale)
-        return chosen
-
-    def described(self, product: Product) -> Product:
-        """Return a product with title, history and provenance."""
-        history = f"{self.started.isoformat(timespec='seconds')} thermofuse run {self.campaign.path.name}"
-        origin = {"software": "thermofuse", "versions": versions(), "inputs": dict(self.inputs)}
-        return annotate(product, title=self.campaign.campaign.title, history=history, provenance=origin)
 
 
 def run_campaign(
@@ -433,7 +257,7 @@ def _run_both(run: Run, source: Source, *, scheduler: str | None) -> tuple[dict[
     modelled, left_out = choose_targets(fused)
     run.notices.extend(too_small or left_out)
     correlated = None if too_small else run.begin(_correlation(source, fields, modelled))
-    run.draw_measured(fields, deviations)
+    _draw_beside(run, fields, deviations)
     checked = run.beside.start(partial(check_fields, _without_frames(source), fields, fused))
     written = _write_maps(run, fields)
     maps = model = None
@@ -453,7 +277,7 @@ def _run_camera(run: Run, source: CameraInputs, *, scheduler: str | None) -> tup
     """Fields and hotspots, by windows of time in place of cycles."""
     fields = _reduce(run, source, ("thermography", "plan"), scheduler=scheduler)
     run.parts["hotspots"] = attribution.describe_hotspots(fields)
-    run.draw_measured(fields, None)
+    _draw_beside(run, fields, None)
     _write_maps(run, fields)()
     checks = [*check_plan(source, run.parts["registration"]), *check_fields_alone(source, fields)]
     return {"fields": fields}, checks
@@ -462,7 +286,7 @@ def _run_camera(run: Run, source: CameraInputs, *, scheduler: str | None) -> tup
 def _run_laser(run: Run, source: LaserInputs) -> tuple[dict[str, Any], list[Check]]:
     """Deviations, and the model of the drift from what was logged."""
     deviations = _evaluate(run, source, partial(run.stage, _evaluation(source, after=())))
-    run.draw_measured(None, deviations)
+    _draw_beside(run, None, deviations)
     if "drift" not in run.parts:
         # Readings without times: nothing can be set beside them.
         return {"deviations": deviations}, []
@@ -578,6 +402,11 @@ def _discard_stale(run: Run, datasets: Mapping[str, Any]) -> None:
     discard(run.folder, *stale)
     for name in {"fields", "deviations"} - set(datasets):
         run.stamps.forget(name)
+
+
+def _draw_beside(run: Run, fields: xr.Dataset | None, deviations: xr.Dataset | None) -> None:
+    """Begin to draw what was measured."""
+    run.measured = run.beside.start(partial(_draw_measured, fields, deviations))
 
 
 def _draw_measured(fields: xr.Dataset | None, deviations: xr.Dataset | None) -> Drawn:

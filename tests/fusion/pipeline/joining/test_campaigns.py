@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fusion.attribution.two_sessions import SessionComparisonError
-from fusion.pipeline.two_campaigns import join_campaigns
+from fusion.pipeline.joining.campaigns import join_campaigns
 from fusion.products.store import DamagedProductError, file_sha256, read_dataset, read_tree, write_dataset, write_json
 
 

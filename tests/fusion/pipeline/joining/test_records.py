@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fusion.campaign.config import CampaignError
-from fusion.pipeline import two_records
+from fusion.pipeline.joining import records
 from fusion.pipeline.run import run_campaign
 from tests.fusion.campaign_parts import without
 
@@ -39,11 +39,11 @@ def write_record(folder: Path, title: str) -> Path:
 
 def test_two_records_are_told_together(tmp_path: Path) -> None:
     paths = [write_record(tmp_path, title) for title in ("Monday", "Tuesday")]
-    assert two_records.of_one_kind(paths)
+    assert records.of_one_kind(paths)
     folders = [tmp_path / "results" / path.stem for path in paths]
     for path, folder in zip(paths, folders, strict=True):
         run_campaign(path, folder)
-    rows = two_records.join_records(folders, tmp_path)
+    rows = records.join_records(folders, tmp_path)
     document = json.loads((tmp_path / "joint.json").read_text())
     assert document["campaigns"] == [name for name, _ in rows[:2]] == ["Monday", "Tuesday"]
     assert document["records"][0]["rmse_final_um"] == document["records"][1]["rmse_final_um"]
@@ -56,19 +56,19 @@ def test_a_record_beside_both_instruments_is_refused(tmp_path: Path, monkeypatch
         def __init__(self, path: Path) -> None:
             self.record = path.stem if path.stem == "record" else None
 
-    monkeypatch.setattr(two_records, "load_campaign", Loaded)
+    monkeypatch.setattr(records, "load_campaign", Loaded)
     with pytest.raises(CampaignError, match=r"record\.toml holds a \[record\], axis\.toml instruments"):
-        two_records.of_one_kind([Path("axis.toml"), Path("record.toml")])
+        records.of_one_kind([Path("axis.toml"), Path("record.toml")])
 
 
 def test_two_campaigns_without_both_instruments_are_refused_before_any_is_run(copied: Path) -> None:
     whole = copied / "campaign.toml"
     laser = without(whole, "thermography", "plan", "model", name="laser.toml")
     camera = without(whole, "interferometry", "model", name="camera.toml")
-    assert two_records.of_one_kind([whole, whole]) is False
+    assert records.of_one_kind([whole, whole]) is False
     with pytest.raises(
         CampaignError, match=r"laser\.toml has no \[thermography\]; two campaigns are compared by the part"
     ):
-        two_records.of_one_kind([whole, laser])
+        records.of_one_kind([whole, laser])
     with pytest.raises(CampaignError, match=r"camera\.toml has no \[interferometry\]"):
-        two_records.of_one_kind([camera, whole])
+        records.of_one_kind([camera, whole])

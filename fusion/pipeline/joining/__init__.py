@@ -1,0 +1,1 @@
+"""Two finished runs of one machine, read together."""
