@@ -30,7 +30,7 @@ def covariance_of_walk(order: int) -> np.ndarray:
     walks = []
     for first, second in ((unit, nothing), (nothing, unit)):
         # However many readings come together.
-        pairs = zip(np.split(first.copy(), [1, 4]), np.split(second.copy(), [1, 4]), strict=True)
+        pairs = zip(np.split(first, [1, 4]), np.split(second, [1, 4]), strict=True)
         walks.append(np.concatenate([*random_walk(system, pairs)]))
     matrix = np.column_stack(walks)
     return matrix @ matrix.T
