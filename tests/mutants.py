@@ -146,7 +146,12 @@ def _stand_ready(module: Path, tests: list[str]) -> int:
     answer, theirs = _FORK.Pipe(duplex=False)
     process = _FORK.Process(target=_run_unchanged, args=(tests, theirs))
     process.start()
-    code, seconds, used = answer.recv()
+    theirs.close()
+    try:
+        code, seconds, used = answer.recv()
+    except EOFError:
+        process.join()
+        raise SystemExit(f"the tests end their process, with code {process.exitcode}, without any change") from None
     process.join()
     if code:
         raise SystemExit("the tests fail without any change")

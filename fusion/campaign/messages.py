@@ -68,7 +68,7 @@ def naming(file: Path, *, readings: Path | None = None) -> Iterator[None]:
     except (FusionError, InterferometryError, ThermographyError) as error:
         about = readings if readings is not None and isinstance(error, InterferometryError) else file
         text = str(error)
-        if not text.startswith(str(file)) and not any(mark in text.split(maxsplit=1)[0] for mark in "/\\"):
+        if not text.startswith(str(file)) and not re.match(r"\s*\S*[/\\]", text):
             error.args = (f"{about}: {text}",)
         raise
 

@@ -63,6 +63,8 @@ def test_a_fault_names_place_key_and_value() -> None:
         (FusionError("the clocks disagree"), "c/campaign.toml: the clocks disagree"),
         (FusionError("c/campaign.toml, line 3: no"), "c/campaign.toml, line 3: no"),
         (ThermographyError("c/thermal/1.jpg: cut short"), "c/thermal/1.jpg: cut short"),
+        (FusionError(), "c/campaign.toml: "),
+        (FusionError("a speed in m/s"), "c/campaign.toml: a speed in m/s"),
     ],
 )
 def test_a_message_without_a_file_gets_one(told: ValueError, message: str) -> None:
