@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import xarray as xr
@@ -73,26 +73,29 @@ def whole_folders(out: Path) -> Iterator[tuple[Path, Path]]:
     Raises
     ------
     RecipeError
-        As `check_free`, or the disk takes no more.
+        As `check_free`, or another simulation writes to the same folder, or the disk takes no more.
     """
     check_free(out)
     places = (truth_folder(out), out.resolve())
     truth, campaign = (place.with_name(f".{place.name}{PARTIAL}") for place in places)
     try:
-        for growing in (truth, campaign):
-            shutil.rmtree(growing, ignore_errors=True)
-            growing.mkdir(parents=True)
-        yield campaign, truth
-        for growing, place in zip((truth, campaign), places, strict=True):
-            _put_in_place(growing, place)
+        with ExitStack() as made:
+            for growing in (truth, campaign):
+                _make(growing)
+                made.callback(shutil.rmtree, growing, ignore_errors=True)
+            yield campaign, truth
+            check_free(out)
+            with ExitStack() as moved:
+                for growing, place in zip((truth, campaign), places, strict=True):
+                    _put_in_place(growing, place, moved)
+                moved.pop_all()
+    except BrokenPipeError:  # Nobody reads the progress any more.
+        raise
     except OSError as error:
         raise RecipeError(
             f"{out}: cannot be written ({error.strerror or error}), and nothing is left there; make room, allow writing there, "
             "or name another folder with --out"
         ) from error
-    finally:
-        for growing in (truth, campaign):
-            shutil.rmtree(growing, ignore_errors=True)
 
 
 def write_truth_nc(folder: Path, truth: xr.Dataset) -> None:
@@ -112,10 +115,25 @@ def write_truth_nc(folder: Path, truth: xr.Dataset) -> None:
     (folder / "truth.nc").write_bytes(truth.to_netcdf(engine="h5netcdf"))
 
 
-def _put_in_place(growing: Path, place: Path) -> None:
-    """Give a folder its name; an empty folder that has the name stays, in which somebody may be at work, and is filled."""
+def _make(growing: Path) -> None:
+    """Make a folder in which no other simulation writes."""
+    try:
+        growing.mkdir(parents=True)
+    except FileExistsError:
+        raise RecipeError(
+            f"{growing} exists: another simulation is writing there, or was killed; wait for it, or remove this folder"
+        ) from None
+
+
+def _put_in_place(growing: Path, place: Path, moved: ExitStack) -> None:
+    """Give a folder its name; an empty folder that has the name stays, in which somebody may be at work, and is filled.
+
+    What is moved can be moved back.
+    """
     if not place.exists():
         growing.rename(place)
+        moved.callback(place.rename, growing)
         return
     for item in sorted(growing.iterdir(), key=lambda item: item.name == CAMPAIGN_FILE):
         item.rename(place / item.name)
+        moved.callback((place / item.name).rename, item)

@@ -46,13 +46,53 @@ def test_what_fails_or_is_stopped_leaves_nothing(tmp_path: Path, exists: bool, f
         )
 
 
-def test_what_a_killed_simulation_left_is_replaced(tmp_path: Path) -> None:
-    left = tmp_path / ".campaign.partial"
-    left.mkdir()
-    (left / "laser.csv").write_text("half")
-    with whole_folders(tmp_path / "campaign") as folders:
+@pytest.mark.parametrize("existing", ["campaign", "campaign-truth"])
+def test_what_cannot_be_put_in_place_is_taken_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, existing: str
+) -> None:
+    """An empty folder that exists, and that nothing can be written to; the other one can."""
+    (tmp_path / existing).mkdir()
+    rename = Path.rename
+
+    def refused(self: Path, target: Path) -> Path:
+        if target.parent == tmp_path / existing and target.name in ("thermal", "truth.json"):
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", refused)
+    with pytest.raises(RecipeError, match="nothing is left there"), whole_folders(tmp_path / "campaign") as folders:
         fill(*folders)
-    assert not (tmp_path / "campaign" / "laser.csv").exists() and not left.exists()
+    assert [path.name for path in tmp_path.rglob("*")] == [existing]
+    check_free(tmp_path / "campaign")
+
+
+def test_a_reader_of_the_progress_who_left_is_no_fault_of_the_disk(tmp_path: Path) -> None:
+    with pytest.raises(BrokenPipeError), whole_folders(tmp_path / "campaign"):
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_simulations_do_not_write_to_one_folder(tmp_path: Path) -> None:
+    with whole_folders(tmp_path / "campaign") as folders:
+        with (
+            pytest.raises(RecipeError, match=r"another simulation is writing there, or was killed; wait for it"),
+            whole_folders(tmp_path / "campaign"),
+        ):
+            pass
+        fill(*folders)
+    assert {path.name for path in tmp_path.iterdir()} == {"campaign", "campaign-truth"}
+
+
+def test_what_somebody_else_put_there_meanwhile_is_not_overwritten(tmp_path: Path) -> None:
+    with (
+        pytest.raises(RecipeError, match="not an empty folder"),
+        whole_folders(tmp_path / "campaign") as folders,
+    ):
+        fill(*folders)
+        (tmp_path / "campaign").mkdir()
+        (tmp_path / "campaign" / "campaign.toml").write_text("mine")
+    assert [path.name for path in tmp_path.iterdir()] == ["campaign"]
+    assert (tmp_path / "campaign" / "campaign.toml").read_text() == "mine"
 
 
 def test_a_folder_that_holds_something_and_the_root_of_a_disk_are_refused(tmp_path: Path, monkeypatch) -> None:
