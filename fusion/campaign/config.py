@@ -100,8 +100,10 @@ def _matching(pattern: str, info: ValidationInfo) -> str:
     if isinstance(info.context, _Surroundings):
         check_pattern(info.context.folder, pattern)
         found = matching_files(info.context.folder, pattern)
-        lost = [path for path in found if not path.exists()]
-        strange = next((text for path in found if (text := not_a_file(path))), "")
+        # Every link, and one file of each folder: where that is a part of the system, all are.
+        doubtful = {path if path.is_symlink() else path.parent: path for path in found}.values()
+        lost = [path for path in doubtful if not path.exists()]
+        strange = next((text for path in doubtful if (text := not_a_file(path))), "")
         unnamed = [path for path in found if not is_text(str(path).removeprefix(str(info.context.folder)))]
         if lost:
             text = f"{lost[0]} is a link to a file that is gone; bring it back or remove the link"

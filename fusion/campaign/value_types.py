@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
@@ -186,7 +188,13 @@ def matching_files(folder: Path, pattern: str) -> list[Path]:
         if error.errno == errno.ENAMETOOLONG:
             return []
         raise
-    return [path.resolve() if path.exists() and not given.anchor else path for path in there]
+    if given.anchor:
+        return there
+    real = {place: place.resolve() for place in {path.parent for path in there}}
+    return [
+        real[path.parent] / path.name if not path.is_symlink() else path.resolve() if path.exists() else path
+        for path in there
+    ]
 
 
 def check_pattern(folder: Path, pattern: str) -> None:
@@ -202,25 +210,37 @@ def check_pattern(folder: Path, pattern: str) -> None:
     Raises
     ------
     PydanticCustomError
-        It has more than 64 folders, or searches folders of any depth below the root of a disk, or more than 1,000,000 files and folders.
+        It has more than 64 folders, or searches folders of any depth below the root of a disk, or would look at more than 1,000,000 files
+        and folders.
     """
     parts = Path(pattern).parts
     if len(parts) > _MOST_PARTS:
         raise PydanticCustomError(
             "pattern", f"has more than {_MOST_PARTS} folders; name the files from a folder nearer to them"
         )
-    first = next((k for k, part in enumerate(parts) if _WILDCARD.search(part)), len(parts))
-    wild = [part for part in parts[first:-1] if _WILDCARD.search(part)]
+    wild = [k for k, part in enumerate(parts) if _WILDCARD.search(part)]
     if "**" not in parts and len(wild) < 2:
         return
-    start = Path(os.path.realpath(folder.joinpath(*parts[:first])))
+    start = Path(os.path.realpath(folder.joinpath(*parts[: wild[0]])))
     advice = f"name the folder of the files before the first wildcard, for example {start / 'thermal' / '*.jpg'}"
-    if start == Path(start.anchor):
-        text = f"would search the whole disk {start}; {advice}"
+    if "**" in parts and start == Path(start.anchor):
+        text = f"would search folders of any depth (**) below {start}, the root of a disk; {advice}"
         raise PydanticCustomError("pattern", "{text}", {"text": text})
     searched = 0
-    for _, folders, files in os.walk(start):
-        searched += len(folders) + len(files)
+    for looked_at in _looked_at(start, parts[wild[0] :]):
+        searched += looked_at
         if searched > _MOST_SEARCHED:
             text = f"would search more than {_MOST_SEARCHED:,} files and folders in {start}; {advice}"
             raise PydanticCustomError("pattern", "{text}", {"text": text})
+
+
+def _looked_at(start: Path, parts: tuple[str, ...]) -> Iterator[int]:
+    """Number of entries of each folder that is listed for a pattern; a fault of the disk is left to what matches the files."""
+    for k, part in enumerate(parts):
+        if not _WILDCARD.search(part) or parts[k - 1 : k] == ("**",):  # Whose folders are counted already.
+            continue
+        before = parts[: k + 1] if part == "**" else parts[:k]
+        with contextlib.suppress(OSError):
+            for listed in start.glob("/".join(before) + "/") if before else [start]:
+                with contextlib.suppress(OSError):
+                    yield len(os.listdir(listed))  # noqa: PTH208 - names alone
