@@ -25,7 +25,7 @@ def found_in_folder(folder: Path) -> list[pn.viewable.Viewable]:
         A table of files and series, then a warning or a fault per file that has one, and per campaign file of a folder below.
     """
     looked_into = list(inspect_paths([folder]))
-    if not looked_into:
+    if [one.label for one in looked_into] == [str(folder)]:
         return [paragraph(f"{folder} holds no file; put the files of the measurement into it", kind="fault")]
     usable = [one for one in looked_into if not one.fault]
     parts = [heading("What was recognised", level=3)]
