@@ -64,8 +64,9 @@ def plot_drift(drift: xr.Dataset, deviations: xr.Dataset) -> Chart:
     )
     for rank, place in ((0, order[0]), (position.size - 1, order[-1])):
         _name_end(drawn, hours[:, place], lines[:, place], f"{position[place]:g} mm", colours[rank])
-    change = np.nanmean(lines[-1] - lines[0])
-    far = np.nanargmax(np.nanmax(np.abs(lines), axis=0))
+    courses = [line[np.isfinite(line)] for line in lines.T]
+    change = np.mean([course[-1] - course[0] for course in courses if course.size])
+    far = np.argmax([np.abs(course).max(initial=-1.0) for course in courses])
     seen = (
         f"Drift of {position.size} positions over {number(float(np.nanmax(hours)), 2)} h: {span_words(lines, 'µm')}; from the first to the "
         f"last cycle it changes by {number(float(change), 2)} µm on average, and the largest drift is at {position[far]:g} mm."

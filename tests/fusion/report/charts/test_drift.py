@@ -16,6 +16,7 @@ from fusion.report.charts.drift import (
     plot_profile,
     plot_reversal,
 )
+from fusion.report.wording import number
 
 
 @pytest.fixture
@@ -53,6 +54,17 @@ def test_drift_of_every_position(readings: tuple[xr.Dataset, xr.Dataset]) -> Non
     )
     assert chart.columns["cycle"].tolist() == [1, 1, 2, 2, 3, 3]
     np.testing.assert_allclose(chart.columns["95 % band ± / µm"], 0.2)
+
+
+def test_a_first_cycle_and_a_position_without_drift_are_left_out_of_the_sentence(
+    readings: tuple[xr.Dataset, xr.Dataset],
+) -> None:
+    drift, deviations = (one.copy(deep=True) for one in readings)
+    drift["drift"][{"cycle": 0}] = np.nan
+    drift["drift"][{"target": 1}] = np.nan
+    mean = drift["drift"].mean("direction")
+    change = float((mean.isel(cycle=-1) - mean.isel(cycle=1)).mean())
+    assert f"it changes by {number(change, 2)} µm on average" in plot_drift(drift, deviations).seen
 
 
 def test_profile_with_its_band(readings: tuple[xr.Dataset, xr.Dataset]) -> None:
