@@ -87,7 +87,7 @@ def run_campaign(
     scheduler : str, optional
         Address of a dask scheduler for the per-frame work.
     report : callable
-        ``report(label, done, total)``, for progress.
+        ``report(label, done, total)``, for progress; with `beside` it is called from another thread too.
     beside : Beside, optional
         Second process that takes a part of the work, from `fusion.beside.second_process`; left out: all is done in this one.
 

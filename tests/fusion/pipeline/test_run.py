@@ -149,6 +149,9 @@ def test_a_second_process_takes_its_part_and_changes_nothing(
     ]  # fmt: skip
     for name in ("results.json", "maps/cycle_0001.exr"):
         assert (tmp_path / "results" / name).read_bytes() == (results_folder / name).read_bytes()
+    for name in ("deviations.nc", ".stages/correlation.nc", ".stages/model.nc"):
+        with xr.open_datatree(tmp_path / "results" / name) as one, xr.open_datatree(results_folder / name) as other:
+            xr.testing.assert_equal(one, other)
     charts, same = (
         re.findall(r'id="figure-(\w+)"', (folder / "report.html").read_text())
         for folder in (tmp_path / "results", results_folder)
