@@ -24,6 +24,8 @@ from typing import IO, TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from threadpoolctl import threadpool_limits
 
+from thermography._processors import usable_processors
+
 if TYPE_CHECKING:
     from fusion.products.progress import Report
 
@@ -154,11 +156,6 @@ class _SecondProcess(Beside):
                 pipe.close()
 
 
-def _processors() -> int:
-    """Return how many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def collect_garbage_less() -> None:
     """Let a process that loads libraries and draws charts look for garbage seldom: the very many small objects that it makes are none.
 
@@ -195,7 +192,7 @@ def second_process(*, wanted: bool = True, libraries: Sequence[str] = _LIBRARIES
     ------
     Beside
     """
-    if not wanted or _processors() < 2:
+    if not wanted or usable_processors() < 2:
         yield InTurn()
         return
     command, environment = same_python()

@@ -39,7 +39,7 @@ def killed_elsewhere(here: int) -> int:
 @pytest.fixture(scope="module")
 def beside() -> Iterator[Beside]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fusion.beside._processors", lambda: 2)
+        patch.setattr("fusion.beside.usable_processors", lambda: 2)
         with second_process(libraries=["json"]) as second:
             yield second
 
@@ -79,7 +79,7 @@ def test_what_cannot_be_sent_is_done_here(beside: Beside) -> None:
 
 
 def test_work_of_a_process_that_has_ended_is_done_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fusion.beside._processors", lambda: 2)
+    monkeypatch.setattr("fusion.beside.usable_processors", lambda: 2)
     with second_process(libraries=[]) as second:
         first = second.start(partial(killed_elsewhere, os.getpid()))
         after = second.start(partial(math.sqrt, 9.0))
@@ -87,7 +87,7 @@ def test_work_of_a_process_that_has_ended_is_done_here(monkeypatch: pytest.Monke
 
 
 def test_a_single_processor_does_the_work_when_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fusion.beside._processors", lambda: 1)
+    monkeypatch.setattr("fusion.beside.usable_processors", lambda: 1)
     with second_process() as one, second_process(wanted=False) as other:
         assert isinstance(one, InTurn) and isinstance(other, InTurn)
         assert one.start(partial(counted, 1), lambda *_: None)() == os.getpid()
@@ -96,7 +96,7 @@ def test_a_single_processor_does_the_work_when_it_is_asked_for(monkeypatch: pyte
 def test_files_of_the_working_folder_are_no_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "queue.py").write_text("raise SystemExit('a file of the user was run')")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("fusion.beside._processors", lambda: 2)
+    monkeypatch.setattr("fusion.beside.usable_processors", lambda: 2)
     with second_process(libraries=[]) as second:
         assert second.start(os.getpid)() != os.getpid()
 
@@ -105,14 +105,14 @@ def test_where_no_process_can_be_started_the_work_is_done_here(monkeypatch: pyte
     def full(*_: object, **options: object) -> None:
         raise BlockingIOError("no more processes")
 
-    monkeypatch.setattr("fusion.beside._processors", lambda: 2)
+    monkeypatch.setattr("fusion.beside.usable_processors", lambda: 2)
     monkeypatch.setattr(subprocess, "Popen", full)
     with second_process() as none:
         assert none.start(os.getpid)() == os.getpid()
 
 
 def test_what_is_begun_after_the_end_is_done_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fusion.beside._processors", lambda: 2)
+    monkeypatch.setattr("fusion.beside.usable_processors", lambda: 2)
     with second_process(libraries=[]) as second:
         begun = second.start(partial(time.sleep, 0.01))
         second.end()
@@ -122,7 +122,7 @@ def test_what_is_begun_after_the_end_is_done_here(monkeypatch: pytest.MonkeyPatc
 def test_it_ends_with_the_first_process_even_in_the_middle_of_its_work() -> None:
     """A first process that is killed closes the pipe."""
     program = (
-        "import time; from functools import partial; import fusion.beside as b; b._processors = lambda: 2\n"
+        "import time; from functools import partial; import fusion.beside as b; b.usable_processors = lambda: 2\n"
         "with b.second_process(libraries=[]) as second:\n"
         "    second.start(partial(time.sleep, 60)); print(second._process.pid, flush=True); time.sleep(60)"
     )

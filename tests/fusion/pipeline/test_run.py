@@ -140,7 +140,7 @@ class Noting(Beside):
 def test_a_second_process_takes_its_part_and_changes_nothing(
     results_folder: Path, campaign_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fusion.beside._processors", lambda: 2)
+    monkeypatch.setattr("fusion.beside.usable_processors", lambda: 2)
     with second_process() as second:
         beside = Noting(second)
         run_campaign(campaign_folder / "campaign.toml", tmp_path / "results", beside=beside)

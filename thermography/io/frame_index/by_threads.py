@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
+from thermography._processors import usable_processors
 from thermography.io.window_reader import in_memory
 
 Item = TypeVar("Item")
@@ -24,8 +24,7 @@ _BATCH = 16
 
 def usable_threads() -> int:
     """Return the number of threads that compute: the cores that this process may use, up to `MOST_THREADS`."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, MOST_THREADS)
+    return min(usable_processors(), MOST_THREADS)
 
 
 def opening_threads(paths: Sequence[Path]) -> int:
