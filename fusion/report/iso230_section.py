@@ -85,22 +85,27 @@ def _positions_table(settled: xr.Dataset, position: xr.DataArray, unit: str) -> 
     spread = settled["standard_deviation"].values / np.sqrt(np.where(settled["count"] > 0, settled["count"], np.nan))
     places = decimals_of(float(np.nanmedian(spread)))
 
-    def shown(value: xr.DataArray) -> str:
-        return f"{float(value):.{places}f}".replace("-", "−") if np.isfinite(value) else "–"
+    def shown(value: float) -> str:
+        return f"{value:.{places}f}".replace("-", "−") if np.isfinite(value) else "–"
 
+    ordered = settled.sel(target=_along(position), direction=list(_ARROWS))
+    by_approach = {
+        name: ordered[name].transpose("target", "direction").values
+        for name in ("mean_unidirectional", "standard_deviation", "repeatability", "count")
+    }
+    of_target = [ordered[name].values for name in ("mean_bidirectional", "reversal", "repeatability_bidirectional")]
     rows = []
-    for target in _along(position):
-        row = settled.sel(target=target)
-        cells = [str(target), f"{float(position.sel(target=target)):g}"]
+    along = position.sel(target=ordered["target"])
+    for at, (target, place) in enumerate(zip(along["target"].values, along.values, strict=True)):
+        cells = [str(target), f"{place:g}"]
         for name in ("mean_unidirectional", "standard_deviation", "repeatability"):
-            cells += [shown(row[name].sel(direction=direction)) for direction in _ARROWS]
-        cells += [shown(row[name]) for name in ("mean_bidirectional", "reversal", "repeatability_bidirectional")]
-        counts = [str(int(row["count"].sel(direction=direction))) for direction in _ARROWS]
-        rows.append([*cells, ", ".join(counts)])
+            cells += [shown(value) for value in by_approach[name][at]]
+        cells += [shown(values[at]) for values in of_target]
+        rows.append([*cells, ", ".join(str(int(count)) for count in by_approach["count"][at])])
     titles = [f"{symbol}{arrow} / {unit}" for symbol in ("x̄", "s", "R") for arrow in _ARROWS.values()]
-    place = str(position.attrs.get("units", "mm"))
+    unit_along = str(position.attrs.get("units", "mm"))
     return table(
-        ["Target", f"Position / {place}", *titles, f"x̄ / {unit}", f"B_i / {unit}", f"R_i / {unit}", "n↑, n↓"], rows
+        ["Target", f"Position / {unit_along}", *titles, f"x̄ / {unit}", f"B_i / {unit}", f"R_i / {unit}", "n↑, n↓"], rows
     )
 
 

@@ -482,17 +482,23 @@ def _positions_table(deviations: xr.Dataset) -> Table:
     """Return profile, scatter and conventional standard deviation of every position and approach."""
     drift, conventional = group(deviations, "drift"), group(deviations, "conventional")
     decimals = {name: decimals_of(float(drift[f"{name}_u"].median())) for name in ("profile", "scatter")}
+    targets = deviations["target"].values
+    laid = {name: _by_approach(drift[name], target=targets) for key in decimals for name in (key, f"{key}_u")}
+    s = _by_approach(conventional["standard_deviation"], target=targets)
     rows = []
-    for target in deviations["target"].values:
-        row = [str(target), f"{float(deviations['position'].sel(target=target)):g}"]
+    for at, (target, position_mm) in enumerate(zip(targets, deviations["position"].values, strict=True)):
+        row = [str(target), f"{position_mm:g}"]
         for name, places in decimals.items():
-            for direction in _SIGNS:
-                value, u = (drift[key].sel(target=target, direction=direction) for key in (name, f"{name}_u"))
-                row.append(measured(float(value), float(u), decimals=places))
-        s = conventional["standard_deviation"].sel(target=target)
-        rows.append([*row, *(f"{float(s.sel(direction=direction)):.2f}" for direction in _SIGNS)])
+            both = zip(laid[name][at], laid[f"{name}_u"][at], strict=True)
+            row += [measured(float(value), float(u), decimals=places) for value, u in both]
+        rows.append([*row, *(f"{value:.2f}" for value in s[at])])
     quantities = ("Profile", "Scatter s", "Conventional s")
     return table(["Position", "mm", *(f"{name} {sign} / µm" for name in quantities for sign in _SIGNS.values())], rows)
+
+
+def _by_approach(variable: xr.DataArray, **places: np.ndarray) -> np.ndarray:
+    """Return the values at places of one dimension, by place and approach."""
+    return variable.sel({**places, "direction": list(_SIGNS)}).transpose(*places, "direction").values
 
 
 def _comparison_table(deviations: xr.Dataset) -> Table:
@@ -505,16 +511,10 @@ def _comparison_table(deviations: xr.Dataset) -> Table:
         "joint": "Joint estimate s {} / µm",
     }
     columns = [name for name in headings if name in comparison]
+    links = comparison["link"].values
+    values = np.stack([_by_approach(comparison[name], link=links) for name in columns], axis=-1)
     rows = [
-        [
-            str(link),
-            *(
-                f"{float(comparison[name].sel(link=link, direction=direction)):.2f}"
-                for direction in _SIGNS
-                for name in columns
-            ),
-        ]
-        for link in comparison["link"].values
+        [str(link), *(f"{value:.2f}" for value in of_link.ravel())] for link, of_link in zip(links, values, strict=True)
     ]
     return table(["Position", *(headings[name].format(sign) for sign in _SIGNS.values() for name in columns)], rows)
 
