@@ -19,7 +19,7 @@ from typing import Any
 import filelock
 
 from fusion.products.store import OutputError, is_text, write_json
-from thermography.io.atomic import PARTIAL, partial_path
+from thermography.io.atomic import PARTIAL, finished_path
 
 MANIFEST = "manifest.json"
 _STAGES = ".stages"
@@ -235,8 +235,11 @@ def _holder_words(folder: Path) -> str:
 
 def _remove_leftovers(folder: Path) -> None:
     """Remove what an interrupted write left: under the temporary names of the manifest's files, and in the folder of the stages."""
-    for name in (MANIFEST, *read_manifest(folder)):
-        partial_path(folder / name).unlink(missing_ok=True)
+    written = {folder / name for name in (MANIFEST, *read_manifest(folder))}
+    for parent in {path.parent for path in written}:
+        for leftover in parent.glob(f".*{PARTIAL}*"):
+            if finished_path(leftover) in written:
+                leftover.unlink()
     for leftover in (folder / _STAGES).rglob(f"*{PARTIAL}*"):
         leftover.unlink()
 

@@ -144,8 +144,8 @@ def _require_room(path: Path, most_bytes: int) -> None:
 
     `most_bytes` is what the values take without compression; the file's own tables are less than a tenth and a megabyte more.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    needed, free = int(1.1 * most_bytes) + 1_000_000, shutil.disk_usage(path.parent).free
+    folder = next(folder for folder in path.absolute().parents if folder.exists())
+    needed, free = int(1.1 * most_bytes) + 1_000_000, shutil.disk_usage(folder).free
     if free < needed:
         raise OutputError(
             f"{path}: may take {needed / 1e6:.0f} MB, and the disk has {free / 1e6:.0f} MB left; what was written before is whole: make "

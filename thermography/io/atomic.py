@@ -3,22 +3,42 @@
 from __future__ import annotations
 
 import os
+import re
+import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
-#: Stands before the suffix of a file that is being written.
+#: Stands before the suffix of a file that is being written, followed by a number.
 PARTIAL = ".partial"
+_PARTIAL_NAME = re.compile(rf"\.(?P<stem>.+){re.escape(PARTIAL)}\d*(?P<suffix>(?:\.[^.]*)?)")
 
 
 def partial_path(path: Path) -> Path:
-    """Return the temporary name under which a file is written: hidden, so that no pattern takes it for the file.
+    """Return the temporary name under which this thread writes a file: hidden, so that no pattern takes it for the file.
 
     Parameters
     ----------
     path : Path
         The file; its suffix is kept, as some libraries choose the format by it.
+
+    Notes
+    -----
+    The number of the thread, which no other of the machine has at the time, keeps apart two processes that write the same file.
     """
-    return path.with_name(f".{path.stem}{PARTIAL}{path.suffix}")
+    return path.with_name(f".{path.stem}{PARTIAL}{threading.get_native_id()}{path.suffix}")
+
+
+def finished_path(partial: Path) -> Path | None:
+    """Return the file that is, or was, written under a temporary name, by any thread; None for another name.
+
+    Parameters
+    ----------
+    partial : Path
+        Any file.
+    """
+    name = _PARTIAL_NAME.fullmatch(partial.name)
+    return partial.with_name(f"{name['stem']}{name['suffix']}") if name else None
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
@@ -41,7 +61,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
     Raises
     ------
     OSError
-        If the folder cannot be written to or the disk is full; no temporary file is left.
+        If the folder cannot be written to or the disk is full; no temporary file is left, nor a folder that was created for it.
 
     Examples
     --------
@@ -50,17 +70,21 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
     >>> write_atomically(path, lambda temporary: temporary.write_text("whole")).read_text()
     'whole'
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    absent = [folder for folder in path.parents if not folder.exists()]
     temporary = partial_path(path)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         write(temporary)
         _bring_to_disk(temporary, os.O_RDWR)
         temporary.replace(path)
         # The new name is on the disk once the folder is. Windows does not open folders; NTFS keeps a journal of names.
         if os.name == "posix":
             _bring_to_disk(path.parent, os.O_RDONLY)
-    finally:
-        temporary.unlink(missing_ok=True)
+    except BaseException:
+        for remove in (temporary.unlink, *(folder.rmdir for folder in absent)):
+            with suppress(OSError):
+                remove()
+        raise
     return path
 
 

@@ -22,7 +22,9 @@ def test_a_folder_with_content_is_refused_unless_a_run_in_it_goes_on(tmp_path: P
         claim(folder, "results.json", "maps/cycle_0001.exr")
         write_text(folder / "results.json", "{}")
     (folder / "maps").mkdir()
-    (folder / "maps" / ".cycle_0001.partial.exr").touch()
+    for number in ("", "4711"):
+        (folder / "maps" / f".cycle_0001.partial{number}.exr").touch()
+    (folder / "maps" / ".cycle_0002.partial4711.exr").touch()
     (folder / "my.partial.notes").touch()
     with pytest.raises(OutputError) as error, open_folder(folder, resume=False):
         pass
@@ -31,7 +33,8 @@ def test_a_folder_with_content_is_refused_unless_a_run_in_it_goes_on(tmp_path: P
     )
     with open_folder(folder, resume=True):
         pass
-    assert not (folder / "maps" / ".cycle_0001.partial.exr").exists(), "left by an interrupted write"
+    left = [path.name for path in (folder / "maps").iterdir()]
+    assert left == [".cycle_0002.partial4711.exr"], "what an interrupted write left of this run, and nothing else"
     assert (folder / "my.partial.notes").exists(), "the user's own"
     with (
         pytest.raises(OutputError, match=r"is a file; name a folder for the results with --out"),
