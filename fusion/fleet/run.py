@@ -22,6 +22,7 @@ from fusion.fleet.summary import SUMMARY, Row, as_csv, as_json, read_rows, with_
 from fusion.products.folder import claim, open_folder
 from fusion.products.progress import Report, silent
 from fusion.products.store import write_json, write_text
+from thermography._processors import usable_processors
 
 #: Memory that a run is taken to need until one has been seen, bytes.
 _USUAL_BYTES = 1e9
@@ -79,7 +80,7 @@ def run_fleet(
     out : Path
         Folder for the summary and, under its name, the results of every campaign; must be empty or absent unless `resume`.
     jobs : int, optional
-        Most runs at a time; left out: one per processor. Fewer are started while memory is short.
+        Most runs at a time; left out: one per processor that this process may use. Fewer are started while memory is short.
     resume : bool
         Keep campaigns that are finished and have not changed, and continue the others.
     report : callable
@@ -104,7 +105,7 @@ def run_fleet(
     """
     with open_folder(out, resume=resume):
         claim(out, SUMMARY, _TABLE, _PAGE)
-        return _Fleet(members, out, jobs or os.cpu_count() or 1, resume, report, say).run()
+        return _Fleet(members, out, jobs or usable_processors(), resume, report, say).run()
 
 
 class _Fleet:
@@ -181,7 +182,7 @@ class _Fleet:
         command += ["--processes", "1"]
         if self.resume and folder.is_dir():
             command.append("--resume")
-        threads = str(max((os.cpu_count() or 1) // self.jobs, 1))
+        threads = str(max(usable_processors() // self.jobs, 1))
         environment = dict.fromkeys(_THREAD_VARIABLES, threads) | inherited | {"PYTHONUNBUFFERED": "1"}
         with self.starting:
             if self.stopped:

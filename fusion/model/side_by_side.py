@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
+
+from thermography._processors import usable_processors
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -35,7 +36,7 @@ def side_by_side(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     Exception
         What a call raises, in the place of its result.
     """
-    threads = min(_THREADS, os.cpu_count() or 1)
+    threads = min(_THREADS, usable_processors())
     with ThreadPoolExecutor(threads, "side by side") as pool:
         waiting: deque[Future[R]] = deque()
         for item in items:
