@@ -12,7 +12,7 @@ import numpy as np
 from thermography.errors import ThermographyError
 from thermography.io.flir import FlirFrameReference, FlirReader, index_frames, read_frame
 from thermography.io.frame import CameraParameters, FlirFormatError, Frame, FrameReference, RejectedFrame
-from thermography.io.frame_readers import find_reader
+from thermography.io.frame_readers import START_BYTES, find_reader, plug_ins
 from thermography.io.temperature_frames import StackOptions, TemperatureReader
 from thermography.radiometry.planck import (
     ZERO_CELSIUS_K,
@@ -116,7 +116,7 @@ class FlirInspection:
 
 
 def is_flir_file(path: Path) -> bool:
-    """Return whether a file starts as a JPEG or an FFF record.
+    """Return whether a run reads a file as one of FLIR: it starts as a JPEG or an FFF record, and no plug-in recognises it.
 
     Parameters
     ----------
@@ -127,10 +127,15 @@ def is_flir_file(path: Path) -> bool:
     -------
     bool
         True for the first bytes of a JPEG or an FFF record; a JPEG need not be radiometric.
+
+    Raises
+    ------
+    FrameReaderError
+        A plug-in cannot be used.
     """
     with Path(path).open("rb") as file:
-        start = file.read(4)
-    return FlirReader().recognises(path, start)
+        start = file.read(START_BYTES)
+    return FlirReader().recognises(path, start) and not any(reader.recognises(path, start) for reader in plug_ins())
 
 
 def inspect_file(path: Path) -> FlirInspection:

@@ -35,6 +35,7 @@ from fusion.campaign.sources import (
     usual_window_s,
 )
 from fusion.campaign.time_zones import bring_to_utc, refuse_mixed_zones
+from fusion.campaign.value_types import matching_pipes
 from fusion.errors import FusionError
 from fusion.products.contracts import check
 from fusion.products.notices import counted, left_out_notices, listed
@@ -346,6 +347,7 @@ def _camera_notices(source: CameraInputs) -> list[Notice]:
     _raise_if_regions_unusable(source)
     return [
         *frames_notices(source.frames_rejected),
+        *pipe_notices(source.campaign),
         *_remark_notices(source.frames),
         *camera_accuracy_notices(source.thermography, source.frames),
     ]
@@ -534,6 +536,33 @@ def frames_notices(rejected: Sequence[Mapping[str, Any]], code: str = "frames_re
             else "Copy damaged files again from the camera; a gap in the frames only widens the interpolation between its neighbours.",
         )
     ]
+
+
+def pipe_notices(campaign: Campaign) -> list[Notice]:
+    """Return one notice that counts what patterns of the campaign file match and no run reads: pipes, sockets and devices.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        With frames, a record or neither.
+    """
+    patterns = {
+        "thermography.frames": () if campaign.thermography is None else campaign.thermography.frames,
+        "record.files": () if campaign.record is None else campaign.record.files,
+    }
+    notices = []
+    for key, named in patterns.items():
+        pipes = sorted({path for pattern in named for path in matching_pipes(campaign.folder, pattern)})
+        if pipes:
+            what = (
+                "1 pipe, socket or device, which is"
+                if len(pipes) == 1
+                else f"{len(pipes)} pipes, sockets or devices, which are"
+            )
+            names = listed(relative_name(path, campaign.folder) for path in pipes)
+            remedy = f"Write a pattern in {key} that matches measured files alone, or move away what is none."
+            notices.append(Notice("pipes_left_out", f"{key} also matches {what} left out: {names}.", remedy))
+    return notices
 
 
 def _remark_notices(frames: Sequence[FrameReference]) -> list[Notice]:

@@ -180,21 +180,40 @@ def matching_files(folder: Path, pattern: str) -> list[Path]:
     pattern : str
         As `pathlib.Path.glob` takes it, relative or absolute.
     """
-    given = Path(pattern)
-    found = Path(given.anchor).glob(str(given.relative_to(given.anchor))) if given.anchor else folder.glob(pattern)
-    try:
-        there = [path for path in found if path.is_file() or (path.is_symlink() and not path.exists())]
-    except OSError as error:
-        if error.errno == errno.ENAMETOOLONG:
-            return []
-        raise
-    if given.anchor:
+    there = [path for path in _matches(folder, pattern) if path.is_file() or (path.is_symlink() and not path.exists())]
+    if Path(pattern).anchor:
         return there
     real = {place: place.resolve() for place in {path.parent for path in there}}
     return [
         real[path.parent] / path.name if not path.is_symlink() else path.resolve() if path.exists() else path
         for path in there
     ]
+
+
+def matching_pipes(folder: Path, pattern: str) -> list[Path]:
+    """Return the pipes, sockets and devices that a pattern matches, none of which is ever opened.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the campaign file, from which relative patterns start.
+    pattern : str
+        As `matching_files` takes it.
+    """
+    return [path for path in _matches(folder, pattern) if path.exists() and not (path.is_file() or path.is_dir())]
+
+
+def _matches(folder: Path, pattern: str) -> list[Path]:
+    """Return all that a pattern matches, folders too; nothing where it is too long for a name."""
+    given = Path(pattern)
+    try:
+        return list(
+            Path(given.anchor).glob(str(given.relative_to(given.anchor))) if given.anchor else folder.glob(pattern)
+        )
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            return []
+        raise
 
 
 def check_pattern(folder: Path, pattern: str) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from fusion.campaign.config import Campaign
+from fusion.campaign.inputs import pipe_notices
 from fusion.campaign.record_runs import read_record
 from fusion.effects.thermal import QUASI_STATIC
 from fusion.products.notices import counted, left_out_notices, listed
@@ -50,7 +51,7 @@ def read_source(campaign: Campaign) -> RecordSource:
     health = examine_record(table, declared)
     record = reduce_record(health.table)
     declare(declared, record)
-    left_out = left_out_notices(table, "record_rows_left_out")
+    left_out = [*pipe_notices(campaign), *left_out_notices(table, "record_rows_left_out")]
     return RecordSource(
         record, declared, [*sensor_notices(health), *notices, *left_out, *record_notices(record)], health
     )

@@ -31,7 +31,7 @@ class FolderContent:
     files : dict of Kind to tuple of Recognised
         All other files that are understood.
     unknown : tuple of Recognised
-        Files that are not, and links whose file is gone.
+        Files that are not, links whose file is gone, pipes, sockets and devices.
     of_temperatures : bool
         Whether the frames hold temperatures of another camera and not FLIR counts.
     """
@@ -105,7 +105,7 @@ def _patterns(folder: Path, frames: list[Path], paths: list[Path]) -> list[str]:
 def input_files(folder: Path) -> Iterator[Path]:
     """Yield the files of a folder and its subfolders, sorted, without hidden ones and without results of a run.
 
-    A link whose file is gone is among them, so that it is missed.
+    A link whose file is gone, a pipe, a socket or a device is among them, so that it is missed.
 
     Parameters
     ----------
@@ -125,5 +125,5 @@ def _files_below(folder: Path, seen: set[Path]) -> Iterator[Path]:
         if path.is_dir():
             if not any((path / name).is_file() for name in _RESULTS):
                 yield from _files_below(path, seen)
-        elif path.is_file() or (path.is_symlink() and not path.exists()):
+        else:
             yield path

@@ -152,8 +152,6 @@ def _is_thermal(path: Path) -> bool:
 def _inspect(path: Path, *, named: bool) -> Inspected:
     """Look into one file."""
     kind = Kind.UNKNOWN
-    if path.exists() and not path.is_file():
-        return Inspected(str(path), Kind.UNREADABLE, fault="is a pipe, a socket or a device; name a file", named=named)
     try:
         found = recognise(path)
         kind = found.kind

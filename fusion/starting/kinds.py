@@ -93,6 +93,8 @@ def recognise(path: Path) -> Recognised:
     """
     if path.is_symlink() and not path.exists():
         return Recognised(path, Kind.UNREADABLE, f"a link to {path.readlink()}, where there is no file")
+    if path.exists() and not path.is_file():
+        return Recognised(path, Kind.UNREADABLE, "is a pipe, a socket or a device; name a file")
     if path.suffix.lower() == ".toml":
         return _toml(path)
     if is_flir_file(path):
@@ -101,6 +103,9 @@ def recognise(path: Path) -> Recognised:
     reader = find_reader(path)
     if isinstance(reader, TemperatureReader) and not isinstance(reader, TextReader):
         return Recognised(path, Kind.STACK)
+    if reader is not None and not isinstance(reader, TextReader):
+        reason = f"counts that the plug-in {reader.name} reads; name the files in thermography.frames, a run tells what they hold"
+        return Recognised(path, Kind.UNKNOWN, reason)
     text = _text_start(path)
     if text is not None and ("camera_matrix" in text or "cameraMatrix" in text):
         return Recognised(path, Kind.LENS)

@@ -65,16 +65,14 @@ class FrameReaderError(ThermographyError):
 
 
 @cache
-def readers() -> tuple[FrameReader, ...]:
-    """Return all readers, plug-ins first.
+def plug_ins() -> tuple[FrameReader, ...]:
+    """Return the readers that other installed distributions add.
 
     Raises
     ------
     FrameReaderError
         A plug-in cannot be imported or does not keep the protocol.
     """
-    from thermography.io.array_frames import NetcdfReader, NumpyReader, TiffReader  # FLIR files are read without them
-
     found: list[FrameReader] = []
     for entry in entry_points(group=ENTRY_POINT_GROUP):
         try:
@@ -88,7 +86,21 @@ def readers() -> tuple[FrameReader, ...]:
                 f"the plug-in {entry.name} = {entry.value} lacks name, recognises or index; it must keep FrameReader"
             )
         found.append(reader)
-    return (*found, FlirReader(), TiffReader(), NumpyReader(), NetcdfReader(), TextReader())
+    return tuple(found)
+
+
+@cache
+def readers() -> tuple[FrameReader, ...]:
+    """Return all readers, plug-ins first.
+
+    Raises
+    ------
+    FrameReaderError
+        A plug-in cannot be used.
+    """
+    from thermography.io.array_frames import NetcdfReader, NumpyReader, TiffReader  # FLIR files are read without them
+
+    return (*plug_ins(), FlirReader(), TiffReader(), NumpyReader(), NetcdfReader(), TextReader())
 
 
 def find_reader(path: Path) -> FrameReader | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -36,6 +37,7 @@ def test_damaged_frames_and_lines_are_left_out_by_name(copied: Path) -> None:
     frames[3].write_bytes(frames[3].read_bytes()[:5000])
     frames[5].write_bytes(b"\xff\xd8\xff\xe0no radiometric data\xff\xd9")
     shutil.copy(frames[7], frames[7].with_name("copy_of_a_frame.jpg"))
+    os.mkfifo(frames[0].with_name("live.jpg"))
     lines = (copied / "laser.csv").read_text().splitlines()
     lines[10] = lines[10].rsplit(",", 1)[0] + ",abc"
     lines[20] = lines[20].replace("positive", "upward").replace("negative", "upward")
@@ -49,6 +51,9 @@ def test_damaged_frames_and_lines_are_left_out_by_name(copied: Path) -> None:
     messages = {notice.code: notice.message for notice in source.notices}
     assert messages["frames_rejected"].startswith("3 frames left out: ")
     assert str(copied) not in messages["frames_rejected"]
+    assert messages["pipes_left_out"] == (
+        "thermography.frames also matches 1 pipe, socket or device, which is left out: thermal/live.jpg."
+    )
     assert "2 lines of laser.csv left out: line 11 ('abc' is not a number)" in messages["readings_left_out"]
     assert "line 21 ('upward'" in messages["readings_left_out"]
     outcome = evaluate_interferometry(source)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fusion.campaign.config import CampaignError, load_campaign
+from fusion.campaign.inputs import pipe_notices
 from fusion.campaign.logged_tables import TableError
 from fusion.campaign.record_runs import read_record
 
@@ -53,6 +55,15 @@ def test_runs_are_joined_in_the_order_of_their_times(tmp_path: Path) -> None:
     assert data["run"].values.tolist() == [0] * 3 + [1] * 3 + [2] * 3
     assert json.loads(data.attrs["test"]) == [2]
     assert (np.diff(data["time"].values) > np.timedelta64(0)).all()
+
+
+def test_a_pipe_among_the_runs_is_left_out_and_named(tmp_path: Path) -> None:
+    campaign = load_campaign(write_runs(tmp_path, 'files = "r*.csv"', r1=stamped(9), r2=stamped(7)))
+    assert pipe_notices(campaign) == []
+    os.mkfifo(tmp_path / "r3.csv")
+    assert json.loads(read_record(campaign).attrs["runs"]) == ["r2.csv", "r1.csv"]
+    (notice,) = pipe_notices(campaign)
+    assert notice.message == "record.files also matches 1 pipe, socket or device, which is left out: r3.csv."
 
 
 def test_runs_that_count_from_their_own_zero_follow_the_order_of_the_files(tmp_path: Path) -> None:

@@ -107,6 +107,17 @@ def test_a_relative_pattern_names_files_where_they_are(tmp_path: Path) -> None:
     ]
 
 
+def test_pipes_and_sockets_that_a_pattern_matches_are_told_apart_from_files(tmp_path: Path) -> None:
+    (tmp_path / "1.jpg").touch()
+    (tmp_path / "2.jpg").symlink_to("gone.jpg")
+    (tmp_path / "folder.jpg").mkdir()
+    os.mkfifo(tmp_path / "3.jpg")
+    (tmp_path / "4.jpg").symlink_to("/dev/null")
+    assert sorted(value_types.matching_pipes(tmp_path, "*.jpg")) == [tmp_path / "3.jpg", tmp_path / "4.jpg"]
+    assert sorted(value_types.matching_files(tmp_path, "*.jpg")) == [tmp_path / "1.jpg", tmp_path / "2.jpg"]
+    assert value_types.matching_pipes(tmp_path, f"{'x' * 300}*") == []
+
+
 def test_what_is_no_file_is_told(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "laser.csv")
     (tmp_path / "kernel.csv").symlink_to("/proc/kmsg")

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from fusion.products.store import OutputError
+from fusion.starting.folder import scan_folder
 from fusion.starting.inspection import inspect_paths, write_thumbnails
 from fusion.starting.kinds import Kind
 
@@ -72,6 +73,9 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(pipe)
     (found,) = inspect_paths([pipe])
     assert found.kind is Kind.UNREADABLE and found.fails and "name a file" in found.fault
+    (in_folder,) = inspect_paths([tmp_path])
+    assert in_folder.fails and in_folder.fault == found.fault, "what stands in a folder is named as well"
+    assert [one.path for one in scan_folder(tmp_path).unknown] == [pipe]
 
 
 def test_a_folder_without_files_is_told(tmp_path: Path) -> None:

@@ -11,6 +11,53 @@ import pytest
 
 from fusion.starting.describe import describe_file
 from fusion.starting.kinds import Kind, column_unit, is_displacement, is_temperature, is_time, recognise
+from tests.thermography.flir_mutations import frame
+from thermography import inspection
+from thermography.io import frame_readers
+from thermography.io.flir import FlirReader
+from thermography.io.flir_writer import write_sequence
+from thermography.io.temperature_frames import StackContents, StackOptions, TemperatureReader
+
+
+class OwnReader(TemperatureReader):
+    """A plug-in for files that the FLIR reader would take too."""
+
+    name = "own"
+
+    def recognises(self, path: Path, start: bytes) -> bool:
+        return path.suffix == ".own"
+
+    def contents(self, path: Path, options: StackOptions) -> StackContents:
+        return StackContents(1, (2, 3), "degC")
+
+    def read_values(self, path: Path, index: int, options: StackOptions) -> np.ndarray:
+        return np.ones((2, 3))
+
+
+class OwnCounts(FlirReader):
+    """A plug-in for counts."""
+
+    name = "own counts"
+
+    def recognises(self, path: Path, start: bytes) -> bool:
+        return path.suffix == ".own"
+
+
+@pytest.mark.parametrize("reader", [OwnReader(), OwnCounts()])
+def test_plug_ins_are_asked_before_the_reader_of_flir_files_as_in_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reader: TemperatureReader | FlirReader
+) -> None:
+    for name in ("a.own", "b.seq"):
+        write_sequence(tmp_path / name, [frame(6, 8, seconds=0)])
+    for module in (frame_readers, inspection):
+        monkeypatch.setattr(module, "plug_ins", lambda: (reader,))
+    monkeypatch.setattr(frame_readers, "readers", lambda: (reader, FlirReader()))
+    assert recognise(tmp_path / "b.seq").kind is Kind.FRAMES
+    own = recognise(tmp_path / "a.own")
+    if isinstance(reader, TemperatureReader):
+        assert own.kind is Kind.STACK and describe_file(own)[0].endswith("a.own: own, 1 frame of 3 x 2")
+    else:
+        assert own.kind is Kind.UNKNOWN and own.reason.startswith("counts that the plug-in own counts reads; name the")
 
 
 @pytest.mark.parametrize(

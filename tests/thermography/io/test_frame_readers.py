@@ -18,7 +18,7 @@ from thermography.io import frame_readers
 from thermography.io.flir import FlirReader
 from thermography.io.flir_writer import write_jpeg
 from thermography.io.frame import FrameReference, RejectedFrame
-from thermography.io.frame_readers import FrameReaderError, find_reader, index_recordings, readers
+from thermography.io.frame_readers import FrameReaderError, find_reader, index_recordings, plug_ins, readers
 from thermography.io.temperature_frames import StackContents, StackError, StackOptions, TemperatureReader
 
 IMAGE = 20.0 + np.arange(12 * 16).reshape(12, 16) / 10.0
@@ -63,9 +63,11 @@ class Unusable:
 
 @pytest.fixture
 def plug_in(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
-    readers.cache_clear()
+    for cached in (readers, plug_ins):
+        cached.cache_clear()
     yield monkeypatch
-    readers.cache_clear()
+    for cached in (readers, plug_ins):
+        cached.cache_clear()
 
 
 def named(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
