@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test docs screenshots soak benchmarks lint mutants audit lock kernels clean
+.PHONY: demo test docs screenshots soak benchmarks speeds lint mutants audit lock kernels clean
 
 $(VENV)/.run: pyproject.toml constraints.txt
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" || { echo "thermofuse needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python3.12"; exit 1; }
@@ -51,6 +51,11 @@ soak: $(VENV)/.test
 # Speeds, as ratios against named peers measured in the same run.
 benchmarks: $(VENV)/.test
 	$(BIN)/pytest tests/benchmarks -m "slow or not slow" --benchmark-enable -s
+
+# The same of an earlier state beside today's, with the times of the commands, as one table: make speeds BEFORE=<commit> (half an hour).
+speeds: $(VENV)/.test
+	rm -rf build/before && mkdir -p build/before && git archive $(BEFORE) | tar -x -C build/before
+	$(BIN)/python tests/benchmarks/beside_earlier.py build/before
 
 # Share of small changes to a module (signs, limits, comparisons) that its tests notice, on a copy of what is staged or committed; fails
 # below 90 %. A sample takes some minutes: make mutants MODULE=fusion/attribution/two_sessions.py SAMPLE=60 SEED=2; SAMPLE=0 takes every change.
