@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -45,6 +46,25 @@ def test_pattern_explains_itself_and_noise_does_not(switching, rng):
     assert switching.share_of(switching.series[:, None]) == pytest.approx(1.0, abs=0.01)
     # one column of 1,900 readings explains 1 / 1,900 of anything by chance
     assert switching.share_of(rng.standard_normal((switching.series.size, 1))) < 0.01
+
+
+def test_the_noise_is_tested_in_units_of_its_own_and_each_site_alike(monkeypatch):
+    readings = readings_of(seed=5)
+    fit = fit_model(
+        readings, [Term(name, next(iter(library()[name].candidates(readings, {}, None)))) for name in DECLARED]
+    ).fit
+    seen, statistics = [], module._statistics
+    monkeypatch.setattr(module, "_statistics", lambda *given: seen.append(given) or statistics(*given))
+    remainder = examine(readings, fit, np.random.default_rng(1))
+    # The null is made first; the residual itself is the last that is looked at.
+    matrix, signs, place = seen[-1]
+    noise, share = fit.noise()
+    for k in (0, 1, matrix.shape[1] - 1):
+        at = (readings.target == remainder.sites[k][0]) & ((readings.sign > 0) == (remainder.sites[k][1] == "positive"))
+        standard = (noise / np.sqrt(share) / fit.sigma)[at].clip(-4.0, 4.0)
+        np.testing.assert_allclose(matrix[:, k], (standard - standard.mean()) / standard.std(), atol=1e-9)
+        assert place[k] == pytest.approx(readings.share[at][0])
+    assert signs.tolist() == [1.0 if direction == "positive" else -1.0 for _, direction in remainder.sites]
 
 
 def test_sites_that_are_set_aside_are_not_tested():
@@ -141,6 +161,7 @@ SITES = [(target, direction) for target in (1, 2, 3, 7) for direction in ("posit
     [
         ([1.0, 0.9, 0.8, 0.9, 0.7, 0.6, 0.9, 0.8], "targets 1-3, 7, both directions"),
         ([1.0, -0.9, 0.8, -0.9, 0.7, -0.6, 0.2, -0.1], "targets 1-3, opposite in both directions"),
+        ([-0.9, 1.0, -0.9, 0.8, -0.6, 0.7, -0.1, 0.2], "targets 1-3, opposite in both directions"),
         ([0.1, 1.0, 0.2, 0.3, 0.1, 0.0, 0.2, 0.6], "targets 1, 7, negative direction only"),
         ([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.9], "target 7, both directions"),
         (
@@ -171,6 +192,23 @@ def test_a_drift_counts_from_half_the_noise_of_a_reading_on(monkeypatch, order, 
     np.testing.assert_allclose(found.free(np.ones((4, 1))), 0.0, atol=1e-12)
     monkeypatch.setattr(module, "unexplained_drift", lambda fit: (drift / 1.1, basis))
     assert module.with_drift(remainder, fit) is remainder
+
+
+def test_a_drift_of_several_channels_is_told_by_its_number(monkeypatch):
+    drift = np.outer([1.0, -1.0, 1.0, -1.0], [0.1, 0.2, 3.0])
+    monkeypatch.setattr(module, "unexplained_drift", lambda fit: (drift, np.zeros((4, 1))))
+    nothing = Remainder(0.5, {}, "", 0.0, np.arange(2), np.zeros(2), [], np.zeros(0), np.zeros(4), lambda given: given)
+    found = module.with_drift(nothing, SimpleNamespace(sigma=2.0, system=SimpleNamespace(order=1)))
+    assert found.shape.endswith("; channel 3, both directions")
+
+
+def test_a_shape_is_tested_below_the_level_alone():
+    shown = Remainder(
+        LEVEL, {}, "one step", 1.0, np.arange(2), np.zeros(2), [], np.zeros(0), np.zeros(4), lambda given: given
+    )
+    assert not shown.is_tested
+    assert replace(shown, p_value=0.99 * LEVEL).is_tested
+    assert not replace(shown, p_value=0.0, shape="").is_tested
 
 
 def test_a_column_explains_the_share_of_what_it_fits_beside_the_model():
