@@ -283,3 +283,44 @@ def test_one_outlier_is_marked_from_its_percentage_point_on() -> None:
         x = np.sqrt((nine**2).sum() * deviate**2 / 9.0 / (0.81 - 0.1 * deviate**2))
         found = generalised_esd(np.append(nine, x), most=1, high_only=True)
         assert found.tolist() == [False] * 9 + [marked]
+
+
+def test_how_large_a_motion_is() -> None:
+    """In units of the scatter of one direction, or of a mean of both; a slow one without what noise leaves in means of blocks."""
+    estimated = xr.Dataset(
+        {
+            "scatter": (("direction", "target"), [[0.5, 1.0], [0.7, 1.0]]),
+            "scatter_position": ("target", [0.6, 1.0]),
+        },
+        coords={"cycle": np.arange(101, 141), "direction": ["positive", "negative"], "target": [4, 9]},
+    )
+    block = anomalies_module.BLOCK_CYCLES
+    series = np.resize(np.repeat([3.0, -3.0], block), 8 * block)
+    noise = np.resize([1.0, -1.0], 8 * block)
+    step = np.where(np.arange(40) < 13, -1.5, 2.5)
+    periodogram = anomalies_module._Periodogram(600.0 * np.arange(40.0))
+
+    def described(kind: str, row: np.ndarray, direction: str) -> Anomaly:
+        return anomalies_module._describe_series(estimated, kind, _Series(0, direction), row, (0.01, True), periodogram)
+
+    slow = described("slow", series, "positive")
+    assert slow.extra_um == pytest.approx(3.0 * np.sqrt(1.0 - 1.0 / block) * 0.5)
+    assert (slow.target, slow.scatter_um, slow.at_cycle, slow.period_s) == (4, 0.5, None, None)
+    assert described("slow", series, "both").extra_um == pytest.approx(slow.extra_um / 0.5 * 0.6 / np.sqrt(2.0))
+    assert described("slow", noise, "positive").extra_um == 0.0
+    shifted = described("step", step, "negative")
+    assert (shifted.extra_um, shifted.at_cycle) == (pytest.approx(4.0 * 0.7), 114)
+
+
+def test_the_direction_of_an_excess_is_told_by_the_scatter_of_the_other_positions() -> None:
+    """Positive approaches scatter by 2 um everywhere; negative ones by 0.5 um, and by 2 um at the first position."""
+    estimated = xr.Dataset(
+        {
+            "scatter": (("direction", "target"), [[2.0] * 4, [2.0, 0.5, 0.5, 0.5]]),
+            "scatter_freedom": (("direction", "target"), np.full((2, 4), 50.0)),
+        },
+        coords={"direction": ["positive", "negative"]},
+    )
+    assert _scatter_direction(estimated, 0, np.arange(1, 4)) == "negative"
+    estimated["scatter"][0, 0] = 8.0
+    assert _scatter_direction(estimated, 0, np.arange(1, 4)) == "both"
