@@ -25,7 +25,7 @@ from interferometry.io.encodings import decode_text
 from interferometry.io.faults import BadReading, RejectedLine, raise_if_mostly_invalid
 from interferometry.io.headings import CHINESE_WORDS
 from interferometry.io.numerals import Numerals
-from interferometry.io.workbook import refuse_bomb
+from interferometry.io.workbook_limits import refuse_bomb
 
 #: Warning of pandas about a line with more fields than the header.
 _SKIPPED = re.compile(r"Skipping line (\d+): expected (\d+) fields, saw (\d+)")
