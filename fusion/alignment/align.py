@@ -17,12 +17,11 @@ from scipy import ndimage
 from fusion._typing import Array
 from fusion.alignment.reflection_patch import find_switching_patch, seen_throughout
 from fusion.errors import FusionError
+from thermography.fields.tasks.pieces import in_pieces
 
 _DIMS = ("cycle", "direction", "target")
 #: Half the width of line and point averages, in plan cells: enough to halve the noise of a single cell.
 _HALF_WIDTH_CELLS = 1.5
-#: Frames that are brought to the line together: beside it they take many times the memory of what comes of them.
-_FRAMES_AT_ONCE = 256
 
 
 class AlignmentError(FusionError):
@@ -242,7 +241,7 @@ def _reduce_fields(fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -
     Where a patch of the field switches like a reflection, its shares in the mean rise and in the integral are given beside them. The
     rise counts from the first frame; cells that are not seen in every frame are left out of the mean.
     """
-    frames = fields["frame_temperature"].values
+    frames = fields["frame_temperature"]
     seen = seen_throughout(frames)
     if not seen.any():
         raise AlignmentError("no plan cell is seen by every frame; check the registration and the plan's size")
@@ -260,21 +259,21 @@ def _reduce_fields(fields: xr.Dataset, axis: AxisGeometry, position_mm: Array) -
     return series
 
 
-def rise_since_first(frames: Array) -> Iterator[Array]:
+def rise_since_first(frames: Array | xr.DataArray) -> Iterator[Array]:
     """Yield the rise of frames since the first one, some at a time: in double precision all frames of a long test fill the memory.
 
     Parameters
     ----------
-    frames : (time, y, x) ndarray, degC
+    frames : (time, y, x) ndarray or DataArray, degC
         Of any precision.
 
     Yields
     ------
     (some, y, x) ndarray, K
     """
-    first = frames[0].astype(float)
-    for start in range(0, len(frames), _FRAMES_AT_ONCE):
-        yield frames[start : start + _FRAMES_AT_ONCE].astype(float) - first
+    first = np.asarray(frames[0]).astype(float)
+    for _, some in in_pieces(frames):
+        yield some.astype(float) - first
 
 
 def _cell_size(fields: xr.Dataset) -> float:
@@ -332,14 +331,11 @@ class MeasuredLine:
                 f"y = {y0[k]:.1f} mm; check [plan.axis] origin and direction, and [plan] size"
             )
 
-    def sample(self, frames: Array) -> Array:
+    def sample(self, frames: Array | xr.DataArray) -> Array:
         """Return frames (time, y, x) along the line, (time, sample), in their unit; gaps are interpolated along the line."""
-        starts = range(0, len(frames), _FRAMES_AT_ONCE)
-        return np.concatenate(
-            [self._sample_some(frames[start : start + _FRAMES_AT_ONCE].astype(float)) for start in starts]
-        )
+        return np.concatenate([self._sample_some(some.astype(float)) for _, some in in_pieces(frames)])
 
-    def sample_rise(self, frames: Array) -> Array:
+    def sample_rise(self, frames: Array | xr.DataArray) -> Array:
         """Return the rise of frames (time, y, x), degC, since the first one along the line, (time, sample), K."""
         return np.concatenate([self._sample_some(rise) for rise in rise_since_first(frames)])
 

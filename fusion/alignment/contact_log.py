@@ -10,6 +10,7 @@ import xarray as xr
 
 from fusion._typing import Array
 from fusion.alignment.sensor_health import SensorFault
+from thermography.fields.tasks.pieces import piece_slices
 
 _KELVIN = {"units": "K", "units_metadata": "temperature: difference"}
 _MM = {"units": "mm"}
@@ -58,7 +59,9 @@ def join_sensors(
     if fields is None:
         return joined
     places = {axis: xr.DataArray(at, dims="sensor") for axis, at in (("x", x_mm), ("y", y_mm))}
-    seen = fields["frame_temperature"].sel(places, method="nearest").drop_vars(["x", "y"])
+    frames = fields["frame_temperature"]
+    parts = [frames[some].load().sel(places, method="nearest") for some in piece_slices(frames.shape)]
+    seen = xr.concat(parts, "time").drop_vars(["x", "y"])
     seen = seen.rename(time="camera_time").transpose("camera_time", "sensor").astype(float)
     return joined.assign(camera_rise=(seen - _first_since(seen, "camera_time", start)).assign_attrs(_KELVIN))
 

@@ -11,18 +11,20 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from fusion._typing import Array
+from thermography.fields.tasks.pieces import in_pieces, piece_slices
 
 #: A change counts as a jump where it exceeds the usual change of its patch this many times (robust sigma).
 _JUMP_SIGMAS = 8.0
 #: A patch stands out where its jump is this much larger than the same jump averaged over the table; a camera offset has 1.
 _LOCAL_RATIO = 3.0
 _MIN_FRAMES = 9
-#: Frames that are looked at together, and changes of a long test among which the patch is looked for.
-_FRAMES_AT_ONCE, _MOST_CHANGES = 256, 1000
+#: Changes of a long test among which the patch is looked for.
+_MOST_CHANGES = 1000
 
 
 @dataclass(frozen=True)
@@ -41,12 +43,12 @@ class SwitchingPatch:
     course: Array
 
 
-def seen_throughout(frames: Array) -> NDArray[np.bool_]:
+def seen_throughout(frames: Array | xr.DataArray) -> NDArray[np.bool_]:
     """Return which cells every frame shows.
 
     Parameters
     ----------
-    frames : (time, y, x) ndarray
+    frames : (time, y, x) ndarray or DataArray
         NaN where the plan is not seen.
 
     Returns
@@ -54,17 +56,17 @@ def seen_throughout(frames: Array) -> NDArray[np.bool_]:
     (y, x) ndarray of bool
     """
     seen = np.ones(frames.shape[1:], bool)
-    for start in range(0, len(frames), _FRAMES_AT_ONCE):
-        seen &= np.isfinite(frames[start : start + _FRAMES_AT_ONCE]).all(axis=0)
+    for _, some in in_pieces(frames):
+        seen &= np.isfinite(some).all(axis=0)
     return seen
 
 
-def find_switching_patch(frames: Array) -> SwitchingPatch | None:
+def find_switching_patch(frames: Array | xr.DataArray) -> SwitchingPatch | None:
     """Find the patch whose switching explains most of the sudden changes of a field.
 
     Parameters
     ----------
-    frames : (time, y, x) ndarray, degC or K
+    frames : (time, y, x) ndarray or DataArray, degC or K
         Temperature of the plan or its rise, NaN where the plan is not seen.
 
     Returns
@@ -105,14 +107,16 @@ def find_switching_patch(frames: Array) -> SwitchingPatch | None:
 
 def _largest(changes: Iterable[Array]) -> Array:
     """The largest changes (at most a thousand, cell) of those that come some at a time, in the order of time."""
-    kept: list[Array] = []
+    kept, sizes = np.empty((0, 0)), np.empty(0)
     for some in changes:
-        kept = [*kept, some]
-        if sum(map(len, kept)) > _MOST_CHANGES:
-            rows = np.concatenate(kept)
-            size = np.einsum("tc,tc->t", rows, rows)
-            kept = [rows[np.sort(np.argpartition(size, -_MOST_CHANGES)[-_MOST_CHANGES:])]]
-    return np.concatenate(kept)
+        size = np.concatenate([sizes, np.einsum("tc,tc->t", some, some)])
+        chosen = np.sort(np.argsort(size)[-_MOST_CHANGES:])
+        before = chosen[chosen < len(kept)]
+        # Those before stay as they are where none of them is left out.
+        old = kept if len(before) == len(kept) else kept[before]
+        kept = np.concatenate([old, some[chosen[len(before) :] - len(kept)]]) if len(old) else some[chosen]
+        sizes = size[chosen]
+    return kept
 
 
 def _leading_component(changes: Array) -> Array:
@@ -128,13 +132,13 @@ def _leading_component(changes: Array) -> Array:
     return np.asarray(component / np.linalg.norm(component) * np.sign(component[np.argmax(np.abs(component))]))
 
 
-def _sudden_changes(frames: Array, seen: NDArray[np.bool_]) -> Iterator[Array]:
+def _sudden_changes(frames: Array | xr.DataArray, seen: NDArray[np.bool_]) -> Iterator[Array]:
     """Change between neighbouring frames beyond the median of the changes around it, (some, cell), some at a time."""
     count = len(frames) - 1
-    for start in range(0, count, _FRAMES_AT_ONCE):
-        stop = min(start + _FRAMES_AT_ONCE, count)
+    for some in piece_slices((count, *seen.shape)):
+        start, stop = some.start, some.stop
         first = max(0, start - 3)
-        changes = np.diff(frames[first : min(count, stop + 3) + 1].astype(float)[:, seen], axis=0)
+        changes = np.diff(np.asarray(frames[first : min(count, stop + 3) + 1]).astype(float)[:, seen], axis=0)
         sudden = np.empty((stop - start, changes.shape[1]))
         for k in range(start, stop):
             low, high = max(0, k - 3) - first, min(count, k + 4) - first

@@ -44,8 +44,8 @@ class Whitening:
         0 no drift, 1 random walk, 2 integrated random walk.
     per_hour : float
         Standard deviation of the increment of the drift over one hour, over the noise of one value.
-    project, project32 : (n, n) ndarray
-        Whitens and removes the nuisance regressors, in double and single precision.
+    project32 : (n, n) ndarray
+        Whitens and removes the nuisance regressors, in single precision.
     system : DriftSystem
         The drift and the noise of the values.
     basis : (n, k) ndarray
@@ -56,11 +56,16 @@ class Whitening:
 
     order: int
     per_hour: float
-    project: Array
     project32: Array32
     system: DriftSystem
     basis: Array
     log_penalty: float
+
+    @property
+    def project(self) -> Array:
+        """`project32` in double precision, (n, n); made when it is asked for, as all grid points of a long test fill the memory."""
+        white, _ = self.system.whiten(np.eye(self.system.seconds.size))
+        return np.asarray(white - self.basis @ (self.basis.T @ white))
 
     @property
     def colour(self) -> Array:
@@ -81,6 +86,8 @@ class NullBank:
         Degrees of freedom: number of values minus nuisance regressors.
     values : (n,) ndarray, um
         The series.
+    whitened : tuple of (n,) ndarray
+        The series whitened at every grid point, without the nuisance regressors.
     best : int
         Index of the grid point of highest restricted likelihood without any regressor.
     sigma : float, um
@@ -92,6 +99,7 @@ class NullBank:
     whitenings: tuple[Whitening, ...]
     freedom: int
     values: Array
+    whitened: tuple[Array, ...]
     best: int
     sigma: float
     log_likelihood: Array
@@ -175,10 +183,10 @@ def whitening_grid(seconds: Array, variance: Array, nuisance: Array, *, integrat
         system = drift_system(seconds, np.ones((n, 1)), order=kind, ratios=np.array([ratio]), variance=variance)
         white, log_determinant = system.whiten(np.eye(n))
         basis, triangle = np.linalg.qr(white @ nuisance)
-        project = white - basis @ (basis.T @ white)
+        project32 = (white - basis @ (basis.T @ white)).astype(np.float32)
         log_normal = 2.0 * float(np.log(np.abs(np.diag(triangle))).sum())
         penalty = float(log_determinant + log_normal) / freedom
-        whitenings.append(Whitening(order, per_hour, project, project.astype(np.float32), system, basis, penalty))
+        whitenings.append(Whitening(order, per_hour, project32, system, basis, penalty))
     return Grid(tuple(whitenings), freedom, scale)
 
 
@@ -196,11 +204,12 @@ def fit_null(grid: Grid, values: Array) -> NullBank:
     -------
     NullBank
     """
-    rss = np.array([((point.project @ values) ** 2).sum() for point in grid.whitenings])
+    whitened = tuple(point.project @ values for point in grid.whitenings)
+    rss = np.array([(white**2).sum() for white in whitened])
     score = np.log(np.maximum(rss, 1e-300)) + np.array([point.log_penalty for point in grid.whitenings])
     best = int(np.argmin(score))
     sigma = float(np.sqrt(grid.scale * rss[best] / grid.freedom))
-    return NullBank(grid.whitenings, grid.freedom, values, best, sigma, -0.5 * grid.freedom * score)
+    return NullBank(grid.whitenings, grid.freedom, values, whitened, best, sigma, -0.5 * grid.freedom * score)
 
 
 def null_bank(values: Array, seconds: Array, variance: Array, nuisance: Array, *, integrated: bool = True) -> NullBank:
@@ -250,7 +259,7 @@ def resample(bank: NullBank, orders: NDArray[np.int64], *, rng: np.random.Genera
     for g in np.unique(chosen):
         null = bank.whitenings[g]
         rows = np.flatnonzero(chosen == g)
-        residual = null.project @ bank.values
+        residual = bank.whitened[g]
         spread = float(np.sqrt(residual @ residual / bank.freedom))
         if gaussian:
             innovations = spread * rng.standard_normal((rows.size, residual.size))
@@ -302,15 +311,18 @@ def whiten_series(bank: NullBank, series: Array) -> Whitened:
     -------
     Whitened
     """
-    projected = np.stack([series @ point.project.T for point in bank.whitenings])
+    projected = np.empty((len(bank.whitenings), *series.shape), np.float32)
+    squares = np.empty(projected.shape[:2])
+    for g, point in enumerate(bank.whitenings):
+        white = series @ point.project.T
+        projected[g], squares[g] = white, (white**2).sum(axis=1)
     log_penalty = np.array([point.log_penalty for point in bank.whitenings])
-    squares = (projected**2).sum(axis=2)
     # Only ratios of scores count; a common factor keeps single precision away from its limits.
     reference = np.log(squares[:, 0]) + log_penalty
     penalty = np.exp(log_penalty - reference.min())
     penalised = squares * penalty[:, None]
     return Whitened(
-        np.ascontiguousarray(projected, np.float32),
+        projected,
         penalised.astype(np.float32),
         penalty.astype(np.float32),
         penalised.min(axis=0).astype(np.float32),
@@ -415,7 +427,7 @@ def estimate_effects(bank: NullBank, regressors: Array32) -> Estimate:
     null_u = np.full(columns, np.inf)
     for g, point in enumerate(bank.whitenings):
         unit, length = _unit_regressors(point.project32, regressors)
-        series = point.project @ bank.values
+        series = bank.whitened[g]
         product = (series.astype(np.float32) @ unit).astype(float)
         rss = float(series @ series) - product**2
         informative = length > 0

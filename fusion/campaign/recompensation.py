@@ -171,12 +171,12 @@ def see_material(fields: xr.Dataset, axis: AxisGeometry, deviations: xr.Dataset)
     """
     position = deviations["position"].values
     line = MeasuredLine(fields, axis, position)
-    samples = line.sample(fields["frame_temperature"].values)
+    samples = line.sample(fields["frame_temperature"])
     at_target = samples[:, line.nearest]
     length = np.where(position == 0.0, 1.0, position)
     mean = np.where(position == 0.0, at_target, line.integrate(samples) / length)
     at_readings = interpolate_series(deviations["time"].values, fields["time"].values.astype("datetime64[ns]"), mean)
-    u = line.sample(fields["temperature_u"].values)
+    u = line.sample(fields["temperature_u"])
     u_K = float(np.nanmean(u))
     return SeenMaterial(deviations["deviation"].copy(data=at_readings), u_K)
 

@@ -219,7 +219,7 @@ def _alternatives(model: ModelFit, fields: xr.Dataset, axis: AxisGeometry) -> It
     position, seconds = readings.positions_mm, readings.series["axis_integral"].seconds
     along_mm = _on_the_plan(fields, axis)
     line = MeasuredLine(fields, axis, along_mm)
-    integral = interp1d(along_mm, line.integrate(line.sample_rise(fields["frame_temperature"].values)), axis=1)
+    integral = interp1d(along_mm, line.integrate(line.sample_rise(fields["frame_temperature"])), axis=1)
 
     def column(origin_mm: float, ends_mm: Array) -> Array:
         return readings.at(Series(seconds, 1e-3 * (integral(ends_mm) - integral([origin_mm])), "K m"))

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from fusion._typing import Array
 from fusion.alignment.first_order_lag import respond
+from fusion.alignment.reflection_patch import seen_throughout
+from thermography.fields.tasks.pieces import in_pieces, piece_slices
 
 #: Side of a coarse cell, mm: finer than heat spreads in the minutes between two frames.
 _COARSE_MM = 20.0
@@ -66,7 +68,10 @@ def thin_fields(fields: xr.Dataset) -> FieldSeries | None:
     frames = _thinned(fields)
     cell_mm = abs(float(np.median(np.diff(fields["x"].values))))
     count = max(1, round(_COARSE_MM / cell_mm))
-    return _series(frames.coarsen(x=count, y=count, boundary="trim").reduce(np.mean))
+    parts = [
+        frames[some].coarsen(x=count, y=count, boundary="trim").reduce(np.mean) for some in piece_slices(frames.shape)
+    ]
+    return _series(xr.concat(parts, "time") if len(parts) > 1 else parts[0])
 
 
 def field_at(fields: xr.Dataset, place_mm: tuple[float, float]) -> FieldSeries | None:
@@ -84,19 +89,24 @@ def field_at(fields: xr.Dataset, place_mm: tuple[float, float]) -> FieldSeries |
     FieldSeries or None
         One cell; None where fewer than 12 frames remain, or no cell is seen by all of them.
     """
-    series = _series(_thinned(fields))
-    if series is None:
+    frames = _thinned(fields)
+    seen = seen_throughout(frames).ravel()
+    if len(frames) < _LEAST_FRAMES or not seen.any():
         return None
-    away = np.array([series.x_mm - place_mm[0], series.y_mm - place_mm[1]])
+    y_mm, x_mm = (at.ravel()[seen] for at in np.meshgrid(frames["y"].values, frames["x"].values, indexing="ij"))
+    away = np.array([x_mm - place_mm[0], y_mm - place_mm[1]])
     distance = np.hypot(*away)
     about = np.flatnonzero(distance <= _COARSE_MM)
     if about.size < 3:
         weight, about = np.ones(1), np.array([np.argmin(distance)])
     else:
         weight = np.linalg.pinv(np.column_stack([np.ones(about.size), *away[:, about]]))[0]
-    temperature = series.temperature[:, about] @ weight
+    chosen = np.flatnonzero(seen)[about]
+    temperature = np.concatenate(
+        [some.reshape(len(some), -1)[:, chosen].astype(float) @ weight for _, some in in_pieces(frames)]
+    )
     place = np.array([[place_mm[0]], [place_mm[1]]])
-    return FieldSeries(series.start, series.seconds, temperature[:, None], *place)
+    return FieldSeries(*_clock(frames), temperature[:, None], *place)
 
 
 def _thinned(fields: xr.Dataset) -> xr.DataArray:
@@ -112,11 +122,15 @@ def _thinned(fields: xr.Dataset) -> xr.DataArray:
 
 def _series(frames: xr.DataArray) -> FieldSeries | None:
     """Cells that all frames show, as series; None where there are too few frames or no such cell."""
-    time = frames["time"].values.astype("datetime64[ns]")
-    values = frames.values.reshape(time.size, -1).astype(float)
+    values = frames.values.reshape(len(frames), -1).astype(float)
     seen = np.isfinite(values).all(axis=0)
-    if time.size < _LEAST_FRAMES or not seen.any():
+    if len(frames) < _LEAST_FRAMES or not seen.any():
         return None
-    seconds = (time - time[0]) / np.timedelta64(1, "s")
     y, x = np.meshgrid(frames["y"].values, frames["x"].values, indexing="ij")
-    return FieldSeries(time[0], seconds, values[:, seen], x.ravel()[seen], y.ravel()[seen])
+    return FieldSeries(*_clock(frames), values[:, seen], x.ravel()[seen], y.ravel()[seen])
+
+
+def _clock(frames: xr.DataArray) -> tuple[np.datetime64, Array]:
+    """Time of the first frame, and seconds of all since then."""
+    time = frames["time"].values.astype("datetime64[ns]")
+    return time[0], (time - time[0]) / np.timedelta64(1, "s")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import xarray as xr
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from fusion._typing import Array
 from fusion.consistency.checks import Check
 from thermography.fields.cycle_fields import plan_unit
+from thermography.fields.tasks.pieces import median_of_pieces, piece_slices
 
 #: Largest share of the frames over which the registration may stay unchecked up to the end of the series or up to a knock.
 _UNCHECKED_SHARE = 0.05
@@ -240,17 +241,19 @@ def _repeated(fields: xr.Dataset, total: int) -> Check:
 
 def _jump(fields: xr.Dataset) -> Check:
     """Largest jump that a part of the table makes between two frames while the rest does not."""
-    excess, share = _jumps(fields)
-    times = fields["time"].values
+    frames, times = fields["frame_temperature"], fields["time"].values
+    seconds = np.diff(times) / np.timedelta64(1, "s")
+    least_K = _least_jump(frames)
+    share = _jump_shares(frames, seconds, least_K)
     at = int(np.argmax(share)) if share.size else 0
     passed = not share.size or float(share[at]) <= _JUMP_SHARE
     value = float(share[at]) if share.size else 0.0
     if passed:
         evidence = "No part of the table changes from one frame to the next by more than its changes before and after."
     else:
-        cells = excess[at] > 0
+        cells = _excess(frames, seconds, slice(at, at + 1), least_K)[0] > 0
         y, x = (float(fields[axis].values[np.nonzero(cells)[k]].mean()) for k, axis in enumerate(("y", "x")))
-        before, after = fields["frame_temperature"].values[at + 1 : at + 3].astype(float)
+        before, after = frames[at + 1 : at + 3].values.astype(float)
         size = float(np.median((after - before)[cells]) - np.nanmedian(after - before))
         instants = np.datetime_as_string(times[np.flatnonzero(share > _JUMP_SHARE) + 2], unit="s")
         strongest = instants[np.argmax(share[share > _JUMP_SHARE])]
@@ -272,19 +275,37 @@ def _jump(fields: xr.Dataset) -> Check:
     )
 
 
-def _jumps(fields: xr.Dataset) -> tuple[Array, Array]:
-    """Excess of every change over what is allowed, (changes, y, x) K, for all but the first and last one, and the share of cells above."""
-    stack = fields["frame_temperature"].values.astype(float)
-    if len(stack) < 4:
-        return np.empty((0, *stack.shape[1:])), np.empty(0)
-    seconds = np.diff(fields["time"].values) / np.timedelta64(1, "s")
-    change = np.diff(stack, axis=0)
-    change -= np.nanmedian(change, axis=(1, 2), keepdims=True)
-    rate = np.abs(change) / seconds[:, None, None]
+def _changes(frames: xr.DataArray, first: int, stop: int) -> Array:
+    """Changes from frame to frame, those from `first` up to `stop`, beyond the one that most of the table makes, (changes, y, x) K."""
+    change = np.diff(frames[first : stop + 1].values.astype(float), axis=0)
+    return np.asarray(change - np.nanmedian(change, axis=(1, 2), keepdims=True))
+
+
+def _least_jump(frames: xr.DataArray) -> float:
+    """Excess of a change beyond which it is a jump, K: large against the noise of the changes."""
+    pairs = (max(len(frames) - 2, 0), *frames.shape[1:])
+
+    def differences() -> Iterator[Array]:
+        return (np.abs(np.diff(_changes(frames, some.start, some.stop + 1), axis=0)) for some in piece_slices(pairs))
+
+    noise_K = 1.4826 * median_of_pieces(differences) / np.sqrt(6.0)
+    return max(_JUMP_K, _JUMP_SIGMAS * noise_K)
+
+
+def _excess(frames: xr.DataArray, seconds: Array, some: slice, least_K: float) -> Array:
+    """Excess of changes over what those before and after them allow, (changes, y, x) K; place 0 is the second change."""
+    change, lasted = _changes(frames, some.start, some.stop + 2), seconds[some.start : some.stop + 2, None, None]
+    rate = np.abs(change) / lasted
     # A source that is switched on bends the temperature, so that the change exceeds only the one before, or only the one after.
-    excess = np.abs(change[1:-1]) - seconds[1:-1, None, None] * np.maximum(rate[:-2], rate[2:])
-    noise_K = 1.4826 * float(np.nanmedian(np.abs(np.diff(change, axis=0)))) / np.sqrt(6.0)
-    excess -= max(_JUMP_K, _JUMP_SIGMAS * noise_K)
-    seen = np.isfinite(excess)
-    share = ((excess > 0) & seen).sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1)
-    return excess, share
+    excess = np.abs(change[1:-1]) - lasted[1:-1] * np.maximum(rate[:-2], rate[2:])
+    return np.asarray(excess - least_K)
+
+
+def _jump_shares(frames: xr.DataArray, seconds: Array, least_K: float) -> Array:
+    """Share of the cells that jump in every change but the first and the last one."""
+    shares = [np.empty(0)]
+    for some in piece_slices((max(len(frames) - 3, 0), *frames.shape[1:])):
+        excess = _excess(frames, seconds, some, least_K)
+        seen = np.isfinite(excess)
+        shares.append(((excess > 0) & seen).sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1))
+    return np.concatenate(shares)

@@ -77,7 +77,7 @@ def find_field_errors(result: LoopResult, fields: xr.Dataset, fused: xr.Dataset)
             error = size * np.broadcast_to(late[:, None, None], fields["frame_temperature"].shape)
             text = f"the camera read {size:+.3f} ± {2.0 * u:.3f} K (k = 2) too high"
         else:
-            patch = find_switching_patch(fields["frame_temperature"].values)
+            patch = find_switching_patch(fields["frame_temperature"])
             if patch is None:
                 continue
             # A warm body adds to what the camera sees: the lowest state is the one without it.

@@ -23,10 +23,9 @@ from fusion.products.progress import Report
 from fusion.products.results import Outcome
 from thermography.fields.cycle_fields import plan_unit
 from thermography.fields.hotspots import Hotspot, detect_hotspots
+from thermography.fields.tasks.pieces import piece_slices
 
 _CORRELATION_CELL_MM = 10.0
-#: Frames that are brought to these cells together.
-_FRAMES_AT_ONCE = 1000
 #: Hotspots are tested on cells that are seen in more than this share of the frames.
 _SEEN_SHARE = 0.8
 
@@ -91,10 +90,7 @@ def _coarse(fields: xr.Dataset) -> xr.DataArray:
     """The field of every frame on cells of about 10 mm; frames are averaged some at a time, as there may be very many."""
     frames = fields["frame_temperature"]
     block = max(1, int(_CORRELATION_CELL_MM / float(np.median(np.diff(fields["x"])))))
-    parts = [
-        frames.isel(time=slice(start, start + _FRAMES_AT_ONCE)).coarsen(x=block, y=block, boundary="trim").mean()
-        for start in range(0, frames.sizes["time"], _FRAMES_AT_ONCE)
-    ]
+    parts = [frames[some].coarsen(x=block, y=block, boundary="trim").mean() for some in piece_slices(frames.shape)]
     return xr.concat(parts, "time")
 
 

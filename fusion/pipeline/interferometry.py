@@ -23,6 +23,7 @@ from fusion.report.wording import moment
 from interferometry import neighbours
 from interferometry.deviations import OUTLIER
 from interferometry.drift.estimate import estimate_drift, flag_outliers
+from thermography.fields.cycle_fields import cycles_with_field
 
 #: Share of the readings that may lie outside the frames' time before the next test should be filmed otherwise.
 _OUTSIDE_SHARE = 0.05
@@ -287,7 +288,7 @@ def _gap_notices(fields: xr.Dataset, deviations: xr.Dataset) -> list[Notice]:
     inside = in_gaps(deviations["time"], gaps)
     if not inside.any():
         return []
-    empty = fields["cycle"].values[~np.isfinite(fields["temperature"].values).any(axis=(1, 2))]
+    empty = fields["cycle"].values[~cycles_with_field(fields["temperature"])]
     without = f"; cycles without a frame: {listed(str(cycle) for cycle in empty)}" if empty.size else ""
     return [
         Notice(

@@ -14,7 +14,7 @@ from fusion.campaign.config import SurfaceTable, ThermographyTable
 from fusion.campaign.sources import CameraInputs
 from fusion.products.notices import counted
 from fusion.products.results import Notice, Outcome
-from thermography.fields.cycle_fields import plan_unit, reference_cycle
+from thermography.fields.cycle_fields import cycles_with_field, plan_unit, reference_cycle
 from thermography.fields.surfaces import (
     EmissivityRegion,
     Surface,
@@ -22,7 +22,8 @@ from thermography.fields.surfaces import (
     find_surfaces,
     measure_emissivity,
 )
-from thermography.fields.total_uncertainty import compare_with_monte_carlo, evaluate_uncertainty
+from thermography.fields.tasks.pieces import in_pieces
+from thermography.fields.total_uncertainty import compare_with_monte_carlo, evaluate_uncertainty, find_range
 from thermography.io.frame import CameraParameters
 from thermography.radiometry.overrides import Overrides
 from thermography.radiometry.planck import ZERO_CELSIUS_K, override
@@ -112,7 +113,7 @@ def complete_fields(source: CameraInputs, fields: xr.Dataset, parameters: Overri
         along: _parameters_at(source, parameters, fields[time].values)
         for along, time in (("cycle", "cycle_time"), ("time", "time"))
     }
-    camera = cameras["cycle"][reference_cycle(fields["temperature"].values)]
+    camera = cameras["cycle"][reference_cycle(fields["temperature"])]
     regions = [_emissivity_region(one, fields, camera, inputs) for one in table.region]
     surfaces, edge = find_surfaces(fields, regions, emissivity=camera.emissivity, emissivity_u=inputs.emissivity)
     if regions:
@@ -139,9 +140,9 @@ def describe_field(fields: xr.Dataset, radiometry: Mapping[str, Any]) -> dict[st
         Part ``radiometry`` of results.json.
     """
     rise, times = fields["temperature_rise"], fields["time"].values
-    seen = np.isfinite(rise.values).any(axis=(1, 2))
+    seen = cycles_with_field(rise)
     mean = float(rise.isel(cycle=int(np.flatnonzero(seen)[-1])).mean())
-    at = np.unravel_index(int(np.nanargmax(rise.values)), rise.shape)
+    at = _largest_at(rise)
     cell = rise[at]
     unit = plan_unit(fields)
     since = (fields["cycle_time"].values[at[0]] - fields["cycle_time"].values[seen][0]) / np.timedelta64(1, "s")
@@ -150,11 +151,21 @@ def describe_field(fields: xr.Dataset, radiometry: Mapping[str, Any]) -> dict[st
         "frames": int(fields["frame_count"].sum()) if "frame_count" in fields else int(times.size),
         "duration_s": float((times[-1] - times[0]) / np.timedelta64(1, "s")),
         "mean_rise_K": {"value": mean, "u": radiometry["rise_u"]["common_K"]},
-        "largest_rise_K": {"value": float(cell), "u": float(fields["temperature_rise_u"].values[at])},
+        "largest_rise_K": {"value": float(cell), "u": float(fields["temperature_rise_u"][at])},
         "largest_cycle": int(cell["cycle"]),
         "largest_after_s": float(since),
         **{f"largest_{axis}_{unit}": float(cell[axis]) for axis in "xy"},
     }
+
+
+def _largest_at(rise: xr.DataArray) -> tuple[int, int, int]:
+    """Cycle, row and column of the largest rise, the first of equal ones."""
+    largest, at = -np.inf, (0, 0, 0)
+    for some, piece in in_pieces(rise):
+        cycle, y, x = np.unravel_index(int(np.argmax(np.where(np.isnan(piece), -np.inf, piece))), piece.shape)
+        if piece[cycle, y, x] > largest:
+            largest, at = piece[cycle, y, x], (some.start + int(cycle), int(y), int(x))
+    return at
 
 
 def _parameters_at(
@@ -192,7 +203,7 @@ def _two_parts(fields: xr.Dataset) -> dict[str, dict[str, float]]:
 
 def _last_field(fields: xr.Dataset) -> xr.Dataset:
     """The last cycle with a field."""
-    return fields.isel(cycle=int(np.flatnonzero(np.isfinite(fields["temperature"].values).any(axis=(1, 2)))[-1]))
+    return fields.isel(cycle=int(np.flatnonzero(cycles_with_field(fields["temperature"]))[-1]))
 
 
 def _budget(
@@ -266,12 +277,11 @@ def _surface_part(
     table: ThermographyTable, surface: Surface, fields: xr.Dataset, camera: CameraParameters, inputs: InputUncertainty
 ) -> dict[str, Any]:
     """One entry of ``radiometry.surfaces`` in results.json."""
-    seen = surface.cells & np.isfinite(fields["temperature"].values)
+    shown = find_range(fields, surface.cells)
     ratio = scale = None
-    if seen.any():
-        temperature, rise = (fields[name].values[seen].astype(float) for name in ("temperature", "temperature_rise"))
+    if shown is not None:
         own = replace(inputs, emissivity=surface.emissivity_u)
-        compared = compare_with_monte_carlo(temperature, rise, override(camera, emissivity=surface.emissivity), own)
+        compared = compare_with_monte_carlo(shown, override(camera, emissivity=surface.emissivity), own)
         ratio, scale = compared.rise_ratio, float(np.nanmean(fields["rise_scale_u"].values[surface.cells]))
     return {
         "name": surface.name.removeprefix("region "),

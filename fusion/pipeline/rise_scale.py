@@ -10,6 +10,7 @@ import xarray as xr
 
 from fusion.alignment.align import AxisGeometry, MeasuredLine
 from fusion.effects.effect import Effect
+from thermography.fields.cycle_fields import cycles_with_field
 
 
 def axis_scale_u(fields: xr.Dataset, axis: AxisGeometry, position_mm: np.ndarray) -> float:
@@ -151,9 +152,9 @@ def scale_evidence(
 
 def _last_rise(fields: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Rise of the last cycle with a field, and the relative uncertainty of its scale, (y, x)."""
-    rise = fields["temperature_rise"].values
-    last = int(np.flatnonzero(np.isfinite(rise).any(axis=(1, 2)))[-1])
-    return rise[last].astype(float), fields["rise_scale_u"].values.astype(float)
+    rise = fields["temperature_rise"]
+    last = int(np.flatnonzero(cycles_with_field(rise))[-1])
+    return rise[last].values.astype(float), fields["rise_scale_u"].values.astype(float)
 
 
 def _weighted(share: np.ndarray, rise: np.ndarray) -> float:

@@ -44,6 +44,8 @@ from fusion.products.progress import Report, silent
 from fusion.products.results import Results, assemble
 from fusion.products.store import (
     StageStamps,
+    is_large,
+    open_dataset,
     read_dataset,
     read_tree,
     write_dataset,
@@ -302,9 +304,11 @@ def _run_laser(run: Run, source: LaserInputs) -> tuple[dict[str, Any], list[Chec
 
 def _reduce(run: Run, source: CameraInputs, tables: tuple[str, ...], *, scheduler: str | None) -> xr.Dataset:
     """The stage of the fields."""
-    stage = Stage("fields", tables, (), partial(thermal.reduce_thermography, source, scheduler=scheduler), read_dataset)
+    stage = Stage("fields", tables, (), partial(thermal.reduce_thermography, source, scheduler=scheduler), open_dataset)
     checkpoint = run.checkpoint(run.key_of(stage))
     fields = run.stage(replace(stage, compute=partial(stage.compute, checkpoint=checkpoint)))
+    if is_large(fields):
+        fields = open_dataset(run.folder / FILES["fields"])
     if fields.nbytes > _MOST_SENT:
         run.beside = InTurn()
     run.parts["field"] = describe_field(fields, run.parts["radiometry"])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import shutil
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
@@ -68,6 +70,12 @@ def _timed(compute: Callable[..., Outcome[Product]], *, report: Report) -> tuple
     """Compute a stage; return the wall time that it took too, s."""
     begun = time.monotonic()
     return compute(report=report), time.monotonic() - begun
+
+
+def _return_freed_memory() -> None:
+    """Give the memory that a stage has left back to the system, where the C library keeps it for what follows (glibc does)."""
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @dataclass
@@ -162,6 +170,8 @@ class Run:
             self.stamps.record(
                 name, key, [path], {"parts": outcome.parts, "notices": [vars(item) for item in outcome.notices]}
             )
+            del computed
+        _return_freed_memory()
         self.keys[name] = key
         self.products.append(path)
         self.parts.update(outcome.parts)

@@ -25,6 +25,7 @@ from thermography.contract import FIELDS
 from thermography.fields.cycle_fields import in_pixels, plan_unit
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
+from thermography.fields.tasks.pieces import piece_slices
 from thermography.io.openexr import write_maps
 from thermography.radiometry.camera_artefacts import DEAD, NOISY, OFFSET, find_bad_pixels
 from thermography.radiometry.overrides import Overrides
@@ -412,12 +413,15 @@ def write_exr(folder: Path, fields: xr.Dataset, *, report: Report) -> list[Path]
         ``report(label, done, total)``, for progress.
     """
     total = fields.sizes["cycle"]
-    paths = []
-    for done, cycle in enumerate(fields["cycle"].values):
-        report("OpenEXR maps", done, total)
-        maps = _exr_maps(fields.sel(cycle=cycle))
-        path = folder / map_name(cycle)
-        paths.append(write_atomically(path, lambda temporary, maps=maps: write_maps(temporary, maps)))  # type: ignore[misc]
+    paths: list[Path] = []
+    mapped = fields[["temperature", "temperature_rise", "temperature_u"]]
+    for some in piece_slices(mapped["temperature"].shape):
+        piece = mapped.isel(cycle=some).load()
+        for cycle in piece["cycle"].values:
+            report("OpenEXR maps", len(paths), total)
+            maps = _exr_maps(piece.sel(cycle=cycle))
+            path = folder / map_name(cycle)
+            paths.append(write_atomically(path, lambda temporary, maps=maps: write_maps(temporary, maps)))  # type: ignore[misc]
     report("OpenEXR maps", total, total)
     return paths
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import xarray as xr
 
 from fusion.errors import FusionError
-from fusion.products.store import DamagedProductError, read_dataset, read_tree, require_own
+from fusion.products.store import DamagedProductError, open_dataset, read_dataset, read_tree, require_own
 from interferometry.contract import DEVIATIONS
 from thermography.contract import FIELDS
 
@@ -65,7 +65,7 @@ def check(dataset: xr.Dataset, contract: Mapping[str, tuple[tuple[str, ...], str
 
 
 def read_product(folder: Path, name: str) -> xr.Dataset:
-    """Read a product of a run into memory.
+    """Read a product of a run into memory; large fields are left in their file, see `open_dataset`.
 
     Parameters
     ----------
@@ -87,7 +87,8 @@ def read_product(folder: Path, name: str) -> xr.Dataset:
     """
     path = folder / ("fusion.nc" if name == "record" else f"{name}.nc")
     require_own(folder, [path.name])
-    return require_kind(read_dataset(path), name, path)
+    read = open_dataset if name == "fields" else read_dataset
+    return require_kind(read(path), name, path)
 
 
 def read_fusion(folder: Path) -> xr.DataTree:

@@ -17,12 +17,16 @@ from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 import numpy as np
 
 from fusion.errors import FusionError
+from thermography.fields.tasks.pieces import in_pieces
+from thermography.fields.tasks.spool import IN_MEMORY_BYTES
 from thermography.io import atomic
 
 if TYPE_CHECKING:
     import xarray as xr
 
 _STAMPS = ".stages/stamps.json"
+#: Compressed maps are stored in parts of this size, bytes: one cycle of thousands can be read without the others.
+_CHUNK_BYTES = 1 << 22
 #: A product is one Dataset, or a tree of them whose nodes become the groups of one NetCDF file.
 Product = TypeVar("Product", "xr.Dataset", "xr.DataTree")
 
@@ -123,6 +127,17 @@ def write_dataset(path: Path, product: xr.Dataset | xr.DataTree) -> Path:
     import netCDF4
     import xarray as xr
     from xarray.backends import NetCDF4DataStore
+    from xarray.backends.common import ArrayWriter
+
+    class PieceWriter(ArrayWriter):
+        """Writes an array that is in a mapped file piece by piece, so that it need not be in memory."""
+
+        def add(self, source: Any, target: Any, region: Any = None) -> None:
+            if source.nbytes <= IN_MEMORY_BYTES:
+                super().add(source, target, region)
+                return
+            for some, piece in in_pieces(source):
+                target[some] = piece
 
     tree = xr.DataTree(product) if isinstance(product, xr.Dataset) else product
     _require_room(path, sum(node.to_dataset().nbytes for node in tree.subtree))
@@ -130,11 +145,13 @@ def write_dataset(path: Path, product: xr.Dataset | xr.DataTree) -> Path:
     def write_groups(temporary: Path) -> None:
         # The library of netCDF writes many small variables three times as fast as h5netcdf; both write the same. Into a file that is
         # open: `Dataset.to_netcdf` opens it for every group, and loads what a cluster needs.
+        # Its memory for each variable, 64 MB unless told, holds one part.
+        netCDF4.set_chunk_cache(_CHUNK_BYTES)
         with netCDF4.Dataset(temporary, "w") as file:
             for node in tree.subtree:
                 dataset = _with_own_coordinates(node).load()
                 group = file if node is tree else file.createGroup(node.relative_to(tree))
-                dataset.dump_to_store(NetCDF4DataStore(group), encoding=_encoding(dataset))
+                dataset.dump_to_store(NetCDF4DataStore(group), encoding=_encoding(dataset), writer=PieceWriter())
 
     return write_atomically(path, write_groups)
 
@@ -165,8 +182,56 @@ def _encoding(dataset: xr.Dataset) -> dict[Any, dict[str, object]]:
     encoding: dict[Any, dict[str, object]] = {name: {"_FillValue": None} for name in dataset.coords}
     for name, array in dataset.data_vars.items():
         if array.dtype.kind == "f" and array.size > 10_000:
-            encoding[name] = {"zlib": True, "complevel": 1}
+            encoding[name] = {"zlib": True, "complevel": 1, "chunksizes": _chunks(array)}
     return encoding
+
+
+def _chunks(array: xr.DataArray) -> tuple[int, ...]:
+    """Return the shape of the parts in which a map is stored: whole fields, as many as there is room for."""
+    field = array.dtype.itemsize * math.prod(array.shape[1:])
+    return (max(1, min(array.shape[0], _CHUNK_BYTES // field)), *array.shape[1:])
+
+
+def is_large(dataset: xr.Dataset) -> bool:
+    """Return whether a Dataset holds an array that `open_dataset` leaves in its file.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        Product.
+    """
+    return any(variable.nbytes > IN_MEMORY_BYTES for variable in dataset.variables.values())
+
+
+def open_dataset(path: Path) -> xr.Dataset:
+    """Open a Dataset written by `write_dataset`: arrays of more than 8 MB stay in the file, the others are read into memory.
+
+    Parameters
+    ----------
+    path : Path
+        Product.
+
+    Returns
+    -------
+    Dataset
+        What is asked for of a large array, for example some cycles, is read then, and not kept.
+
+    Raises
+    ------
+    DamagedProductError
+        If the file is no NetCDF, or only a part of one.
+    FileNotFoundError
+        If there is none.
+    """
+    import xarray as xr
+
+    with told_if_damaged(path):
+        dataset = xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False, cache=False)
+        if not is_large(dataset):
+            with dataset:
+                return dataset.load()
+        small = [name for name, variable in dataset.variables.items() if variable.nbytes <= IN_MEMORY_BYTES]
+        return dataset.assign({name: dataset[name].load() for name in small if name not in dataset.indexes})
 
 
 def read_dataset(path: Path) -> xr.Dataset:

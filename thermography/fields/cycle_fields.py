@@ -16,7 +16,8 @@ from scipy import ndimage
 from thermography._constants import MAD_TO_SIGMA
 from thermography._typing import Array
 from thermography.fields.resampling import PlanWeights
-from thermography.fields.tasks.spool import IN_MEMORY_BYTES, Spool, empty_array
+from thermography.fields.tasks.pieces import in_pieces, piece_slices
+from thermography.fields.tasks.spool import Spool, empty_array, give_back
 from thermography.radiometry.averaging import AVERAGING_LIMIT_K, MeanTemperature
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import Registration
@@ -357,7 +358,8 @@ def assemble_fields(
     span_of = np.zeros(cycles, int)
     count, flags = _filled(shape, np.int32, 0, folder), _filled(shape, np.uint8, _FLAGS["no_frame"], folder)
     time = np.full(cycles, np.datetime64("NaT"), "datetime64[ns]")
-    for cycle, group in groupby(parts, lambda part: part.cycle):
+    step = next(piece_slices(shape)).stop
+    for number, (cycle, group) in enumerate(groupby(parts, lambda part: part.cycle), start=1):
         of_cycle = list(group)
         time[cycle] = of_cycle[0].first_time + np.timedelta64(_mean_nanoseconds(of_cycle), "ns")
         merged = _merge(of_cycle)
@@ -366,14 +368,17 @@ def assemble_fields(
         span_of[cycle] = of_cycle[-1].span
         count[cycle] = sum(part.count for part in of_cycle)
         flags[cycle] = _flags(of_cycle, merged[0], np.max([coverages[part.span] for part in of_cycle], axis=0))
+        if number % step == 0:
+            give_back(*fields.values(), count, flags)
     plan = ("cycle", "y", "x")
     temperatures = {name: empty_array(shape, np.float32, folder) for name in _TEMPERATURES}
-    for some in _stretches_of(cycles, grid):
+    for some in piece_slices(shape):
         evaluated = _temperatures(
             **fields, some=some, time=time, reference=parts[0], spans=span_of, covariances=covariances, grid=grid
         )
         for name, array in evaluated.items():
             temperatures[name][some] = array
+        give_back(*fields.values(), *temperatures.values())
     dataset = xr.Dataset(
         {name: (plan, array) for name, array in temperatures.items()}
         | {
@@ -411,14 +416,10 @@ def _flags(parts: Sequence[CyclePart], mean: Array, coverage: Array) -> NDArray[
 def _filled(shape: tuple[int, ...], kind: Any, value: float, folder: Path | None) -> Array:
     """Array of one value, see `empty_array`."""
     array = empty_array(shape, kind, folder)
-    array[...] = value
+    for some in piece_slices(shape):
+        array[some] = value
+        give_back(array)
     return array
-
-
-def _stretches_of(cycles: int, grid: PlanGrid) -> Iterator[slice]:
-    """Stretches of cycles that are evaluated at a time: all of most campaigns, some of very many."""
-    step = max(IN_MEMORY_BYTES // (8 * int(np.prod(grid.shape))), 1)
-    return (slice(first, min(first + step, cycles)) for first in range(0, cycles, step))
 
 
 _TEMPERATURES = (
@@ -567,15 +568,30 @@ def _gradient_variance(fields_K: Array, covariance: Array, grid: PlanGrid) -> Ar
     return np.where(seen, across * (across * xx + 2 * down * xy) + down * down * yy, np.nan)
 
 
-def reference_cycle(temperature: Array) -> int:
+def cycles_with_field(temperature: Array | xr.DataArray) -> NDArray[np.bool_]:
+    """Return which cycles have a field.
+
+    Parameters
+    ----------
+    temperature : (cycle, y, x) ndarray or DataArray, degC
+        Or its rise; NaN where there is none.
+
+    Returns
+    -------
+    (cycle,) ndarray of bool
+    """
+    return np.concatenate([np.isfinite(some).any(axis=(1, 2)) for _, some in in_pieces(temperature)])
+
+
+def reference_cycle(temperature: Array | xr.DataArray) -> int:
     """Index of the cycle from which rises are counted: the first one with a field.
 
     Parameters
     ----------
-    temperature : (cycle, y, x) ndarray, degC
+    temperature : (cycle, y, x) ndarray or DataArray, degC
         NaN where there is none.
     """
-    return int(np.flatnonzero(np.isfinite(temperature).any(axis=(1, 2)))[0])
+    return int(np.flatnonzero(cycles_with_field(temperature))[0])
 
 
 def rate(mean: Array, time: Array, *, since: np.datetime64 | None = None) -> Array:

@@ -24,6 +24,7 @@ from fusion.report.charts.style import (
 from fusion.report.wording import number
 from interferometry.figures import ACCENT, INK
 from thermography.fields.cycle_fields import plan_unit
+from thermography.fields.tasks.pieces import in_pieces
 
 #: Temperatures of a picture are rounded to 1/32 K, far below its noise, so that it is small when it is compressed.
 _STEP_PER_K = 32
@@ -189,11 +190,15 @@ def plot_rise_history(fields: xr.Dataset) -> Chart:
     Chart
     """
     rise = fields["temperature_rise"]
-    hours, flat = _hours(fields), rise.values.reshape(rise.sizes["cycle"], -1)
-    low, high, mean, most = np.full((4, len(flat)), np.nan)
-    shown = np.isfinite(flat).any(axis=1)
-    low[shown], high[shown] = np.nanpercentile(flat[shown], [10, 90], axis=1)
-    mean[shown], most[shown] = np.nanmean(flat[shown], axis=1), np.nanmax(flat[shown], axis=1)
+    hours = _hours(fields)
+    low, high, mean, most = np.full((4, rise.sizes["cycle"]), np.nan)
+    for some, piece in in_pieces(rise):
+        flat = piece.reshape(len(piece), -1)
+        shown = np.isfinite(flat).any(axis=1)
+        if not shown.any():
+            continue
+        low[some][shown], high[some][shown] = np.nanpercentile(flat[shown], [10, 90], axis=1)
+        mean[some][shown], most[some][shown] = np.nanmean(flat[shown], axis=1), np.nanmax(flat[shown], axis=1)
     unit, scale = ("h", 1.0) if hours[-1] >= _LEAST_HOURS else ("s", 3600.0)
     hours = scale * hours
     drawn = new_figure(x=f"time since first cycle / {unit}", y="rise / K")

@@ -180,16 +180,16 @@ def draw_map(
 def _thin(fields: xr.Dataset) -> tuple[xr.Dataset, str]:
     """Return the fields within the budget: every n-th cycle, then averages of blocks of cells; and the sentence that says so."""
     layers, cycles = len(fields.data_vars), fields.sizes["cycle"]
-    cells = fields.sizes["x"] * fields.sizes["y"]
+    x, y = fields.sizes["x"], fields.sizes["y"]
     note = []
-    block = int(np.ceil(np.sqrt(max(1.0, cells * layers * min(cycles, 25) / _MAP_BUDGET))))
+    block = int(np.ceil(np.sqrt(max(1.0, x * y * layers * min(cycles, 25) / _MAP_BUDGET))))
+    every = int(np.ceil((x // block) * (y // block) * layers * cycles / _MAP_BUDGET))
+    chosen = sorted({*range(0, cycles, every), cycles - 1})
+    fields = (fields.isel(cycle=chosen) if every > 1 else fields).load()
     if block > 1:
         fields = fields.coarsen(x=block, y=block, boundary="trim").mean(keep_attrs=True)
         note.append(f"The map shows means of {block} × {block} cells")
-    every = int(np.ceil(fields.sizes["x"] * fields.sizes["y"] * layers * cycles / _MAP_BUDGET))
     if every > 1:
-        chosen = sorted({*range(0, cycles, every), cycles - 1})
-        fields = fields.isel(cycle=chosen)
         note.append(f"{'' if note else 'The map shows '}{len(chosen)} of {cycles} cycles")
     return fields, f"{', '.join(note)}; fields.nc holds all." if note else ""
 

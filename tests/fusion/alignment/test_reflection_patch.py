@@ -39,14 +39,15 @@ def test_a_patch_of_a_long_test_is_found_among_the_largest_changes(warming, monk
     warming[:, 3:6, 8:12] += on[:, None, None]
     known = find_switching_patch(warming)
     monkeypatch.setattr("fusion.alignment.reflection_patch._MOST_CHANGES", 15)
-    monkeypatch.setattr("fusion.alignment.reflection_patch._FRAMES_AT_ONCE", 7)
+    monkeypatch.setattr("thermography.fields.tasks.pieces.PIECE_BYTES", 7 * 8 * 12 * 20)
     patch = find_switching_patch(warming)
     # The noise of 0.03 K is 2 % of the jump; the component of the fifteen largest changes differs by a part of that.
     np.testing.assert_allclose(patch.pattern, known.pattern, atol=0.02)
     np.testing.assert_allclose(patch.course, known.course, atol=0.02)
 
 
-def test_frames_of_a_long_test_are_never_held_in_double_precision():
+def test_frames_of_a_long_test_are_never_held_in_double_precision(monkeypatch):
+    monkeypatch.setattr("thermography.fields.tasks.pieces.PIECE_BYTES", 256 * 8 * 10 * 20)
     frames = np.random.default_rng(4).standard_normal((6000, 10, 20)).astype(np.float32)
     tracemalloc.start()
     try:

@@ -119,3 +119,12 @@ def test_readings_in_a_gap_between_frames_are_counted() -> None:
     assert "42 min from 2026-03-09T07:24:36Z to 2026-03-09T08:06:36Z" in check.evidence
     assert [gap_words(gap) for gap in find_gaps(kept)] == ["42 min from 2026-03-09T07:24:36Z to 2026-03-09T08:06:36Z"]
     assert check_gaps(np.delete(kept, np.arange(1, len(kept))), readings)[0].passed
+
+
+def test_a_long_series_is_checked_piece_by_piece_with_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    lit = np.zeros((FRAMES, ROWS, COLUMNS))
+    lit[18:28, 2:6, 10:16] = 1.0
+    lit[:, 0, :3] = np.nan
+    at_once = [check_place(fields(change_K)) for change_K in (None, lit)]
+    monkeypatch.setattr("thermography.fields.tasks.pieces.PIECE_BYTES", 7 * 8 * ROWS * COLUMNS)
+    assert [check_place(fields(change_K)) for change_K in (None, lit)] == at_once

@@ -12,14 +12,17 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from fusion.products import store
 from fusion.products.store import (
     DamagedProductError,
     OutputError,
     StageStamps,
     digest,
     finished_stages,
+    is_large,
     name_in_words,
     noted_messages,
+    open_dataset,
     plain,
     read_dataset,
     read_json_object,
@@ -28,6 +31,7 @@ from fusion.products.store import (
     write_dataset,
     write_json,
 )
+from thermography.fields.tasks.pieces import in_pieces
 
 
 def test_json_has_no_nan_and_times_are_utc(tmp_path: Path) -> None:
@@ -155,3 +159,35 @@ def test_what_is_no_json_object_holds_nothing(tmp_path: Path) -> None:
         assert read_json_object(path) == {}
     path.write_text('{"axis": "X"}', encoding="utf-8")
     assert read_json_object(path) == {"axis": "X"}
+
+
+def test_large_arrays_are_written_in_pieces_and_stay_in_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    monkeypatch.setattr(store, "IN_MEMORY_BYTES", 50_000)
+    monkeypatch.setattr(store, "_CHUNK_BYTES", 9_000)
+    monkeypatch.setattr("thermography.fields.tasks.pieces.PIECE_BYTES", 20_000)
+    rise = rng.normal(size=(100, 10, 20)).astype("f4")
+    rise[3, 2] = np.nan
+    whole = xr.Dataset(
+        {"rise": (("cycle", "y", "x"), rise), "count": (("cycle", "y", "x"), (10 * rise[::1] > 3).astype("i4"))},
+        {"cycle": np.arange(1, 101)},
+    )
+    path = write_dataset(tmp_path / "fields.nc", whole)
+    opened = open_dataset(path)
+    assert is_large(opened)
+    # Nothing of it is read before it is asked for, and then no more than that.
+    assert not opened["rise"].variable._in_memory and opened["cycle"].variable._in_memory
+    assert (opened["rise"][-1].values == rise[-1]).all() and not opened["rise"].variable._in_memory
+    assert np.concatenate([some for _, some in in_pieces(opened["rise"])]).tobytes() == rise.tobytes()
+    xr.testing.assert_identical(read_dataset(path), whole)
+    assert opened["rise"].encoding["chunksizes"] == (11, 10, 20)
+    opened.close()
+
+
+def test_a_small_dataset_is_opened_into_memory(tmp_path: Path) -> None:
+    path = write_dataset(tmp_path / "fields.nc", xr.Dataset({"rise": ("cycle", np.arange(3.0))}))
+    assert open_dataset(path)["rise"].variable._in_memory
+    (tmp_path / "bad.nc").write_bytes(path.read_bytes()[:200])
+    with pytest.raises(DamagedProductError, match=r"bad\.nc: is damaged"):
+        open_dataset(tmp_path / "bad.nc")

@@ -8,7 +8,6 @@ import pytest
 import xarray as xr
 
 from tests.thermography.plan_scene import DISCS, GRID, START, Scene, record
-from thermography.fields import cycle_fields
 from thermography.fields.cycle_fields import (
     CyclePart,
     FinishedParts,
@@ -18,7 +17,7 @@ from thermography.fields.cycle_fields import (
 )
 from thermography.fields.moving import reduce_moving_frames
 from thermography.fields.still import reduce_frames
-from thermography.fields.tasks import spool
+from thermography.fields.tasks import pieces, spool
 from thermography.registration.plan import PlanGrid
 from thermography.registration.register import register
 
@@ -118,7 +117,7 @@ def test_very_many_cycles_are_evaluated_some_at_a_time_with_the_same_bits(monkey
     assert finished[-1].span == 1 and len(finished[2:4]) == 2
     at_once = assemble_fields(parts, 14, PLAN, [covariance] * 2, [WHOLE] * 2)
     for limit in (1, 4 * 6 * 8 * 3):
-        monkeypatch.setattr(cycle_fields, "IN_MEMORY_BYTES", limit)
+        monkeypatch.setattr(pieces, "PIECE_BYTES", limit)
         monkeypatch.setattr(spool, "IN_MEMORY_BYTES", limit)
         in_turns = assemble_fields(finished, 14, PLAN, [covariance] * 2, [WHOLE] * 2, folder=tmp_path)
         for name in at_once.variables:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import tempfile
 import weakref
@@ -14,7 +15,7 @@ import numpy as np
 from thermography._typing import Array
 
 #: Arrays up to this size stay in memory, bytes.
-IN_MEMORY_BYTES = 1 << 24
+IN_MEMORY_BYTES = 1 << 23
 
 
 def empty_array(shape: tuple[int, ...], kind: Any, folder: Path | None = None) -> Array:
@@ -50,6 +51,24 @@ def _take_room(file: int, size: int) -> None:
         os.posix_fallocate(file, 0, size)
     else:
         os.ftruncate(file, size)
+
+
+def give_back(*arrays: Array) -> None:
+    """Give the memory of arrays in mapped files back to the system; their values stay in the files and are read again when needed.
+
+    Parameters
+    ----------
+    *arrays : ndarray
+        Or parts of them. Those in memory are left alone.
+    """
+    for array in arrays:
+        mapped: Any = array
+        while isinstance(mapped, np.ndarray) and not isinstance(mapped.base, mmap.mmap):
+            mapped = mapped.base
+        # A copy-on-write mapping would lose what was changed in it; Windows has no such call.
+        if isinstance(mapped, np.memmap) and mapped.mode != "c" and hasattr(mmap, "MADV_DONTNEED"):
+            pages: Any = mapped.base
+            pages.madvise(mmap.MADV_DONTNEED)
 
 
 class Spool(Sequence[Array]):

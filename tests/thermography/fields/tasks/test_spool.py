@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thermography.fields.tasks import spool as spool_module
-from thermography.fields.tasks.spool import Spool, empty_array
+from thermography.fields.tasks.spool import Spool, empty_array, give_back
 
 
 @pytest.mark.parametrize("in_memory", [1 << 24, 100])
@@ -49,3 +49,12 @@ def test_a_disk_that_is_too_small_is_named(monkeypatch, tmp_path):
     with pytest.raises(OSError, match=str(tmp_path)) as refused:
         empty_array((100, 100), np.float64, tmp_path)
     assert refused.value.errno == errno.ENOSPC and refused.value.filename == str(tmp_path)
+
+
+@pytest.mark.parametrize("mode", ["r+", "c"])
+def test_memory_that_is_given_back_loses_nothing(tmp_path, mode):
+    np.arange(5000.0).tofile(tmp_path / "array")
+    array = np.asarray(np.memmap(tmp_path / "array", float, mode))
+    array[7] = -1.0
+    give_back(array[3:9], np.zeros(3))
+    assert array[7] == -1.0 and array[4999] == 4999.0
