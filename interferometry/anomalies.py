@@ -363,11 +363,13 @@ def _series(estimated: xr.Dataset) -> tuple[list[_Series], Array]:
     labels, rows = [], []
     for target in range(z.shape[2]):
         measured = [d for d in range(z.shape[1]) if np.isfinite(z[:, d, target]).sum() >= SHORTEST_TEST_CYCLES]
-        single = {d: np.nan_to_num(z[:, d, target] - np.nanmean(z[:, d, target])) for d in measured}
+        centred = {d: np.nan_to_num(z[:, d, target] - np.nanmean(z[:, d, target])) for d in measured}
+        # Where all readings of an approach are left out, each stands at the limit: a series without any course.
+        single = {d: row for d, row in centred.items() if row.any()}
         for d, row in single.items():
             labels.append(_Series(target, names[d]))
             rows.append(row)
-        if len(measured) == 2:
+        if len(single) == 2:
             labels.append(_Series(target, "both"))
             rows.append((single[0] + single[1]) / np.sqrt(2))
     return labels, np.array(rows)

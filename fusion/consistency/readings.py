@@ -271,6 +271,10 @@ def _datum(deviations: xr.Dataset, noise_um: float) -> Check:
         return sound
     # Over two cycles, so that a jump within a cycle counts whole; the cycle between belongs to neither side.
     places = np.arange(_LEAST_SIDE - 1, level.size - _LEAST_SIDE + 1)
+    # Only sites that were read on both sides tell a jump from others being read.
+    places = places[np.isfinite(values[places + 1] - values[places - 1]).any(axis=1)]
+    if not places.size:
+        return sound
     jumps = level[places + 1] - level[places - 1]
     place = int(places[np.argmax(np.abs(jumps))])
     jump = values[place + 1] - values[place - 1]

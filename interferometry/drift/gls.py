@@ -50,6 +50,8 @@ _OUTLIER_LIMIT = 3.0
 _LARGEST_EXCESS = 1e6
 #: A whitened column is collinear with those before it where they leave less than this share of its squared length unexplained.
 _DEPENDENCE_TOLERANCE = 1e-10
+#: Share of the whitened response's square that each degree of freedom loses to rounding in its sums.
+_ROUNDING = float(np.finfo(float).eps)
 #: So many fixed effects of single sites take part in the search for the variances of the drift at most.
 _MOST_SITES = 160
 #: The drift is taken as an integrated random walk only if that raises the restricted log-likelihood by this much: where both fit,
@@ -210,7 +212,8 @@ def _solve(system: DriftSystem, problem: _Problem) -> DriftFit:
         raise DriftModelError(
             f"{freedom + scale.size} readings cannot determine {scale.size} coefficients; measure more cycles"
         )
-    rss = max(float(swept[0, 0]), 0.0)
+    # What is left below the rounding of the sums is not known: taken for nothing, it would be of infinite likelihood.
+    rss = max(float(swept[0, 0]), freedom * _ROUNDING * float(gram[0, 0]))
     sigma2 = rss / freedom
     log_normal += 2.0 * float(np.log(scale).sum())
     log_likelihood = -0.5 * (freedom * np.log(max(sigma2, 1e-300)) + log_determinant + log_normal)
@@ -249,10 +252,7 @@ def _maximise(system: DriftSystem, response: Array, design: Array, start: Array 
     components = system.loadings.shape[1]
     problem = _Problem.of(response, design)
     searched, few = _for_search(system, problem)
-    # Ratios are searched per component in units that make the drift over one hour comparable to one reading's noise.
-    unit = np.log10(1.0 / 3600.0 ** (1.0 if system.order == 1 else 3.0)) - 2 * np.log10(
-        np.maximum(np.abs(system.loadings).max(axis=0), 1e-12)
-    )
+    unit = _log_ratio_unit(system)
 
     def ratios(log_ratio: Array) -> Array:
         return np.asarray(10.0 ** (unit + np.clip(log_ratio, low, high)))
@@ -274,6 +274,13 @@ def _maximise(system: DriftSystem, response: Array, design: Array, start: Array 
         },
     )
     return _solve(replace(system, ratios=ratios(optimum.x)), problem)
+
+
+def _log_ratio_unit(system: DriftSystem) -> Array:
+    """Logarithm of the ratio of each component at which its drift over one hour is comparable to the noise of one reading."""
+    return np.log10(1.0 / 3600.0 ** (1.0 if system.order == 1 else 3.0)) - 2 * np.log10(
+        np.maximum(np.abs(system.loadings).max(axis=0), 1e-12)
+    )
 
 
 def _for_search(system: DriftSystem, problem: _Problem) -> tuple[DriftSystem, _Problem]:
@@ -332,6 +339,7 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
     system, problem = fit.system, _Problem.of(fit.response, fit.design)
     span = float(system.seconds[-1] - system.seconds[0])
     first_s = _SETTLING_SHARE * span
+    largest = _log_ratio_unit(system) + _LOG_RATIO_LIMITS[1]
     searched, few = _for_search(system, problem)
     constant = fit.log_likelihood if few is problem else _solve(searched, few).log_likelihood
 
@@ -340,7 +348,9 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
         return _solve(replace(searched, ratios=10.0**log_ratio, process_noise_scale=scale), few)
 
     def likelihood(log_ratio: Array, time_s: float, exponent: float) -> float:
-        # Far out in the search a column may vanish beside the noise: no model, and not the end of the search.
+        # Far out in the search the drift hides everything else, or a column vanishes beside it: no model, and not the end of the search.
+        if (log_ratio > largest).any():
+            return -np.inf
         try:
             return float(fitted(log_ratio, time_s, exponent).log_likelihood)
         except DriftModelError:

@@ -324,3 +324,38 @@ def test_the_direction_of_an_excess_is_told_by_the_scatter_of_the_other_position
     assert _scatter_direction(estimated, 0, np.arange(1, 4)) == "negative"
     estimated["scatter"][0, 0] = 8.0
     assert _scatter_direction(estimated, 0, np.arange(1, 4)) == "both"
+
+
+def test_an_approach_whose_readings_are_all_left_out_has_no_course(rng: np.random.Generator) -> None:
+    standardised = rng.normal(size=(40, 2, 3))
+    standardised[:, 1, 2] = np.inf
+    labels, values = anomalies_module._series(
+        xr.Dataset(
+            {"standardised": (("cycle", "direction", "target"), standardised)},
+            coords={"direction": ["positive", "negative"]},
+        )
+    )
+    assert [(label.target, label.direction) for label in labels] == [
+        *((target, direction) for target in (0, 1) for direction in ("positive", "negative", "both")),
+        (2, "positive"),
+    ]
+    assert (values.std(axis=1) > 0.5).all()
+
+
+def test_readings_are_shuffled_within_their_pass(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
+    """Three cycles from both sides at two targets, of which one reading is missing: six passes, one of a single reading."""
+    seen = []
+    monkeypatch.setattr(anomalies_module, "_largest_excess", lambda *given: seen.append(given) or np.zeros(1))
+    z = rng.normal(size=(3, 2, 2))
+    z[1, 0, 1] = np.nan
+    anomalies_module._scatter_test(z, 1, rng)
+    assert seen[0][4].tolist() == [0, 2, 4, 5, 7, 9, 11]
+
+
+def test_the_limit_of_a_second_outlier_is_that_of_the_values_without_the_first() -> None:
+    """Nine values beside a first outlier, one side at 0.05: 2.110 standard deviations (Grubbs 1969, Technometrics 11, 1, table 1)."""
+    eight = np.linspace(-1.0, 1.0, 8)
+    for deviate, outliers in ((2.10, 1), (2.12, 2)):
+        # With x beside eight values of mean 0 and sum of squares q, x - mean = 8/9 x and 8 s^2 = q + 8/9 x^2.
+        x = np.sqrt((eight**2).sum() * deviate**2 / 8.0 / ((8.0 / 9.0) ** 2 - deviate**2 / 9.0))
+        assert generalised_esd(np.append(eight, [x, 1000.0]), most=2, high_only=True).sum() == outliers

@@ -132,6 +132,18 @@ def test_a_new_datum_is_named_with_its_cycle_and_size(first: int, size_um: float
     assert "two campaigns" in check.remedy and "clamping" in check.remedy
 
 
+def test_cycles_that_have_no_site_in_common_tell_no_jump() -> None:
+    """Two cycles of one half of the targets, two of the other: the cycles before and after any cycle share no site."""
+    deviations = sound()
+    half = (np.arange(CYCLES) // 2 % 2)[:, None] == (np.arange(TARGETS) < TARGETS // 2)
+    alternating = with_deviation(deviations, np.where(half[:, None, :], deviations["deviation"].values, np.nan))
+    assert "datum" not in failed(alternating)
+    # One cycle with all targets has a site in common with its neighbours but one, and nothing has jumped.
+    half[20] = True
+    nearly = with_deviation(deviations, np.where(half[:, None, :], deviations["deviation"].values, np.nan))
+    assert "datum" not in failed(nearly)
+
+
 def test_a_jump_of_some_targets_or_a_small_slip_is_no_new_datum() -> None:
     some, small = sound(), sound()
     some["deviation"][20:, :, 6:] += 20.0

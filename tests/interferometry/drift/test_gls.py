@@ -237,6 +237,24 @@ def test_a_drift_that_settles_has_larger_process_noise_at_the_start_only(rng):
     assert (estimate(seconds, loadings, wandering, columns, settling=True).system.step_scales == 1.0).all()
 
 
+def test_readings_that_a_drift_follows_to_the_last_have_a_noise_all_the_same(rng):
+    """Without noise of its own, a walk of 1 um from reading to reading: rounding of the sums is never taken for an exact fit."""
+    seconds = np.sort(rng.uniform(0, 2000, 120))
+    site = rng.integers(0, 30, 120)
+    loadings = np.column_stack([np.ones(120), np.arange(30)[site] / 29.0])
+    design = np.eye(30)[site]
+    wild = np.cumsum(rng.normal(0, 1.0, 120)) * loadings[:, 0] + np.cumsum(rng.normal(0, 1.0, 120)) * loadings[:, 1]
+    fit = estimate(seconds, loadings, wild - 500.0, design, order=1, settling=True)
+    # The drift that hides everything else: 10^4 times the variance of a reading in an hour, also at the start.
+    assert (fit.system.ratios * fit.system.step_scales[0] <= 1.001e4 / 3600.0).all()
+    assert 1e-3 < fit.sigma < 1.0
+    exact = fit_fixed_effects(
+        drift_system(seconds, loadings, order=1, ratios=[0.1, 0.1]), 7.0 * design[:, 3] - 500.0, design
+    )
+    assert 0.0 < exact.sigma < 1e-4
+    assert np.isfinite(exact.log_likelihood)
+
+
 def test_an_even_choice_of_very_many_sites_knows_the_variances_of_the_drift(rng, monkeypatch):
     seconds, loadings, y, design = simulated_test(rng)[:4]
     every = estimate(seconds, loadings, y, design, order=1, settling=True)
