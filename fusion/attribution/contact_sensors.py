@@ -161,8 +161,7 @@ def choose_sensors(
     weight = {"common": 1.0, "proportional": float((readings.design[:, 1] ** 2).mean())}
     tasks = [_Task.build(channel, operators) for channel in series]
     most = min(most, contact.shape[1])
-    whole = [_Part(task, np.ones(task.series.values.size, bool)) for task in tasks]
-    chosen = _place(whole, [_fit(part, modes) for part in whole], contact, most)
+    chosen = _place_by_all(tasks, modes, contact, most)
     rows, columns = np.divmod(np.flatnonzero(seen)[chosen], field.sizes["x"])
     places = tuple((float(field["x"][c]), float(field["y"][r])) for r, c in zip(rows, columns, strict=True))
     predictions = _predict_held_out(tasks, modes, contact, most)
@@ -201,7 +200,9 @@ class _Part:
         ones = np.ones((self.values.size, 1))
         grid = whitening_grid(series.seconds[kept], series.variance[kept], ones)
         self.freedom = grid.freedom
-        self.projects = np.stack([point.project for point in grid.whitenings])
+        self.projects = np.empty((len(grid.whitenings), self.values.size, self.values.size))
+        for g, point in enumerate(grid.whitenings):
+            self.projects[g] = point.project
         self.penalty = np.array([point.log_penalty for point in grid.whitenings])
         self.white = self.projects @ self.values
 
@@ -259,7 +260,8 @@ def _place(parts: Sequence[_Part], fits: Sequence[_Fit], contact: Array, most: i
     states = []
     for part, fit in zip(parts, fits, strict=True):
         project = part.projects[fit.drift]
-        states.append((project.T @ project, part.columns(contact)[fit.lag]))
+        # A copy: that of one lag, without the others.
+        states.append((project.T @ project, part.columns(contact)[fit.lag].copy()))
     for _ in range(most):
         gain = np.zeros(contact.shape[1])
         for part, fit, (inverse, columns) in zip(parts, fits, states, strict=True):
@@ -276,6 +278,12 @@ def _place(parts: Sequence[_Part], fits: Sequence[_Fit], contact: Array, most: i
             informed = 1.0 + fit.prior * float(columns[:, chosen[-1]] @ moved)
             states[k] = (inverse - fit.prior * np.outer(moved, moved) / informed, columns)
     return chosen
+
+
+def _place_by_all(tasks: Sequence[_Task], modes: Array, contact: Array, most: int) -> list[int]:
+    """Choose cells by all values; what is whitened for that, which is large, ends here."""
+    parts = [_Part(task, np.ones(task.series.values.size, bool)) for task in tasks]
+    return _place(parts, [_fit(part, modes) for part in parts], contact, most)
 
 
 def _predict_held_out(tasks: Sequence[_Task], modes: Array, contact: Array, most: int) -> list[Array]:

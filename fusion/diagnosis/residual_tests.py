@@ -8,7 +8,7 @@ that are flat or linear along the axis are absorbed by the drift; their size is 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from fusion._typing import Array
 from fusion.diagnosis import remainder
 from fusion.effects.events import off_the_cycle
 from fusion.model.fit import ModelFit, unexplained_drift
+from thermography.fields.tasks.spool import empty_arrays, give_back
 
 _PERMUTATIONS = 400
 #: Number of autocorrelations tested, in readings; a cycle has some thirty readings.
@@ -32,6 +33,8 @@ _CLIP = 4.0
 _LIMIT = 0.95
 #: Permutations that are evaluated at once at most, and values of them, 8 MB.
 _BATCH, _VALUES_AT_ONCE = 50, 2**20
+#: Values of waves that lie together, 16 MB.
+_WAVES_AT_ONCE = 2**22
 
 
 @dataclass(frozen=True)
@@ -108,10 +111,7 @@ def examine_residual(model: ModelFit, rng: np.random.Generator) -> ResidualTests
     clipped = np.clip(innovations, -_CLIP, _CLIP)
     window = max(2, round(readings.seconds.size / np.unique(readings.cycle).size))
     periods = _periods_min(readings.seconds)
-    waves = np.empty((readings.seconds.size, 2 * periods.size), np.float32)
-    for k, period in enumerate(periods):
-        phase = 2 * np.pi * readings.seconds / (60.0 * period)
-        waves[:, k], waves[:, periods.size + k] = np.cos(phase), np.sin(phase)
+    waves = _waves(readings.seconds, periods)
     memory, shift, power = _time_statistics(clipped[None, :], window, waves)
     null = [_largest(*_time_statistics(some, window, waves)) for some in _permutations_of(clipped, rng)]
     memories, shifts, strongest = (np.concatenate(largest) for largest in zip(*null, strict=True))
@@ -144,6 +144,18 @@ def _periods_min(seconds: Array) -> Array:
     return np.asarray(1.0 / np.arange(lowest, highest, step, dtype=np.float64)[:_MOST_PERIODS])
 
 
+def _waves(seconds: Array, periods_min: Array) -> list[NDArray[np.float32]]:
+    """Return cosines and sines of some periods each, (n, 2 some), all sines after all cosines; those of a long test on disk."""
+    parts = np.array_split(periods_min, 1 + 2 * periods_min.size * seconds.size // _WAVES_AT_ONCE)
+    waves = empty_arrays([(seconds.size, 2 * some.size) for some in parts], np.float32)
+    for some, of_some in zip(parts, waves, strict=True):
+        for k, period in enumerate(some):
+            phase = 2 * np.pi * seconds / (60.0 * period)
+            of_some[:, k], of_some[:, some.size + k] = np.cos(phase), np.sin(phase)
+        give_back(of_some)
+    return waves
+
+
 def _permutations_of(values: Array, rng: np.random.Generator) -> Iterator[Array]:
     """Yield permutations (some, n) of values (n,), some at a time."""
     at_once = min(_BATCH, max(1, _VALUES_AT_ONCE // values.size))
@@ -156,21 +168,24 @@ def _largest(memory: Array, shift: Array, power: Array) -> tuple[Array, Array, A
     return memory, shift.max(axis=1), power.max(axis=1)
 
 
-def _time_statistics(series: Array, window: int, waves: NDArray[np.float32]) -> tuple[Array, Array, Array]:
+def _time_statistics(series: Array, window: int, waves: Sequence[NDArray[np.float32]]) -> tuple[Array, Array, Array]:
     """Return statistics of series (r, n): memory (r,), size of a shift from each reading on (r, n - window + 1), and power (r, m).
 
     Memory is the sum of squared autocorrelations (Box and Pierce 1970). A shift appears in the innovations as one cycle of readings,
-    `window`, of the same sign. Power is that of Lomb (1976) for orthogonal sine and cosine, the columns of `waves` (n, 2 m).
+    `window`, of the same sign. Power is that of Lomb (1976) for orthogonal sine and cosine, the `waves` of `_waves`.
     """
     centred = series - series.mean(axis=1, keepdims=True)
     variance = np.maximum((centred**2).mean(axis=1), 1e-300)
     lagged = [(centred[:, k:] * centred[:, :-k]).mean(axis=1) / variance for k in range(1, _LAGS + 1)]
     total = np.cumsum(np.pad(centred, ((0, 0), (1, 0))), axis=1)
     shift = np.abs(total[:, window:] - total[:, :-window]) / np.sqrt(window)
-    projected = np.asarray(centred.astype(np.float32) @ waves, np.float64) ** 2
-    half = waves.shape[1] // 2
-    power = (projected[:, :half] + projected[:, half:]) / (series.shape[1] * variance[:, None])
-    return np.asarray(np.sum(np.square(lagged), axis=0)), shift, power
+    single, powers = centred.astype(np.float32), []
+    for some in waves:
+        projected = np.asarray(single @ some, np.float64) ** 2
+        half = some.shape[1] // 2
+        powers.append((projected[:, :half] + projected[:, half:]) / (series.shape[1] * variance[:, None]))
+        give_back(some)
+    return np.asarray(np.sum(np.square(lagged), axis=0)), shift, np.hstack(powers)
 
 
 def _p_value(observed: float, null: Array) -> float:

@@ -31,6 +31,8 @@ from fusion.model.products import Products, by_width, sum_products, sum_products
 from fusion.model.profile_gain import gains_by_products
 from interferometry.drift.gls import DriftFit
 from interferometry.drift.state_space import DriftSystem
+from thermography.fields.tasks.pieces import in_pieces
+from thermography.fields.tasks.spool import empty_arrays, give_back
 
 #: Probability that an effect which is absent passes its confirmation; the multiplicity of the search is accounted for before.
 CONFIRMATION_LEVEL = 0.1
@@ -219,18 +221,24 @@ def ask_hold_out(model: ModelFit, candidate: Candidate, rng: np.random.Generator
     priors = prior_rows(model, rng)
     null = simulate_null(fit, rng, over=replace(whole, observed=np.ones_like(whole.observed)))
     columns = np.column_stack([design, candidate.columns])
-    responses = np.array_split(null, 1 + null.size // _VALUES_AT_ONCE, axis=1)
+    responses = _in_parts(null, 1 + null.size // _VALUES_AT_ONCE)
+    del null
     responses[0] = np.column_stack([model.readings.response, responses[0]])
     likelihood: dict[bool, list[Array]] = {False: [], True: []}
     error: dict[bool, list[Array]] = {False: [], True: []}
     for system in scaled_systems(fit, SHIFT_AND_STRETCH, over=whole):
-        seen, x, y = _open_loop(system, columns, responses)
+        seen, x, ahead = _open_loop(system, columns, responses)
         seen = priors.add_to(seen)
         for with_candidate in (False, True):
             moments = seen if with_candidate else seen.first(design.shape[1])
             beta = solve(moments.design, moments.cross)
             likelihood[with_candidate].append(profile_likelihood(moments))
-            error[with_candidate].append(((y - x[:, : beta.shape[0]] @ beta) ** 2).mean(axis=0))
+            each = np.split(beta, np.cumsum([some.shape[1] for some in ahead])[:-1], axis=1)
+            error[with_candidate].append(
+                np.concatenate(
+                    [((y - x[:, : beta.shape[0]] @ own) ** 2).mean(axis=0) for y, own in zip(ahead, each, strict=True)]
+                )
+            )
     before, after = (
         np.sqrt(np.take_along_axis(np.array(error[key]), np.argmax(likelihood[key], axis=0)[None, :], axis=0)[0])
         for key in (False, True)
@@ -238,8 +246,21 @@ def ask_hold_out(model: ModelFit, candidate: Candidate, rng: np.random.Generator
     return float(before[0]), float(after[0]), float((1 + (after[1:] <= after[0]).sum()) / after.size)
 
 
-def _open_loop(system: DriftSystem, design: Array, responses: Sequence[Array]) -> tuple[Moments, Array, Array]:
-    """Products over the observed readings, and prediction errors of the others: of the design (m, p) and of all responses (m, r).
+def _in_parts(responses: Array, count: int) -> list[Array]:
+    """Responses (n, r) in matrices of some columns each, so that one of them is read without the others."""
+    if count == 1:
+        return [responses]
+    columns = np.array_split(responses, count, axis=1)
+    parts = empty_arrays([some.shape for some in columns], float)
+    for part, some in zip(parts, columns, strict=True):
+        for rows, values in in_pieces(some):
+            part[rows] = values
+        give_back(part)
+    return parts
+
+
+def _open_loop(system: DriftSystem, design: Array, responses: Sequence[Array]) -> tuple[Moments, Array, list[Array]]:
+    """Products over the observed readings, and prediction errors of the others: of the design (m, p) and of all responses (m, some).
 
     Responses come in matrices (n, some) that are filtered one after another.
     """
@@ -255,6 +276,7 @@ def _open_loop(system: DriftSystem, design: Array, responses: Sequence[Array]) -
         seen /= roots
         cross.append(x.T @ seen)
         squares.append((seen**2).sum(axis=0))
+        give_back(some)
     log_spread = float(np.log(spread[train]).sum())
     moments = Moments(x.T @ x, np.hstack(cross), np.concatenate(squares), x.shape[0], log_spread)
-    return moments, errors[~train], np.hstack(ahead)
+    return moments, errors[~train], ahead

@@ -11,6 +11,7 @@ from fusion._typing import Array
 from fusion.model.drift_variances import plausible_ratios
 from interferometry.drift.gls import DriftFit
 from interferometry.drift.state_space import DriftSystem
+from thermography.fields.tasks.spool import empty_array, give_back
 
 DRAWS = 200
 #: Readings that are simulated together, 0.4 MB of random numbers, which stay in the cache of a processor.
@@ -38,16 +39,17 @@ def simulate_null(
     noise, share = fit.noise()
     system = fit.system if over is None else over
     relative = noise / np.sqrt(np.maximum(share, 1e-12))
-    # Some readings at a time: these are the largest numbers of a long test.
-    drawn = np.empty((system.seconds.size, draws))
+    # Some readings at a time, and those of a long test on disk: these are its largest numbers.
+    drawn, scale = empty_array((system.seconds.size, draws), float), np.sqrt(system.variance)[:, None]
     for rows in _blocks(system.seconds.size):
-        drawn[rows] = rng.choice(relative, size=(rows.stop - rows.start, draws))
-    drawn *= np.sqrt(system.variance)[:, None]
+        drawn[rows] = rng.choice(relative, size=(rows.stop - rows.start, draws)) * scale[rows]
+        give_back(drawn)
     ratios = plausible_ratios(fit, rng, draws=draws)
     for ratio, loading in zip(ratios.T, system.loadings.T, strict=True):
         walks = random_walk(system, _normal_numbers(system, draws, rng))
         for walk, rows in zip(walks, _blocks(system.seconds.size), strict=True):
             drawn[rows] += walk * (fit.sigma * np.sqrt(ratio)) * loading[rows, None]
+            give_back(drawn)
     return drawn
 
 

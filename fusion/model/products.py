@@ -17,6 +17,7 @@ from fusion._typing import Array
 from fusion.effects.effect import Candidate, Separable, Wave
 from fusion.model.least_squares import Moments, PriorRows
 from interferometry.drift.state_space import DriftSystem
+from thermography.fields.tasks.spool import give_back
 
 #: Values that are whitened together, 4 MB: enough for products of whole matrices, few enough to stay in the processor's cache.
 _VALUES_AT_ONCE = 2**19
@@ -359,6 +360,7 @@ def _sums_over(
             for part, products in zip(parts, of_parts, strict=True):
                 counted = part[rows]
                 products.add(*((whitened, roots) if counted.all() else (whitened[counted], roots[counted])))
+        give_back(*measured)
     return sums
 
 

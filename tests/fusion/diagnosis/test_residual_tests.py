@@ -76,7 +76,7 @@ def test_memory_shift_and_power_of_series_that_are_known():
     turns = 2 * np.pi * n[:, None] * np.array([6.0, 11.0]) / 40.0
     waves = np.hstack([np.cos(turns), np.sin(turns)]).astype(np.float32)
     series = np.stack([np.sin(2 * np.pi * 6.0 * n / 40.0 + 0.3), 5.0 + np.where(n < 20, -1.0, 1.0)])
-    memory, shift, power = module._time_statistics(series, 10, waves)
+    memory, shift, power = module._time_statistics(series, 10, [waves])
     # All of the variance at one frequency: n / 2 in units of white noise.
     np.testing.assert_allclose(power[0], [20.0, 0.0], atol=1e-4)
     # Ten readings of one sign over the root of their number; none where five are of either sign.
@@ -90,3 +90,16 @@ def test_memory_shift_and_power_of_series_that_are_known():
 def test_a_permutation_p_value_counts_the_measured_order_as_one():
     assert module._p_value(3.0, np.array([1.0, 2.0, 3.0, 4.0])) == 3 / 5
     assert module._p_value(5.0, np.array([1.0, 2.0, 3.0, 4.0])) == 1 / 5
+
+
+def test_waves_of_a_long_test_lie_in_parts_with_the_same_power(monkeypatch, rng):
+    seconds, periods = 60.0 * np.arange(200.0), np.array([60.0, 30.0, 20.0, 15.0, 12.0])
+    series = rng.standard_normal((3, 200))
+    (whole,) = module._waves(seconds, periods)
+    expected = module._time_statistics(series, 10, [whole])
+    monkeypatch.setattr(module, "_WAVES_AT_ONCE", 1000)
+    monkeypatch.setattr("thermography.fields.tasks.spool.IN_MEMORY_BYTES", 100)
+    parts = module._waves(seconds, periods)
+    assert [part.shape for part in parts] == [(200, 4), (200, 4), (200, 2)]
+    # Products in single precision.
+    np.testing.assert_allclose(module._time_statistics(series, 10, parts)[2], expected[2], rtol=1e-5)

@@ -202,3 +202,12 @@ def test_an_effect_that_is_present_answers_the_question(rng):
 def test_a_column_of_zeros_changes_nothing(rng):
     before, after, _ = ask_hold_out(model_of(measured(), used=TRAINING), candidate(np.zeros(BARE.seconds.size)), rng)
     assert after == pytest.approx(before, rel=1e-9)
+
+
+def test_the_question_to_a_long_hold_out_set_is_answered_in_parts(monkeypatch):
+    at_once = ask_hold_out(model_of(measured(), used=TRAINING), candidate(WAVE), np.random.default_rng(3))
+    monkeypatch.setattr("fusion.loop.confirmation._VALUES_AT_ONCE", 5000)
+    monkeypatch.setattr("thermography.fields.tasks.spool.IN_MEMORY_BYTES", 100)
+    in_parts = ask_hold_out(model_of(measured(), used=TRAINING), candidate(WAVE), np.random.default_rng(3))
+    # The products of matrices of another width are rounded differently.
+    np.testing.assert_allclose(in_parts, at_once, rtol=1e-9)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import tempfile
@@ -43,6 +44,19 @@ def empty_array(shape: tuple[int, ...], kind: Any, folder: Path | None = None) -
             raise OSError(error.errno, error.strerror, str(folder or tempfile.gettempdir())) from error
         # An array of its own and not a memmap, which NumPy would pass on as the type of every result.
         return np.asarray(np.memmap(file, kind, "r+", shape=shape))
+
+
+def empty_arrays(shapes: Sequence[tuple[int, ...]], kind: Any) -> list[Array]:
+    """Return arrays to be filled, all in memory, or, where they are large together, in one temporary file, see `empty_array`.
+
+    Parameters
+    ----------
+    shapes : sequence of tuple of int
+    kind : dtype
+    """
+    ends = np.cumsum([math.prod(shape) for shape in shapes])
+    parts = np.split(empty_array((int(ends[-1]),), kind), ends[:-1])
+    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
 
 
 def _take_room(file: int, size: int) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thermography.fields.tasks import spool as spool_module
-from thermography.fields.tasks.spool import Spool, empty_array, give_back
+from thermography.fields.tasks.spool import Spool, empty_array, empty_arrays, give_back
 
 
 @pytest.mark.parametrize("in_memory", [1 << 24, 100])
@@ -58,3 +58,14 @@ def test_memory_that_is_given_back_loses_nothing(tmp_path, mode):
     array[7] = -1.0
     give_back(array[3:9], np.zeros(3))
     assert array[7] == -1.0 and array[4999] == 4999.0
+
+
+@pytest.mark.parametrize("in_memory", [1 << 24, 100])
+def test_arrays_that_lie_one_after_the_other_are_apart(monkeypatch, in_memory):
+    monkeypatch.setattr(spool_module, "IN_MEMORY_BYTES", in_memory)
+    parts = empty_arrays([(40, 3), (40, 2), (7,)], np.float32)
+    for number, part in enumerate(parts):
+        part[...] = number
+        give_back(part)
+    assert [part.shape for part in parts] == [(40, 3), (40, 2), (7,)]
+    assert all(part.flags.c_contiguous and (part == number).all() for number, part in enumerate(parts))
