@@ -39,9 +39,10 @@ from interferometry.drift.state_space import (
     start_columns,
 )
 
-#: Search limits of log10(process noise over reading variance), in units that make the drift of one hour comparable to the noise of
-#: one reading: from a drift far below the noise to one that hides everything else.
-_LOG_RATIO_LIMITS = (-14.0, 4.0)
+#: Search limits of log10(process noise over reading variance) of either order, in units that make the drift of one hour comparable to the
+#: noise of one reading: from a drift far below the noise to one that hides everything else. A random walk that is a hundred times the noise
+#: passes for noise itself; an integrated one stays smooth, and a good laser reads 10 nm beside 100 um of drift.
+_LOG_RATIO_LIMITS: dict[Order, tuple[float, float]] = {1: (-14.0, 4.0), 2: (-14.0, 8.0)}
 #: Edge of the first simplex, decades.
 _FIRST_STEP = 1.5
 #: A reading whose deletion residual exceeds this many standard deviations is down-weighted (robust fit).
@@ -248,7 +249,7 @@ def _sweep(gram: Array) -> tuple[Array, float, int]:
 
 def _maximise(system: DriftSystem, response: Array, design: Array, start: Array | None) -> DriftFit:
     """Restricted maximum likelihood of the variance ratios by a bounded simplex in their logarithm."""
-    low, high = _LOG_RATIO_LIMITS
+    low, high = _LOG_RATIO_LIMITS[system.order]
     components = system.loadings.shape[1]
     problem = _Problem.of(response, design)
     searched, few = _for_search(system, problem)
@@ -265,7 +266,7 @@ def _maximise(system: DriftSystem, response: Array, design: Array, start: Array 
         lambda log_ratio: -_solve(replace(searched, ratios=ratios(log_ratio)), few).log_likelihood,
         guess,
         method="Nelder-Mead",
-        bounds=[_LOG_RATIO_LIMITS] * components,
+        bounds=[(low, high)] * components,
         options={
             "initial_simplex": simplex,
             "xatol": 0.03,
@@ -339,7 +340,7 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
     system, problem = fit.system, _Problem.of(fit.response, fit.design)
     span = float(system.seconds[-1] - system.seconds[0])
     first_s = _SETTLING_SHARE * span
-    largest = _log_ratio_unit(system) + _LOG_RATIO_LIMITS[1]
+    largest = _log_ratio_unit(system) + _LOG_RATIO_LIMITS[system.order][1]
     searched, few = _for_search(system, problem)
     constant = fit.log_likelihood if few is problem else _solve(searched, few).log_likelihood
 
@@ -451,6 +452,10 @@ def estimate(
     if order is None:
         walk = _maximise(system(1, neutral), response, with_trends, None)
         smooth = _maximise(system(2, neutral), response, with_trends, None)
+        # The simplex can lose a component on its way: where the smooth drift is likelier by the sizes that the walk has, it starts there.
+        as_walk = 10.0 ** (np.log10(walk.system.ratios) - _log_ratio_unit(walk.system) + _log_ratio_unit(smooth.system))
+        if fit_fixed_effects(system(2, as_walk), response, with_trends).log_likelihood > smooth.log_likelihood:
+            smooth = _maximise(system(2, neutral), response, with_trends, as_walk)
         order = 2 if smooth.log_likelihood > walk.log_likelihood + _SMOOTH_MARGIN else 1
         start = (walk if order == 1 else smooth).system.ratios
     columns = design if order == 1 else with_trends
