@@ -20,6 +20,8 @@ from thermography.fields.tasks.pieces import in_pieces, piece_slices
 
 #: A change counts as a jump where it exceeds the usual change of its patch this many times (robust sigma).
 _JUMP_SIGMAS = 8.0
+#: ... and beside another one this many times: a source that is switched while a frame is taken jumps twice.
+_PART_SIGMAS = 3.0
 #: A patch stands out where its jump is this much larger than the same jump averaged over the table; a camera offset has 1.
 _LOCAL_RATIO = 3.0
 _MIN_FRAMES = 9
@@ -36,7 +38,7 @@ class SwitchingPatch:
     pattern : (y, x) ndarray
         Relative size of the jump, about 1 on the patch, 0 where the plan is not seen.
     course : (time,) ndarray, K
-        Sum of all jumps up to each frame, on the patch.
+        How much warmer than at first each frame shows the patch by its jumps.
     """
 
     pattern: Array
@@ -78,7 +80,8 @@ def find_switching_patch(frames: Array | xr.DataArray) -> SwitchingPatch | None:
     -----
     Sudden changes are differences of neighbouring frames minus the median of the differences around them. Their first principal
     component is the patch; its scores beyond 8 robust standard deviations are the jumps. In a long test it is the component of the
-    thousand largest changes, brought closer to that of all by one step of the power method.
+    thousand largest changes, brought closer to that of all by one step of the power method. The course follows the jumps as far as
+    levels that do not wander allow (docs/method/effects.md).
     """
     if frames.shape[0] < _MIN_FRAMES:
         return None
@@ -94,15 +97,34 @@ def find_switching_patch(frames: Array | xr.DataArray) -> SwitchingPatch | None:
         component = np.asarray(along_all / np.linalg.norm(along_all))
         score = np.concatenate([sudden @ component for sudden in _sudden_changes(frames, seen)])
     score /= component @ component
-    scatter = stats.median_abs_deviation(score, scale="normal")
-    jumps = np.where(np.abs(score) > _JUMP_SIGMAS * max(scatter, 1e-9), score, 0.0)
+    scatter = max(float(stats.median_abs_deviation(score, scale="normal")), 1e-9)
+    jumps = np.abs(score) > _JUMP_SIGMAS * scatter
     # The upper percent stands for the patch's own height, so that one noisy cell does not make a pattern local.
     height = float(np.quantile(component, 0.99))
     if not jumps.any() or height < _LOCAL_RATIO * abs(float(component.mean())):
         return None
     pattern = np.zeros(seen.shape)
     pattern[seen] = component / height
-    return SwitchingPatch(pattern, np.concatenate([[0.0], np.cumsum(jumps)]) * height)
+    return SwitchingPatch(pattern, _course(score, jumps, scatter) * height)
+
+
+def _course(score: Array, jumps: NDArray[np.bool_], scatter: float) -> Array:
+    """Levels of a switching source, (time,), from its changes (time - 1,), of which some are jumps; the first level is zero.
+
+    A sum of jumps is a random walk of their errors. The levels of a source are not: with independent ones of variance :math:`s^2` a change
+    has :math:`2 s^2`, and the levels minimise the squared errors of the changes over that of noise, plus the squared levels over
+    :math:`s^2`.
+    """
+    beside = np.convolve(jumps, [1, 1, 1], mode="same") > 0
+    switched = jumps | (beside & (np.abs(score) > _PART_SIGMAS * scatter))
+    changes = score[switched]
+    wander = 2.0 * scatter**2 / float(np.mean(score[jumps] ** 2))
+    # Each change is the difference of two levels, so that the normal equations have two diagonals.
+    bands = np.full((2, changes.size + 1), -1.0)
+    bands[1] = 2.0 + wander
+    bands[1, [0, -1]] = 1.0 + wander
+    levels = linalg.solveh_banded(bands, np.diff(-changes, prepend=0.0, append=0.0))
+    return np.asarray((levels - levels[0])[np.concatenate([[0], np.cumsum(switched)])])
 
 
 def _largest(changes: Iterable[Array]) -> Array:
