@@ -42,6 +42,7 @@ from fusion.loop.closed_loop import (
 from fusion.loop.confirmation import CandidateScorer, ask_hold_out
 from fusion.loop.decisions import FINAL, Decision, Reason
 from fusion.loop.detectability import detection_limits
+from fusion.loop.restless_drift import refuse_in_restless_drift
 from fusion.loop.result import AddedEffect, LoopResult, declared_coefficients, nuisance_size, report_steps, rmse
 from fusion.loop.scoring import WORTH_CONFIRMING, Families, collect_candidates, of_same_kind, refine, score_effects
 from fusion.loop.state import Confirmed, HoldOutQuestion, LoopState, Round, Score
@@ -209,8 +210,9 @@ class AxisProblem:
         return SEARCH_LEVEL
 
     def refuse(self, score: Score, model: ModelFit) -> Decision | None:
-        """Refuse an effect that these readings do not identify."""
-        return refuse(score.name, self.effects[score.name].excited_by, score.best, AxisGrounds(model))
+        """Refuse an effect that these readings do not identify, and an event that restless drift explains as well."""
+        refusal = refuse(score.name, self.effects[score.name].excited_by, score.best, AxisGrounds(model))
+        return refusal or refuse_in_restless_drift(score, model)
 
     def confirm(self, score: Score, state: AxisState) -> Score:
         """Return the score: it was confirmed when it was scored."""

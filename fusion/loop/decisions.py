@@ -22,6 +22,7 @@ class Reason(StrEnum):
     SINGLE_WARM_UP = "single warm-up"
     SINGLE_SWITCHING = "single switching"
     AT_SWITCHING = "at a switching"
+    RESTLESS_DRIFT = "restless drift"
     TEMPERATURE_NOISE = "temperature noise"
     FOLLOWS_RATE = "follows the rate"
     SMOOTHING = "smoothing"
@@ -67,6 +68,10 @@ _SENTENCES: Mapping[Reason, str] = {
         "switch the load on purpose to separate it"
     ),
     Reason.AT_SWITCHING: "a driver was switched at {hours:.2f} h: a shift there is a response to the load, not an event of its own",
+    Reason.RESTLESS_DRIFT: (
+        "between {start_h:.2f} h and {end_h:.2f} h the drift moves {times:.2g} times as much as in the rest of the test, as in a warm-up "
+        "or after a change of the load; against that, an event gains {advantage:.1f} in log-likelihood, and its name needs {needed:.0f}"
+    ),
     Reason.TEMPERATURE_NOISE: (
         "the noise of {series} is {noise_percent:.2g} % of its range; above {limit_percent:.1g} % a lagged copy, which is smoother, fits "
         "better by its smoothness alone"
