@@ -118,7 +118,8 @@ def _course(score: Array, jumps: NDArray[np.bool_], scatter: float) -> Array:
     beside = np.convolve(jumps, [1, 1, 1], mode="same") > 0
     switched = jumps | (beside & (np.abs(score) > _PART_SIGMAS * scatter))
     changes = score[switched]
-    wander = 2.0 * scatter**2 / float(np.mean(score[jumps] ** 2))
+    # Never none: changes alone do not fix the levels.
+    wander = max(2.0 * scatter**2 / float(np.mean(score[jumps] ** 2)), 1e-9)
     # Each change is the difference of two levels, so that the normal equations have two diagonals.
     bands = np.full((2, changes.size + 1), -1.0)
     bands[1] = 2.0 + wander

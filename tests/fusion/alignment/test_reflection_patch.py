@@ -69,6 +69,13 @@ def test_the_course_of_a_patch_does_not_wander_in_a_long_test(frames):
     assert np.ptp(patch.course) == pytest.approx(0.7, abs=0.28)
 
 
+def test_the_course_of_a_patch_without_noise_is_exact():
+    on = np.arange(40) // 5 % 2.0
+    field = np.zeros((40, ROWS, COLUMNS))
+    field[:, 3:6, 8:12] += 2.0 * on[:, None, None]
+    np.testing.assert_allclose(find_switching_patch(field).course, 2.0 * on, atol=1e-6)
+
+
 def test_frames_of_a_long_test_are_never_held_in_double_precision(monkeypatch):
     monkeypatch.setattr("thermography.fields.tasks.pieces.PIECE_BYTES", 256 * 8 * 10 * 20)
     frames = np.random.default_rng(4).standard_normal((6000, 10, 20)).astype(np.float32)
