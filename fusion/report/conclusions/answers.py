@@ -56,6 +56,11 @@ _ANOMALY_CAUSES = {
 
 #: Hotspots that the summary names; the table has all.
 _TOLD = 3
+#: What p does not hold, because it takes sensors for prompt; docs/method/records.md, error rates.
+_NAMES_OF_RECORDS = (
+    "A name is less certain than that: p takes sensors for prompt. Of 40 simulated records with late sensors "
+    "in which nothing was missing, 3 were given a name."
+)
 
 
 class Conclusion(NamedTuple):
@@ -292,6 +297,8 @@ def _how_sure(results: Results) -> list[str]:
     added = [f"{effect_words(step.effect).name} {p_words(step.p_value)}" for step in loop.steps if step.confirmed]
     found = f"{join(added)} (chance that the whole search finds as much where nothing is missing)." if added else ""
     found = f"{found[:1].upper()}{found[1:]}"
+    if added and isinstance(loop, RecordLoop):
+        found = f"{found} {_NAMES_OF_RECORDS}"
     doubtful = [f"{effect_words(step.effect).name} ({step.doubt})" for step in loop.steps if not step.confirmed]
     named = " ".join(text for text in (found, f"Not confirmed: {join(doubtful)}." if doubtful else "") if text)
     sentences = [conditional(named, results.inputs, "causes")] if named else []

@@ -132,6 +132,13 @@ def test_a_record_repeats_values_and_predicts_blocks_of_time() -> None:
     assert "the noise of a block mean" in told and "blocks of time predicted from the others" in told
 
 
+def test_a_name_in_a_record_is_less_certain_than_its_p_value() -> None:
+    told = loop("explained", step("unseen_heat_source")).__dict__
+    record = RecordLoop.model_construct(**{**told, "channels": {}})
+    assert "3 were given a name" in " ".join(answers._how_sure(results(record)))
+    assert "3 were given a name" not in " ".join(answers._how_sure(results(loop("explained", step("step_event")))))
+
+
 def test_what_is_left_is_said_once() -> None:
     shape = "a slow, smooth drift that no effect of the library follows"
     found = results(loop("unexplained", shape=shape, unnamed={"dead_path": 9e-35}))
