@@ -604,7 +604,9 @@ def _scatter_variables(grid: _Grid, joint: JointFit, scatter: Array, freedom: Ar
         np.bincount(target, freedom * np.nan_to_num(scatter) ** 2, minlength=targets)
         / np.where(pooled_freedom, pooled_freedom, np.nan)
     )
-    scatter_u = scatter / np.sqrt(2 * np.maximum(freedom, 1.0))
+    # Where the drift's own uncertainty is all that a cell shows, its scatter is not known to be nothing: the common one stands for it.
+    typical = np.where(scatter > 0.0, scatter, np.where(np.isnan(scatter), np.nan, joint.fit.sigma))
+    scatter_u = typical / np.sqrt(2 * np.maximum(freedom, 1.0))
     dims = DIMS[1:]
     return {
         "scatter": (dims, grid.per_cell(scatter), {"units": "um", "long_name": "random standard deviation"}),

@@ -294,3 +294,17 @@ def test_many_targets_give_the_same_on_any_number_of_threads(rng: np.random.Gene
         with threadpool_limits(threads, user_api="blas"):
             estimated.append(estimate_drift(test))
     xr.testing.assert_identical(*estimated)
+
+
+def test_a_scatter_that_a_restless_drift_leaves_nothing_of_has_an_uncertainty(rng: np.random.Generator) -> None:
+    """A walk of 1 um from reading to reading beside 0.03 um of noise: of some positions nothing is seen but the walk."""
+    deviations, _ = simulate(rng, cycles=6, sigma=0.03)
+    order = np.argsort(deviations["time"].values, axis=None)
+    walk = np.empty(order.size)
+    walk[order] = np.cumsum(rng.normal(0, 1.0, order.size))
+    deviations["deviation"] += walk.reshape(deviations["deviation"].shape)
+    estimated = estimate_drift(deviations)
+    scatter, scatter_u = estimated["scatter"].values, estimated["scatter_u"].values
+    assert (scatter == 0.0).any()
+    assert (scatter_u[np.isfinite(scatter)] > 0.0).all()
+    assert np.isnan(scatter_u[np.isnan(scatter)]).all()
