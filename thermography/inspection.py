@@ -25,6 +25,8 @@ from thermography.radiometry.planck import (
 
 #: Maximum number of frames whose pixels are read, spread evenly over the file, so that long recordings are inspected quickly.
 _FRAMES_READ = 32
+#: Pixels that are read in all: 32 frames of the largest usual camera, 1024 x 1024.
+_PIXELS_READ = _FRAMES_READ << 20
 #: Bolometer cameras with these file formats appeared after this year; an earlier date means that the clock was never set.
 _OLDEST_YEAR = 2001
 _THUMBNAIL_WIDTH = 320
@@ -180,7 +182,8 @@ def inspect_file(path: Path) -> FlirInspection:
     references, rejected = index_frames([path])
     if not references:
         raise FlirFormatError(rejected[0].reason)
-    chosen = np.unique(np.linspace(0, len(references) - 1, _FRAMES_READ).round().astype(int))
+    count = max(1, min(_FRAMES_READ, _PIXELS_READ // int(references.shapes().prod(axis=1).max())))
+    chosen = np.unique(np.linspace(0, len(references) - 1, count).round().astype(int))
     frames, read = [], []
     for index in chosen:
         try:
@@ -222,7 +225,7 @@ def describe_stack(path: Path) -> list[str]:
         raise ThermographyError(f"{path}: no file of temperatures that is read; docs/formats.md lists them")
     # A scale of one and an offset of nothing would be asked for; the values are shown as they are stored.
     stored = StackOptions(scale=np.nextafter(1.0, 2.0))
-    contents = reader.contents(path, stored)
+    contents = reader.frame_contents(path, stored)
     rows, columns = contents.shape
     count = f"{contents.frames} frames" if contents.frames > 1 else "1 frame"
     values = np.asarray(reader.read_values(path, 0, stored), float)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 import numpy as np
 
 from fusion.errors import FusionError
+from thermography._hdf5 import hdf5_fault
 from thermography.fields.tasks.pieces import in_pieces
 from thermography.fields.tasks.spool import IN_MEMORY_BYTES
 from thermography.io import atomic
@@ -288,9 +289,12 @@ def told_if_damaged(path: Path) -> Iterator[None]:
     Raises
     ------
     DamagedProductError
-        If the library of NetCDF cannot read it: HDF5 answers to damaged bytes with errors of several kinds, none of which names the file.
+        If its values stand in another file or nowhere, or the library of NetCDF cannot read it: HDF5 answers to damaged bytes with errors of several kinds, none of which names the file.
     """
     try:
+        fault = hdf5_fault(path)
+        if fault:
+            raise DamagedProductError(f"{path}: is no product of thermofuse: {fault}; run the campaign again")
         yield
     except (FileNotFoundError, IsADirectoryError, PermissionError, FusionError):
         raise

@@ -206,7 +206,7 @@ def _stack(content: FolderContent, asker: Asker) -> Iterator[str]:
     reader = find_reader(first)
     assert isinstance(reader, TemperatureReader)
     stored = StackOptions(scale=np.nextafter(1.0, 2.0))
-    contents = reader.contents(first, stored)
+    contents = reader.frame_contents(first, stored)
     yield '# camera_offset_u = "1 K"                  # accuracy in the camera\'s data sheet; left out = that of an uncooled camera'
     yield 'table = "still"                          # every frame shows the table at axis position 0; "moving": frames during motion'
     yield from _optional("lens", content, Kind.LENS)

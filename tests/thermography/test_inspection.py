@@ -202,3 +202,25 @@ def test_a_file_of_temperatures_is_described_with_what_must_be_stated(tmp_path: 
     (tmp_path / "b.npy").write_bytes(b"nothing\0")
     with pytest.raises(ThermographyError, match="no file of temperatures that is read"):
         describe_stack(tmp_path / "b.npy")
+
+
+def test_what_no_camera_writes_is_told_and_not_made(tmp_path: Path) -> None:
+    """A few bytes may state any number of pixels and frames."""
+    for name, shape in [("pixels", (1, 20_000, 20_000)), ("nothing", (3, 0, 5)), ("frames", (2_000_000, 1, 1))]:
+        np.lib.format.open_memmap(tmp_path / f"{name}.npy", mode="w+", dtype=np.float32, shape=shape).flush()
+    for name, told in [
+        ("pixels", "20000 x 20000 pixels are no thermal frame"),
+        ("nothing", "5 x 0 pixels are no thermal frame"),
+        ("frames", r"2,000,000 frames, 1 to 1,000,000 in a file can be read; export them in parts"),
+    ]:
+        with pytest.raises(ThermographyError, match=told):
+            describe_stack(tmp_path / f"{name}.npy")
+
+
+def test_of_large_frames_fewer_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_sequence(tmp_path / "a.seq", (frame(6, 8, seconds=second) for second in range(5)))
+    assert inspect_file(tmp_path / "a.seq").frames_read == 5
+    monkeypatch.setattr("thermography.inspection._PIXELS_READ", 2 * 6 * 8)
+    assert inspect_file(tmp_path / "a.seq").frames_read == 2
+    monkeypatch.setattr("thermography.inspection._PIXELS_READ", 1)
+    assert inspect_file(tmp_path / "a.seq").frames_read == 1

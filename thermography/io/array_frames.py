@@ -14,6 +14,7 @@ import tifffile
 import xarray as xr
 from numpy.typing import NDArray
 
+from thermography._hdf5 import hdf5_fault
 from thermography.errors import ThermographyError
 from thermography.io.temperature_frames import StackContents, StackError, StackOptions, TemperatureReader
 
@@ -24,6 +25,8 @@ _UNITS = {
 }  # fmt: skip
 #: Kinds of NumPy's types that can be temperatures: floating point and whole numbers.
 _NUMBERS = "fiu"
+#: Variables that a message names.
+_NAMED = 5
 #: Files that a Zarr store of version 3 or 2 begins with; each stands for the whole store.
 _ZARR_METADATA = ("zarr.json", ".zgroup")
 
@@ -193,6 +196,9 @@ class NetcdfReader(TemperatureReader):
         try:
             store = path.parent if path.name in _ZARR_METADATA else path
             zarr = store.is_dir()
+            fault = "" if zarr else hdf5_fault(store)
+            if fault:
+                raise ValueError(fault)
             dataset = (
                 xr.open_zarr(store, consolidated=False, chunks=None)
                 if zarr
@@ -205,8 +211,13 @@ class NetcdfReader(TemperatureReader):
             name = options.variable if options.variable is not None else stacks[0] if len(stacks) == 1 else None
             if name not in dataset.data_vars or dataset[name].ndim != 3:
                 raise StackError(
-                    f'{path}: holds the variables {", ".join(map(str, stacks)) or "none"} over three dimensions; write variable = "..." '
+                    f'{path}: holds the variables {_first(stacks)} over three dimensions; write variable = "..." '
                     "for the one with the temperatures (time, row, column)"
+                )
+            kind = dataset[name].dtype
+            if kind.kind not in _NUMBERS:
+                raise ThermographyError(
+                    f"{path}: values of type {kind} are no temperatures; write floating-point or whole numbers"
                 )
             yield dataset[name]
 
@@ -252,6 +263,12 @@ class NetcdfReader(TemperatureReader):
                 return np.asarray(values[index].values)
             except Exception as error:
                 raise ThermographyError(f"{path}: frame {index} is damaged ({error}); write it again") from None
+
+
+def _first(names: list[Any]) -> str:
+    """Return the first of some names for a message."""
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return (", ".join(map(str, names[:_NAMED])) or "none") + more
 
 
 def _require_scale(path: Path, kind: np.dtype[Any], options: StackOptions) -> None:

@@ -31,7 +31,9 @@ _PLANCK_R1 = _HIGHEST_COUNT * (np.exp(_PLANCK_B / (_HIGHEST_DEGC + _ZERO_CELSIUS
 #: Parts of a time in the name of a file: directive of strptime -> digits.
 _DIGITS = {"Y": 4, "m": 2, "d": 2, "H": 2, "M": 2, "S": 2, "j": 3}
 #: Most pixels of a frame; a damaged header may claim more.
-MOST_PIXELS = 1 << 24
+_MOST_PIXELS = 1 << 24
+#: Nine hours at 30 Hz.
+_MOST_FRAMES = 1_000_000
 
 
 class StackError(ThermographyError):
@@ -142,6 +144,28 @@ class TemperatureReader(ABC):
     def read_values(self, path: Path, index: int, options: StackOptions) -> NDArray[np.floating]:
         """Return the values of a frame as stored, (row, column)."""
 
+    def frame_contents(self, path: Path, options: StackOptions) -> StackContents:
+        """Return what a file holds, see `contents`, where it can be frames: what a few bytes state may be any number.
+
+        Parameters
+        ----------
+        path : Path
+        options : StackOptions
+
+        Raises
+        ------
+        ThermographyError
+            The file is damaged, its frames have no pixel or more than 16.8 million, or there are none or more than a million.
+        """
+        contents = self.contents(path, options)
+        if contents.shape[0] * contents.shape[1] > _MOST_PIXELS or 0 in contents.shape:
+            raise ThermographyError(f"{path}: {contents.shape[1]} x {contents.shape[0]} pixels are no thermal frame")
+        if not 0 < contents.frames <= _MOST_FRAMES:
+            raise ThermographyError(
+                f"{path}: {contents.frames:,} frames, 1 to {_MOST_FRAMES:,} in a file can be read; export them in parts"
+            )
+        return contents
+
     def index(self, path: Path, options: StackOptions) -> Iterator[FrameReference | RejectedFrame]:
         """Yield the frames of a file in its order.
 
@@ -157,9 +181,7 @@ class TemperatureReader(ABC):
         ThermographyError
             The file is damaged.
         """
-        contents = self.contents(path, options)
-        if contents.shape[0] * contents.shape[1] > MOST_PIXELS or 0 in contents.shape:
-            raise ThermographyError(f"{path}: {contents.shape[1]} x {contents.shape[0]} pixels are no thermal frame")
+        contents = self.frame_contents(path, options)
         unit = options.unit or contents.unit
         if unit not in ("degC", "K"):
             raise StackError(
