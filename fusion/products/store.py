@@ -289,7 +289,8 @@ def told_if_damaged(path: Path) -> Iterator[None]:
     Raises
     ------
     DamagedProductError
-        If its values stand in another file or nowhere, or the library of NetCDF cannot read it: HDF5 answers to damaged bytes with errors of several kinds, none of which names the file.
+        If its values stand in another file or nowhere, or the library of NetCDF cannot read it: HDF5 answers to damaged bytes with errors
+        of several kinds, none of which names the file.
     """
     try:
         fault = hdf5_fault(path)

@@ -202,7 +202,7 @@ class NetcdfReader(TemperatureReader):
             dataset = (
                 xr.open_zarr(store, consolidated=False, chunks=None)
                 if zarr
-                else xr.open_dataset(store, engine="h5netcdf")
+                else xr.open_dataset(store, engine="h5netcdf", phony_dims="access")
             )
         except Exception as error:
             raise ThermographyError(f"{path}: cannot be opened ({error}); write it again") from None

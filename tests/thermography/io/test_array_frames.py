@@ -125,21 +125,12 @@ def test_values_that_are_no_real_numbers_are_named_by_their_type(tmp_path: Path,
         TiffReader().contents(tmp_path / "a.tif", EVERY_10_S)
 
 
-def in_netcdf(dataset: h5py.Dataset) -> None:
-    """Give an array of (3, 4, 5) the dimensions that NetCDF has."""
-    for number, (name, size) in enumerate(zip(("time", "y", "x"), dataset.shape, strict=True)):
-        if name not in dataset.file:
-            dataset.file[name] = np.arange(float(size))
-            dataset.file[name].make_scale(name)
-        dataset.dims[number].attach_scale(dataset.file[name])
-
-
 @pytest.mark.parametrize(
     "kind", [np.dtype([("a", "f4"), ("b", "i4")]), np.dtype("V8"), np.dtype("c16"), h5py.string_dtype()]
 )
 def test_a_variable_of_no_numbers_is_refused(tmp_path: Path, kind: np.dtype) -> None:
     with h5py.File(tmp_path / "a.nc", "w") as file:
-        in_netcdf(file.create_dataset("temperature", (3, 4, 5), kind))
+        file.create_dataset("temperature", (3, 4, 5), kind)
     with pytest.raises(ThermographyError, match="are no temperatures; write floating-point or whole numbers"):
         describe_stack(tmp_path / "a.nc")
 
@@ -147,6 +138,6 @@ def test_a_variable_of_no_numbers_is_refused(tmp_path: Path, kind: np.dtype) -> 
 def test_of_many_variables_a_message_names_some(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.nc", "w") as file:
         for number in range(8):
-            in_netcdf(file.create_dataset(f"v{number}", (3, 4, 5)))
+            file.create_dataset(f"v{number}", (3, 4, 5), "f4")
     with pytest.raises(StackError, match="the variables v0, v1, v2, v3, v4 and 3 more over three dimensions"):
         describe_stack(tmp_path / "a.nc")
