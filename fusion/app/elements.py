@@ -7,6 +7,19 @@ from html import escape
 
 import panel as pn
 
+from fusion.terminal import printable
+
+
+def as_markup(text: str) -> str:
+    """Return a text as markup in which nothing is an element, nor turns the direction of what stands beside it.
+
+    Parameters
+    ----------
+    text : str
+        From a file.
+    """
+    return escape(printable(text))
+
 
 def heading(text: str, *, level: int = 2) -> pn.pane.HTML:
     """Return a heading.
@@ -18,7 +31,7 @@ def heading(text: str, *, level: int = 2) -> pn.pane.HTML:
     level : int
         2 for the title of a screen, 3 for a part of it.
     """
-    return pn.pane.HTML(f"<h{level}>{escape(text)}</h{level}>", sizing_mode="stretch_width")
+    return pn.pane.HTML(f"<h{level}>{as_markup(text)}</h{level}>", sizing_mode="stretch_width")
 
 
 def paragraph(text: str, *, kind: str = "") -> pn.pane.HTML:
@@ -48,7 +61,7 @@ def paragraph_markup(text: str, *, kind: str = "") -> str:
     if not text:
         return ""
     role = {"fault": ' role="alert"', "warning": ' role="status"', "done": ' role="status"'}.get(kind, "")
-    return f'<p class="{escape(kind)}"{role}>{escape(text)}</p>'
+    return f'<p class="{as_markup(kind)}"{role}>{as_markup(text)}</p>'
 
 
 def bullets(lines: Iterable[str]) -> pn.pane.HTML:
@@ -59,7 +72,7 @@ def bullets(lines: Iterable[str]) -> pn.pane.HTML:
     lines : iterable of str
         Shown as they are.
     """
-    items = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    items = "".join(f"<li>{as_markup(line)}</li>" for line in lines)
     return pn.pane.HTML(f"<ul>{items}</ul>", sizing_mode="stretch_width")
 
 
@@ -79,15 +92,15 @@ def table(
     stacked : bool
         Whether the cells of a row stand below one another on a phone: for cells that hold sentences.
     """
-    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in columns)
+    head = "".join(f'<th scope="col">{as_markup(name)}</th>' for name in columns)
     body = "".join(
-        f'<tr><th scope="row">{escape(first)}</th>{"".join(f"<td>{escape(cell)}</td>" for cell in rest)}</tr>'
+        f'<tr><th scope="row">{as_markup(first)}</th>{"".join(f"<td>{as_markup(cell)}</td>" for cell in rest)}</tr>'
         for first, *rest in rows
     )
     kind = ' class="stacked"' if stacked else ""
     return pn.pane.HTML(
-        f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}"><table{kind}>'
-        f"<caption>{escape(caption)}</caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>",
+        f'<div class="scroll" tabindex="0" role="region" aria-label="{as_markup(caption)}"><table{kind}>'
+        f"<caption>{as_markup(caption)}</caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>",
         sizing_mode="stretch_width",
     )
 
@@ -103,6 +116,6 @@ def link(text: str, address: str) -> pn.pane.HTML:
         Within the application.
     """
     return pn.pane.HTML(
-        f'<p><a href="{escape(address)}" target="_blank" rel="noopener">{escape(text)}</a></p>',
+        f'<p><a href="{as_markup(address)}" target="_blank" rel="noopener">{as_markup(text)}</a></p>',
         sizing_mode="stretch_width",
     )

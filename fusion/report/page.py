@@ -13,6 +13,7 @@ from markupsafe import Markup
 
 from fusion.report.charts.embedding import EmbeddedChart, chart_scripts
 from fusion.report.wording import number
+from fusion.terminal import printable
 
 
 def render_page(template: str, charts: Mapping[str, EmbeddedChart], **context: Any) -> str:
@@ -30,13 +31,14 @@ def render_page(template: str, charts: Mapping[str, EmbeddedChart], **context: A
     Returns
     -------
     str
-        One HTML page. Every variable is escaped where it is shown.
+        One HTML page. Every variable is escaped where it is shown, and what would turn the direction of the text around it is written
+        out, as in a terminal.
     """
     templates = resources.files("fusion.report") / "templates"
     loader = jinja2.FileSystemLoader(str(templates))
     environment = jinja2.Environment(
-        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
-    )
+        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined, finalize=_in_page,
+    )  # fmt: skip
     environment.filters |= {"number": number, "css_string": _css_string}
     own = Markup((templates / "page.js").read_text(encoding="utf-8"))
     scripts = (*chart_scripts(), own) if charts else (own,)
@@ -71,6 +73,11 @@ def content_security_policy(scripts: Sequence[str]) -> Markup:
     allowed = " ".join(f"'sha256-{one}'" for one in hashes)
     rest = "style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'; form-action 'none'"
     return Markup(f"default-src 'none'; script-src {allowed}; {rest}")
+
+
+def _in_page(value: object) -> object:
+    """Return a text of which no sign acts on what stands beside it; what is HTML already is made of such texts."""
+    return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 def _css_string(text: str) -> Markup:

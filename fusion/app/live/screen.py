@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from html import escape
-
 import panel as pn
 
-from fusion.app.elements import bullets, heading, paragraph
+from fusion.app.elements import as_markup, bullets, heading, paragraph
 from fusion.app.live.charts import plot_course, plot_field, plot_standard
 from fusion.app.live.session import Course, LiveSession
 from fusion.app.places import PlaceError, place_within
@@ -123,7 +121,7 @@ def standing(course: Course, wanted_u_um: float, *, runs: bool) -> str:
     head = (
         f"{'Following' if runs else 'No longer followed'}: {', '.join(counted(count, noun) for count, noun in seen)}."
     )
-    return f'<p role="status">{escape(head)} {escape(enough_words(course, wanted_u_um))}</p>'
+    return f'<p role="status">{as_markup(head)} {as_markup(enough_words(course, wanted_u_um))}</p>'
 
 
 def enough_words(course: Course, wanted_u_um: float) -> str:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from html import escape
 from pathlib import Path
 
 import panel as pn
 
-from fusion.app.elements import bullets, heading, link, paragraph
+from fusion.app.elements import as_markup, bullets, heading, link, paragraph
 from fusion.app.places import PlaceError, place_within
 from fusion.app.report import report_link
 from fusion.app.run.process import RUNS, RunError, RunProcess, is_begun
@@ -181,8 +180,8 @@ def stages_markup(run: RunProcess) -> str:
         Under way or ended.
     """
     rows = "".join(
-        f'<tr><th scope="row">{escape(stage.label)}</th><td><progress aria-label="{escape(stage.label)}" max="1" '
-        f'value="{stage.share:.3f}"></progress></td><td>{escape(stage.words)}</td></tr>'
+        f'<tr><th scope="row">{as_markup(stage.label)}</th><td><progress aria-label="{as_markup(stage.label)}" max="1" '
+        f'value="{stage.share:.3f}"></progress></td><td>{as_markup(stage.words)}</td></tr>'
         for stage in list(run.progress.stages.values())
     )
     return f"<table><caption>Progress by stage</caption><tbody>{rows}</tbody></table>" if rows else ""
