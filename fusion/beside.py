@@ -40,7 +40,16 @@ _LIBRARIES = ("fusion.pipeline.run", "fusion.report.html")
 
 
 class Beside(ABC):
-    """Takes work that is not waited for at once."""
+    """Takes work that is not waited for at once.
+
+    Attributes
+    ----------
+    faults : list of str
+        Why a second process did not do its part, a clause for each piece of work that was done in the first one instead.
+    """
+
+    def __init__(self, faults: list[str] | None = None) -> None:
+        self.faults: list[str] = [] if faults is None else faults
 
     @abstractmethod
     def start(self, work: Callable[..., Answer], report: Report | None = None) -> Callable[[], Answer]:
@@ -88,6 +97,7 @@ class _SecondProcess(Beside):
     """Sends work through a pipe, one piece after the other."""
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        super().__init__()
         self._process = process
         self._line = ThreadPoolExecutor(1, "beside")
 
@@ -120,6 +130,7 @@ class _SecondProcess(Beside):
                 why = str(value)
             if done:
                 return value
+            self.faults.append(why)
             _log.warning("the second process did not do its part (%s); it is done in the first one", why)
             return work(**_given(report))
 
@@ -207,7 +218,7 @@ def second_process(*, wanted: bool = True, libraries: Sequence[str] = _LIBRARIES
         )
     except OSError as error:
         _log.warning("no second process could be started (%s); its part is done in the first one", error)
-        yield InTurn()
+        yield InTurn([f"could not be started: {error}"])
         return
     second = _SecondProcess(process)
     try:

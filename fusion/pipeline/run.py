@@ -310,7 +310,7 @@ def _reduce(run: Run, source: CameraInputs, tables: tuple[str, ...], *, schedule
     if is_large(fields):
         fields = open_dataset(run.folder / FILES["fields"])
     if fields.nbytes > _MOST_SENT:
-        run.beside = InTurn()
+        run.beside = InTurn(run.beside.faults)
     run.parts["field"] = describe_field(fields, run.parts["radiometry"])
     return fields
 
@@ -453,10 +453,13 @@ def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
         products=[content, *(path for path in run.products if path.parent != run.folder / ".stages")],
         address=run.address,
     )
-    write_json(run.folder / "provenance.json", provenance)
     from fusion.report.html import render_report
 
     page = render_report(results, provenance, datasets, drawn=drawn)
+    # The charts are the last that a second process may not have done.
+    if run.beside.faults:
+        provenance["second_process_faults"] = run.beside.faults
+    write_json(run.folder / "provenance.json", provenance)
     write_text(run.folder / "report.html", page)
     stamp_run(run.stamps, run.campaign, run.inputs, [*run.products, *(run.folder / name for name in PAGES)])
     run.report("report", 1, 1)

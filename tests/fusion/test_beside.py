@@ -84,6 +84,7 @@ def test_work_of_a_process_that_has_ended_is_done_here(monkeypatch: pytest.Monke
         first = second.start(partial(killed_elsewhere, os.getpid()))
         after = second.start(partial(math.sqrt, 9.0))
         assert first() == os.getpid() and after() == 3.0
+        assert len(second.faults) == 2
 
 
 def test_a_single_processor_does_the_work_when_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,6 +110,7 @@ def test_where_no_process_can_be_started_the_work_is_done_here(monkeypatch: pyte
     monkeypatch.setattr(subprocess, "Popen", full)
     with second_process() as none:
         assert none.start(os.getpid)() == os.getpid()
+        assert none.faults == ["could not be started: no more processes"]
 
 
 def test_what_is_begun_after_the_end_is_done_here(monkeypatch: pytest.MonkeyPatch) -> None:

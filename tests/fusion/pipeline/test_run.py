@@ -123,15 +123,17 @@ def test_a_whole_run_is_read_and_nothing_written(results_folder: Path, copied: P
 
 
 class Noting(Beside):
-    """A second process that notes what it is given."""
+    """A second process that notes what it is given, and does not take the last."""
 
     def __init__(self, second: Beside) -> None:
+        super().__init__(second.faults)
         self.second, self.names = second, []
 
     def start(self, work: Callable[..., Any], report: Report | None = None) -> Callable[[], Any]:
         # A stage is timed where it is computed.
         self.names.append(work.args[0].func.__name__ if work.func.__name__ == "_timed" else work.func.__name__)
-        return self.second.start(work, report)
+        # What is no function of a module cannot be sent.
+        return self.second.start((lambda: work()) if self.names[-1] == "_draw_found" else work, report)
 
     def end(self) -> None:
         self.second.end()
@@ -147,6 +149,10 @@ def test_a_second_process_takes_its_part_and_changes_nothing(
     assert beside.names == [
         "evaluate_interferometry", "correlate_field", "_draw_measured", "check_fields", "write_exr", "_draw_found",
     ]  # fmt: skip
+    provenance = json.loads((tmp_path / "results" / "provenance.json").read_text())
+    (fault,) = provenance["second_process_faults"]
+    assert "pickle" in fault, "told, although nothing is lost"
+    assert "second_process_faults" not in json.loads((results_folder / "provenance.json").read_text())
     for name in ("results.json", "maps/cycle_0001.exr"):
         assert (tmp_path / "results" / name).read_bytes() == (results_folder / name).read_bytes()
     for name in ("deviations.nc", ".stages/correlation.nc", ".stages/model.nc"):
