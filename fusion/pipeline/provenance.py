@@ -17,7 +17,7 @@ from fusion.campaign.config import Campaign
 from fusion.effects.plugins import GROUP, describe_code, plugins
 from fusion.products.progress import Report, silent
 from fusion.products.results import Notice, Results, read_results
-from fusion.products.store import StageStamps, digest, file_sha256
+from fusion.products.store import OutputError, StageStamps, digest, file_sha256, is_file_list, read_json_object
 from thermography.io.frame_readers import ENTRY_POINT_GROUP
 
 #: Number of the products' layout: stages that were kept in another one are computed again.
@@ -191,6 +191,41 @@ def note_changes(before: Mapping[str, FileState], after: Mapping[str, FileState]
 
 def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+
+
+def refuse_other_campaign(folder: Path, campaign: Campaign, inputs: Mapping[str, Mapping[str, Any]]) -> None:
+    """Refuse a results folder that holds the results of another campaign: a run that goes on there would replace them.
+
+    Parameters
+    ----------
+    folder : Path
+        Results folder.
+    campaign : Campaign
+        What is to be run.
+    inputs : mapping
+        Result of `hash_files`.
+
+    Raises
+    ------
+    OutputError
+        If the provenance of the folder names another campaign file, and none of the recordings of this one was an input then. A campaign
+        file that was changed or moved, and recordings that have grown, are those of the same campaign.
+    """
+    known = read_json_object(folder / "provenance.json")
+    here, there = _place_from(folder, campaign.path), known.get("campaign_file")
+    if not is_file_list(known.get("inputs")) or not isinstance(there, str) or here in (None, there):
+        return
+    tables = ("thermography", "interferometry", "record")
+    recordings = {inputs[name]["sha256"] for table in tables for name in campaign.files_of(table) if name in inputs}
+    if recordings & {one["sha256"] for one in known["inputs"].values()}:
+        return
+    stated = known.get("parameters")
+    about = stated.get("campaign") if isinstance(stated, dict) else None
+    named = f'"{about.get("title")}", {there}' if isinstance(about, dict) else there
+    raise OutputError(
+        f"{folder} holds the results of another campaign ({named}), which --resume would replace by those of "
+        f'{campaign.path} ("{campaign.campaign.title}"); name another folder with --out, or remove this one first'
+    )
 
 
 def describe_run(

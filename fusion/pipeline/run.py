@@ -34,6 +34,7 @@ from fusion.pipeline.provenance import (
     input_states,
     kept_results,
     note_changes,
+    refuse_other_campaign,
     stamp_run,
 )
 from fusion.pipeline.radiometry import describe_field
@@ -200,10 +201,12 @@ def _start_run(
     campaign: Campaign, folder: Path, seen: Mapping[str, FileState], report: Report, address: str | None, beside: Beside
 ) -> Run:
     """Start a run in the folder that it holds: claim the products, and note what they are made from."""
-    products = [name for name in FILES.values() if not name.startswith(".")]
-    claim(folder, *products, *PAGES)
     started = datetime.now(UTC)
     inputs = hash_files(campaign.input_files(), report=report)
+    if address is None:
+        refuse_other_campaign(folder, campaign, inputs)
+    products = [name for name in FILES.values() if not name.startswith(".")]
+    claim(folder, *products, *PAGES)
     stamps = StageStamps(folder)
     forget_run(stamps)
     return Run(campaign, folder, report, stamps, inputs, seen, started, address, beside)

@@ -20,8 +20,10 @@ from fusion.pipeline.provenance import (
     input_states,
     kept_results,
     note_changes,
+    refuse_other_campaign,
     versions,
 )
+from fusion.products.store import OutputError, write_json
 
 
 def test_inputs_are_hashed_by_name(tmp_path: Path) -> None:
@@ -41,6 +43,32 @@ def test_a_run_is_described_without_a_folder(campaign_folder: Path, monkeypatch:
     assert run["started"] == "2026-03-09T06:30:00+00:00" and run["stage_seconds"] == {"fields": 1.23}
     assert run["parameters"]["plan"]["cell_size_mm"] == 20.0 and "path" not in run["parameters"]
     assert run["products"] == {}
+
+
+def test_the_results_of_another_campaign_are_not_replaced(copied: Path) -> None:
+    folder, own = copied / "results", load_campaign(copied / "campaign.toml")
+    hashed = hash_files(own.input_files())
+    refuse_other_campaign(folder, own, hashed)
+    written = describe_run(own, hashed, folder, started=datetime(2026, 3, 9, 6, 30, tzinfo=UTC), seconds={})
+    write_json(folder / "provenance.json", written)
+    other = load_campaign(shutil.copy(own.path, copied / "other.toml"))
+    # A copy of the campaign file is for the same recordings; the same campaign file is for recordings that have grown.
+    refuse_other_campaign(folder, other, hash_files(other.input_files()))
+    for path in (own.resolve("laser.csv"), own.resolve("environment.csv"), *own.frame_paths()):
+        path.write_bytes(path.read_bytes() + b"\n")
+    refuse_other_campaign(folder, own, hash_files(own.input_files()))
+    with pytest.raises(OutputError) as error:
+        refuse_other_campaign(folder, other, hash_files(other.input_files()))
+    assert str(error.value) == (
+        f'{folder} holds the results of another campaign ("{own.campaign.title}", ../campaign.toml), which --resume would replace by those '
+        f'of {other.path} ("{own.campaign.title}"); name another folder with --out, or remove this one first'
+    )
+    for damaged in ([], {"inputs": []}, {**written, "campaign_file": None}):
+        write_json(folder / "provenance.json", damaged)
+        refuse_other_campaign(folder, other, hash_files(other.input_files()))
+    write_json(folder / "provenance.json", {**written, "parameters": ["x"]})
+    with pytest.raises(OutputError, match=r"another campaign \(\.\./campaign\.toml\)"):
+        refuse_other_campaign(folder, other, hash_files(other.input_files()))
 
 
 def test_products_are_listed_with_their_hash(campaign_folder: Path, tmp_path: Path) -> None:
