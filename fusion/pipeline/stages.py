@@ -73,7 +73,7 @@ def _timed(compute: Callable[..., Outcome[Product]], *, report: Report) -> tuple
 
 
 def _return_freed_memory() -> None:
-    """Give the memory that a stage has left back to the system, where the C library keeps it for what follows (glibc does)."""
+    """Give the memory that was left back to the system, where the C library keeps it for what follows (glibc does)."""
     with suppress(AttributeError, OSError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
 
@@ -158,6 +158,7 @@ class Run:
         name, key = stage.name, self.key_of(stage)
         path = self.folder / FILES[name]
         kept = self.stamps.done(name, key)
+        _return_freed_memory()
         computed, spent_s = (None, 0.0) if kept else compute()
         begun = time.monotonic()
         if computed is None:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _STAMPS = ".stages/stamps.json"
 #: Compressed maps are stored in parts of this size, bytes: one cycle of thousands can be read without the others.
-_CHUNK_BYTES = 1 << 22
+_CHUNK_BYTES = 1 << 21
 #: A product is one Dataset, or a tree of them whose nodes become the groups of one NetCDF file.
 Product = TypeVar("Product", "xr.Dataset", "xr.DataTree")
 
@@ -227,7 +227,9 @@ def open_dataset(path: Path) -> xr.Dataset:
     import xarray as xr
 
     with told_if_damaged(path):
-        dataset = xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False, cache=False)
+        # Of every array one part is kept, which the next piece may need, in place of several.
+        kept = {"rdcc_nbytes": _CHUNK_BYTES}
+        dataset = xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False, cache=False, driver_kwds=kept)
         if not is_large(dataset):
             with dataset:
                 return dataset.load()

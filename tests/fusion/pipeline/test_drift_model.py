@@ -54,7 +54,9 @@ def test_gaps_of_a_log_are_one_notice_for_every_series():
 
 
 def test_camera_errors_that_were_taken_out_are_noted():
-    error = FieldFault("camera_offset", "the camera read too high from cycle 5 on", 0.5, 0.1, 5, np.zeros((1, 1, 1)))
+    error = FieldFault(
+        "camera_offset", "the camera read too high from cycle 5 on", 0.5, 0.1, 5, np.zeros(1), np.ones((1, 1))
+    )
     (notice,) = field_notices([error])
     assert notice.code == "field_corrected_camera_offset"
     assert notice.message.startswith("The camera read too high from cycle 5 on: taken out of the frames")
@@ -104,7 +106,7 @@ def test_what_the_correction_changes_is_written_beside_the_fields():
         },
         coords={"time": times, "cycle": [1, 2, 3]},
     )
-    error = FieldFault("camera_offset", "it erred", 0.5, 0.1, 2, np.array([0.0, -0.5, -0.5])[:, None, None])
+    error = FieldFault("camera_offset", "it erred", 0.5, 0.1, 2, np.array([0.0, -0.5, -0.5]), np.ones((1, 1)))
     again = xr.Dataset(
         {name: (dims, np.full((3, 1, 1), k)) for k, name in enumerate(("mean_rise", "axis_integral", "local_rise"))}
     )
