@@ -135,10 +135,10 @@ def _largest(changes: Iterable[Array]) -> Array:
         size = np.concatenate([sizes, np.einsum("tc,tc->t", some, some)])
         chosen = np.sort(np.argsort(size)[-_MOST_CHANGES:])
         before = chosen[chosen < len(kept)]
+        new = some[chosen[len(before) :] - len(kept)]
         # Those before stay as they are where none of them is left out.
         old = kept if len(before) == len(kept) else kept[before]
-        kept = np.concatenate([old, some[chosen[len(before) :] - len(kept)]]) if len(old) else some[chosen]
-        sizes = size[chosen]
+        kept, sizes = np.concatenate([old, new]) if len(old) else new, size[chosen]
     return kept
 
 

@@ -5,7 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from fusion.alignment.reflection_patch import _leading_component, find_switching_patch
+from fusion.alignment.reflection_patch import _largest, _leading_component, find_switching_patch
 
 FRAMES, ROWS, COLUMNS = 60, 12, 20
 
@@ -110,3 +110,15 @@ def test_the_leading_component_is_the_first_singular_vector(rng, shape):
     told = _leading_component(changes)
     np.testing.assert_allclose(told, components[0] * np.sign(components[0] @ told), atol=1e-12)
     assert told[np.argmax(np.abs(told))] > 0.0
+
+
+@pytest.mark.parametrize("order", ["rising", "falling", "mixed"])
+def test_the_largest_changes_are_kept_in_the_order_of_time(order, rng, monkeypatch):
+    monkeypatch.setattr("fusion.alignment.reflection_patch._MOST_CHANGES", 5)
+    size = {"rising": np.arange(1.0, 41.0), "falling": np.arange(40.0, 0.0, -1.0), "mixed": rng.permutation(40) + 1.0}[
+        order
+    ]
+    changes = size[:, None] * np.array([1.0, -1.0, 0.5])
+    expected = changes[np.sort(np.argsort(size)[-5:])]
+    for pieces in (1, 3, 20):
+        np.testing.assert_array_equal(_largest(np.array_split(changes, pieces)), expected)
