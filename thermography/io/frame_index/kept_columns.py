@@ -109,7 +109,7 @@ def keep(file: BinaryIO, path: Path, start: int, columns: Mapping[str, Array]) -
     try:
         write_atomically(place, write)
     except OSError as error:
-        # Another process that keeps the same has put its file in place first.
+        # Another process that keeps the same has made room, and this file with it; its own is as good.
         if isinstance(error, FileNotFoundError) and place.exists():
             return
         remedy = f"let {CACHE_VARIABLE} name a folder that can be written to"
