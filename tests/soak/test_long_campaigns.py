@@ -1,22 +1,32 @@
-"""How often the closed loop names what is not there in long tests, and finds what is: docs/method/closed-loop.md, table of long tests.
+"""How often a long test is said to show what is not there, and shows what is: docs/method/closed-loop.md, table of long tests.
 
-THERMOFUSE_RUNS sets the number of tests per case, THERMOFUSE_FIRST_SEED the first seed.
+Names of the closed loop; correlation by means of cycles; patches of the field. THERMOFUSE_RUNS sets the number of tests per case (of the
+correlation four times as many), THERMOFUSE_FIRST_SEED the first seed of the closed loop.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 
+import numpy as np
 import pytest
 
+from fusion.alignment.reflection_patch import find_switching_patch
+from fusion.attribution.attribute import correlate
 from fusion.loop.axis import close_loop
 from fusion.loop.decisions import Reason
 from fusion.loop.result import LoopResult
+from fusion.pipeline.sizes import average_cycles
+from fusion.twin import simulate
+from fusion.twin.machine.recipe import EffectRecipe, Recipe
+from fusion.twin.truth import fields_of
+from tests.fusion import field_simulator
 from tests.fusion.long_tests import long_test
 from tests.soak.rates import campaigns, first_seed, rate, wilson
 
 pytestmark = pytest.mark.slow
 RUNS = campaigns(20)
+CORRELATIONS = 4 * RUNS
 FIRST_SEED = first_seed(31000)
 
 
@@ -65,3 +75,40 @@ def test_a_true_step_is_named(drift: str, cycles: int, period_s: float, step_um:
         f"\n{drift}, {cycles} cycles, step of {step_um} um: named {rate(right, RUNS)}, refused for restless drift {held}"
     )
     assert wilson(right, RUNS)[1] >= 0.5
+
+
+@pytest.mark.parametrize("kind", ["rw", "ar"])
+@pytest.mark.parametrize(("cycles", "averaged"), [(600, True), (600, False), (1500, True)])
+def test_means_of_cycles_keep_the_level_of_the_correlation(
+    kind: str, cycles: int, averaged: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Field and drift of the same kind, independent of each other: how often a cell or mode is significant at 5 %."""
+    monkeypatch.setattr(field_simulator, "CYCLES", cycles)
+    found = 0
+    for seed in range(CORRELATIONS):
+        made = field_simulator.null_session(kind, np.random.default_rng([seed, 91]))
+        fused, field = made.fused.isel(target=[0, 7, 15]), made.field[:, 2::6, 2::8]
+        if averaged:
+            fused, field, _ = average_cycles(fused, field)
+        maps = correlate(fused, field, checks=1, seed=seed, draws=199)
+        least = [float(maps[name].min()) for name in ("p_value", "modes/p_value") if name in maps]
+        found += min(least) <= 0.05
+    means = "means of cycles" if averaged else "every cycle"
+    print(f"\n{kind}, {cycles} cycles, {means}: any cell or mode {rate(found, CORRELATIONS)}")
+    assert wilson(found, CORRELATIONS)[0] <= 0.07
+
+
+@pytest.mark.parametrize("cycles", [800, 1500])
+@pytest.mark.parametrize("source_K", [0.0, 25.0])
+def test_a_patch_of_a_long_test_is_found_where_there_is_one(cycles: int, source_K: float) -> None:
+    """Fields of the twin with 0.05 K of noise; a body of 25 K makes a patch of 0.72 K, which is switched at random."""
+    effects = (EffectRecipe("reflected_source", amplitude_K=source_K),) if source_K else ()
+    ranges_K = []
+    for seed in range(1000, 1000 + (10 if effects else 40)):
+        truth = simulate(Recipe().vary(campaign={"seed": seed}, test={"cycles": cycles}, effect=effects))
+        fields = fields_of(truth, cell_size_mm=20.0, noise_K=0.05)
+        patch = find_switching_patch(fields["frame_temperature"].values)
+        ranges_K += [] if patch is None else [float(np.ptp(patch.course))]
+    print(f"\n{cycles} frames, body of {source_K:g} K: found {len(ranges_K)}, ranges {np.round(ranges_K, 2)} K")
+    assert len(ranges_K) == (10 if effects else 0)
+    assert not effects or np.median(ranges_K) < 1.2
