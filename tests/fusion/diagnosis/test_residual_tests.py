@@ -71,18 +71,18 @@ def test_periods_reach_from_half_the_test_to_three_minutes_in_halves_of_the_reso
 
 
 def test_memory_shift_and_power_of_series_that_are_known():
-    """Forty readings: six turns of a sine; and twenty of +1 after twenty of -1, on a level that must not count."""
+    """Forty readings: six turns of a sine; and twenty of +2 after twenty of -2, on a level that must not count."""
     n = np.arange(40)
     turns = 2 * np.pi * n[:, None] * np.array([6.0, 11.0]) / 40.0
     waves = np.hstack([np.cos(turns), np.sin(turns)]).astype(np.float32)
-    series = np.stack([np.sin(2 * np.pi * 6.0 * n / 40.0 + 0.3), 5.0 + np.where(n < 20, -1.0, 1.0)])
+    series = np.stack([np.sin(2 * np.pi * 6.0 * n / 40.0 + 0.3), 5.0 + np.where(n < 20, -2.0, 2.0)])
     memory, shift, power = module._time_statistics(series, 10, [waves])
     # All of the variance at one frequency: n / 2 in units of white noise.
     np.testing.assert_allclose(power[0], [20.0, 0.0], atol=1e-4)
     # Ten readings of one sign over the root of their number; none where five are of either sign.
     assert shift.shape == (2, 31)
-    np.testing.assert_allclose(shift[1, [0, 10, 15, 30]], [np.sqrt(10.0), np.sqrt(10.0), 0.0, np.sqrt(10.0)], atol=1e-9)
-    # k readings apart, 40 - 2 k of the 40 - k products are +1 and k are -1.
+    np.testing.assert_allclose(shift[1, [0, 10, 15, 30]] / np.sqrt(10.0), [2.0, 2.0, 0.0, 2.0], atol=1e-9)
+    # k readings apart, 40 - 2 k of the 40 - k products are the variance and k its opposite.
     lags = np.arange(1, 13)
     assert memory[1] == pytest.approx((((40 - 3 * lags) / (40 - lags)) ** 2).sum())
 
