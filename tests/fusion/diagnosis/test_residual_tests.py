@@ -103,3 +103,13 @@ def test_waves_of_a_long_test_lie_in_parts_with_the_same_power(monkeypatch, rng)
     assert [part.shape for part in parts] == [(200, 4), (200, 4), (200, 2)]
     # Products in single precision.
     np.testing.assert_allclose(module._time_statistics(series, 10, parts)[2], expected[2], rtol=1e-5)
+
+
+def test_there_are_400_permutations_some_at_a_time(monkeypatch, rng):
+    values = np.arange(10.0)
+    for room, sizes in [(module._VALUES_AT_ONCE, [50] * 8), (70, [7] * 57 + [1]), (1, [1] * 400)]:
+        monkeypatch.setattr(module, "_VALUES_AT_ONCE", room)
+        some = list(module._permutations_of(values, rng))
+        assert [len(one) for one in some] == sizes
+        rows = np.concatenate(some)
+        assert (np.sort(rows, axis=1) == values).all() and len(np.unique(rows, axis=0)) > 390
