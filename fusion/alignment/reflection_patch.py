@@ -25,6 +25,8 @@ _PART_SIGMAS = 3.0
 #: A patch stands out where its jump is this much larger than the same jump averaged over the table; a camera offset has 1.
 _LOCAL_RATIO = 3.0
 _MIN_FRAMES = 9
+#: Variance of the independent part of a source's levels, over that by which they wander from change to change: none to nothing else.
+_LEVELS_OVER_WANDER = (0.0, *np.logspace(-2.0, 6.0, 33).tolist())
 #: Changes of a long test among which the patch is looked for.
 _MOST_CHANGES = 1000
 
@@ -81,7 +83,7 @@ def find_switching_patch(frames: Array | xr.DataArray) -> SwitchingPatch | None:
     Sudden changes are differences of neighbouring frames minus the median of the differences around them. Their first principal
     component is the patch; its scores beyond 8 robust standard deviations are the jumps. In a long test it is the component of the
     thousand largest changes, brought closer to that of all by one step of the power method. The course follows the jumps as far as
-    levels that do not wander allow (docs/method/effects.md).
+    the levels of the source do not wander (docs/method/effects.md).
     """
     if frames.shape[0] < _MIN_FRAMES:
         return None
@@ -109,23 +111,29 @@ def find_switching_patch(frames: Array | xr.DataArray) -> SwitchingPatch | None:
 
 
 def _course(score: Array, jumps: NDArray[np.bool_], scatter: float) -> Array:
-    """Levels of a switching source, (time,), from its changes (time - 1,), of which some are jumps; the first level is zero.
+    r"""Levels of a switching source, (time,), from its changes (time - 1,), of which some are jumps; the first level is zero.
 
-    A sum of jumps is a random walk of their errors. The levels of a source are not: with independent ones of variance :math:`s^2` a change
-    has :math:`2 s^2`, and the levels minimise the squared errors of the changes over that of noise, plus the squared levels over
-    :math:`s^2`.
+    A sum of jumps wanders with their errors, of variance :math:`\sigma^2` each. The levels of a source that is switched on and off do not,
+    those of others do: levels with an independent part of variance :math:`s^2` and one that wanders by :math:`q` a change have changes with
+    variance :math:`2 s^2 + v` and covariance :math:`-s^2` with their neighbours, :math:`v = q + \sigma^2`. Both variances are those of
+    largest likelihood; the share :math:`\sigma^2 / v` of what wanders is error.
     """
     beside = np.convolve(jumps, [1, 1, 1], mode="same") > 0
     switched = jumps | (beside & (np.abs(score) > _PART_SIGMAS * scatter))
     changes = score[switched]
-    # Never none: changes alone do not fix the levels.
-    wander = max(2.0 * scatter**2 / float(np.mean(score[jumps] ** 2)), 1e-9)
-    # Each change is the difference of two levels, so that the normal equations have two diagonals.
-    bands = np.full((2, changes.size + 1), -1.0)
-    bands[1] = 2.0 + wander
-    bands[1, [0, -1]] = 1.0 + wander
-    levels = linalg.solveh_banded(bands, np.diff(-changes, prepend=0.0, append=0.0))
-    return np.asarray((levels - levels[0])[np.concatenate([[0], np.cumsum(switched)])])
+    likelihood, error = -np.inf, np.zeros_like(changes)
+    for ratio in _LEVELS_OVER_WANDER:
+        bands = np.full((2, changes.size), -ratio)
+        bands[1] = 1.0 + 2.0 * ratio
+        factor = linalg.cholesky_banded(bands)
+        wander = linalg.cho_solve_banded((factor, False), changes)
+        square = float(changes @ wander)
+        variance = max(square / changes.size, scatter**2)
+        found = -0.5 * (changes.size * np.log(variance) + square / variance) - float(np.log(factor[1]).sum())
+        if found > likelihood:
+            likelihood, error = found, scatter**2 / variance * wander
+    levels = np.concatenate([[0.0], np.cumsum(changes - error)])
+    return np.asarray(levels[np.concatenate([[0], np.cumsum(switched)])])
 
 
 def _largest(changes: Iterable[Array]) -> Array:

@@ -69,6 +69,22 @@ def test_the_course_of_a_patch_does_not_wander_in_a_long_test(frames):
     assert np.ptp(patch.course) == pytest.approx(0.7, abs=0.28)
 
 
+def test_levels_that_last_and_levels_that_climb_are_followed():
+    """A second source that comes to stay among many switchings of the first, and one that grows by 0.6 K every 20 frames."""
+    frame = np.arange(800)
+    rng = np.random.default_rng(5)
+    noise = 0.05 * rng.standard_normal((800, ROWS, COLUMNS))
+    courses = {"lasting": 1.5 * (frame >= 400) + 0.6 * (frame % 10 < 3), "climbing": 0.6 * (frame // 20)}
+    wrong_K = {}
+    for name, course in courses.items():
+        field = noise.copy()
+        field[:, 3:6, 8:12] += course[:, None, None]
+        wrong_K[name] = np.std(find_switching_patch(field).course - course)
+    # The plain sum of the jumps is wrong by 0.06 K of a climbing level, and by 0.16 K of the other: a fifth of it is taken for error here.
+    assert wrong_K["climbing"] < 0.1
+    assert wrong_K["lasting"] < 0.35
+
+
 def test_the_course_of_a_patch_without_noise_is_exact():
     on = np.arange(40) // 5 % 2.0
     field = np.zeros((40, ROWS, COLUMNS))
