@@ -69,8 +69,9 @@ _SENTENCES: Mapping[Reason, str] = {
     ),
     Reason.AT_SWITCHING: "a driver was switched at {hours:.2f} h: a shift there is a response to the load, not an event of its own",
     Reason.RESTLESS_DRIFT: (
-        "between {start_h:.2f} h and {end_h:.2f} h the drift moves {times:.2g} times as much as in the rest of the test, as in a warm-up "
-        "or after a change of the load; against that, an event gains {advantage:.1f} in log-likelihood, and its name needs {needed:.0f}"
+        "drift that moved {times:.2g} times as much between {start_h:.2f} h and {end_h:.2f} h as in the rest of the test, as in a warm-up "
+        "or after a change of the load, would gain {drift_gain:.1f} in log-likelihood; the event gains {event_gain:.1f}, and its name "
+        "needs {needed:.0f} more than such drift"
     ),
     Reason.TEMPERATURE_NOISE: (
         "the noise of {series} is {noise_percent:.2g} % of its range; above {limit_percent:.1g} % a lagged copy, which is smoother, fits "

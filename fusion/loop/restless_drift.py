@@ -64,8 +64,9 @@ def refuse_in_restless_drift(score: Score, model: ModelFit) -> Decision | None:
 
     Notes
     -----
-    Both explanations have as many parameters: instant and size; duration and factor. Rates of false events with and without this question:
-    docs/method/closed-loop.md.
+    For an event whose instant is searched both explanations have as many parameters: instant and size; duration and factor. An event whose
+    instant the field or a log shows (an offset of the camera, a fault of a sensor) has one less, and is asked as strictly. Rates of false
+    events with and without this question: docs/method/closed-loop.md.
     """
     if score.best.event_s is None:
         return None
@@ -77,6 +78,8 @@ def refuse_in_restless_drift(score: Score, model: ModelFit) -> Decision | None:
         "start_h": time.start_s / 3600.0,
         "end_h": time.end_s / 3600.0,
         "times": 10.0 ** (time.within / 2.0),
+        "drift_gain": time.gain,
+        "event_gain": score.gain,
         "advantage": advantage,
         "needed": TIE_GAIN,
     }

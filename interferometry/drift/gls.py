@@ -340,7 +340,8 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
     system, problem = fit.system, _Problem.of(fit.response, fit.design)
     span = float(system.seconds[-1] - system.seconds[0])
     first_s = _SETTLING_SHARE * span
-    largest = _log_ratio_unit(system) + _LOG_RATIO_LIMITS[system.order][1]
+    # Of the mean over the test; with a little room, so that a fit at the limit can settle at all.
+    largest = _log_ratio_unit(system) + _LOG_RATIO_LIMITS[system.order][1] + 0.01
     searched, few = _for_search(system, problem)
     constant = fit.log_likelihood if few is problem else _solve(searched, few).log_likelihood
 
@@ -349,8 +350,9 @@ def _fit_settling(fit: DriftFit) -> DriftFit:
         return _solve(replace(searched, ratios=10.0**log_ratio, process_noise_scale=scale), few)
 
     def likelihood(log_ratio: Array, time_s: float, exponent: float) -> float:
-        # Far out in the search the drift hides everything else, or a column vanishes beside it: no model, and not the end of the search.
-        if (log_ratio > largest).any():
+        # Far out in the search the drift hides everything else all the time, or a column vanishes beside it: no model, and not the end.
+        mean = np.log10(settling_noise_scale(searched.seconds, time_s, exponent).mean())
+        if (log_ratio + mean > largest).any():
             return -np.inf
         try:
             return float(fitted(log_ratio, time_s, exponent).log_likelihood)
@@ -455,7 +457,8 @@ def estimate(
         # The simplex can lose a component on its way: where the smooth drift is likelier by the sizes that the walk has, it starts there.
         as_walk = 10.0 ** (np.log10(walk.system.ratios) - _log_ratio_unit(walk.system) + _log_ratio_unit(smooth.system))
         if fit_fixed_effects(system(2, as_walk), response, with_trends).log_likelihood > smooth.log_likelihood:
-            smooth = _maximise(system(2, neutral), response, with_trends, as_walk)
+            again = _maximise(system(2, neutral), response, with_trends, as_walk)
+            smooth = max((smooth, again), key=lambda fit: fit.log_likelihood)
         order = 2 if smooth.log_likelihood > walk.log_likelihood + _SMOOTH_MARGIN else 1
         start = (walk if order == 1 else smooth).system.ratios
     columns = design if order == 1 else with_trends

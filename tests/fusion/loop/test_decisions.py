@@ -19,7 +19,7 @@ FIELDS = {
     Reason.SINGLE_WARM_UP: {"share_percent", "gain"},
     Reason.SINGLE_SWITCHING: {"driver", "share_percent"},
     Reason.AT_SWITCHING: {"hours"},
-    Reason.RESTLESS_DRIFT: {"start_h", "end_h", "times", "advantage", "needed"},
+    Reason.RESTLESS_DRIFT: {"start_h", "end_h", "times", "drift_gain", "event_gain", "needed"},
     Reason.TEMPERATURE_NOISE: {"series", "noise_percent", "limit_percent"},
     Reason.FOLLOWS_RATE: {"series"},
     Reason.SMOOTHING: {"series", "advantage"},

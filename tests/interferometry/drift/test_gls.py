@@ -248,8 +248,8 @@ def test_readings_that_a_drift_follows_to_the_last_have_a_noise_all_the_same(rng
     design = np.eye(30)[site]
     wild = np.cumsum(rng.normal(0, 1.0, 120)) * loadings[:, 0] + np.cumsum(rng.normal(0, 1.0, 120)) * loadings[:, 1]
     fit = estimate(seconds, loadings, wild - 500.0, design, order=1, settling=True)
-    # The drift that hides everything else: 10^4 times the variance of a reading in an hour, also at the start.
-    assert (fit.system.ratios * fit.system.step_scales[0] <= 1.001e4 / 3600.0).all()
+    # The drift that hides everything else has 10^4 times the variance of a reading in an hour, in the mean over the test.
+    assert (fit.system.ratios * fit.system.step_scales.mean() <= 2e4 / 3600.0).all()
     assert 1e-3 < fit.sigma < 1.0
     exact = fit_fixed_effects(
         drift_system(seconds, loadings, order=1, ratios=[0.1, 0.1]), 7.0 * design[:, 3] - 500.0, design
@@ -287,6 +287,19 @@ def test_a_search_that_loses_a_component_begins_again_where_the_walk_found_it(rn
     assert len(lost) == 1
     assert again.system.order == expected.system.order == 2
     assert again.sigma == pytest.approx(expected.sigma, rel=1e-3)
+
+
+def test_a_drift_that_is_restless_at_the_start_alone_is_described_so(rng):
+    """A walk of 20 um a root hour that falls to 0.3 with the hour, beside 0.1 um of noise: more at first than a whole test may have."""
+    seconds, site = np.arange(720) * 20.0, np.tile(np.arange(12), 60)
+    rate = (0.3 + 20.0 * np.exp(-seconds / 3600.0)) * np.sqrt(20.0 / 3600.0)
+    walk = np.cumsum(rng.normal(size=720) * rate)
+    fit = estimate(seconds, np.ones((720, 1)), walk + rng.normal(0, 0.1, 720), np.eye(12)[site], order=1, settling=True)
+    ratio = fit.system.ratios[0] * 3600.0 * fit.system.step_scales
+    assert ratio[0] > 3.0 * ratio[-1]
+    assert ratio[-1] < 1.001e4 < ratio[0]
+    # Where the walk is a hundred times the noise of a reading, the two are hardly told apart.
+    assert 0.4 < fit.sigma / 0.1 < 2.0
 
 
 def test_an_even_choice_of_very_many_sites_knows_the_variances_of_the_drift(rng, monkeypatch):
