@@ -87,8 +87,12 @@ def read_product(folder: Path, name: str) -> xr.Dataset:
     """
     path = folder / ("fusion.nc" if name == "record" else f"{name}.nc")
     require_own(folder, [path.name])
-    read = open_dataset if name == "fields" else read_dataset
-    return require_kind(read(path), name, path)
+    product = (open_dataset if name == "fields" else read_dataset)(path)
+    try:
+        return require_kind(product, name, path)
+    except DamagedProductError:
+        product.close()
+        raise
 
 
 def read_fusion(folder: Path) -> xr.DataTree:

@@ -11,6 +11,7 @@ import math
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 
@@ -215,7 +216,7 @@ def open_dataset(path: Path) -> xr.Dataset:
     Returns
     -------
     Dataset
-        What is asked for of a large array, for example some cycles, is read then, and not kept.
+        What is asked for of a large array, for example some cycles, is read then, and not kept, see `open_in_file`.
 
     Raises
     ------
@@ -224,17 +225,45 @@ def open_dataset(path: Path) -> xr.Dataset:
     FileNotFoundError
         If there is none.
     """
-    import xarray as xr
+    opened = open_in_file(path)
+    try:
+        for variable in opened.variables.values():
+            if variable.nbytes <= IN_MEMORY_BYTES:
+                variable.load()
+    except DamagedProductError:
+        opened.close()
+        raise
+    if not is_large(opened):
+        opened.close()
+    return opened
+
+
+def open_in_file(path: Path) -> xr.Dataset:
+    """Open a Dataset written by `write_dataset` and leave all its arrays in the file.
+
+    Parameters
+    ----------
+    path : Path
+        Product.
+
+    Returns
+    -------
+    Dataset
+        What is asked for is read then, and not kept; it is of the file that was opened, whatever takes its place meanwhile. Bytes that
+        turn out to be damaged only then raise `DamagedProductError`, too.
+
+    Raises
+    ------
+    DamagedProductError
+        If the file is no NetCDF, or only a part of one.
+    FileNotFoundError
+        If there is none.
+    """
+    from thermography.fields.tasks.stored import open_stored
 
     with told_if_damaged(path):
         # Of every array one part is kept, which the next piece may need, in place of several.
-        kept = {"rdcc_nbytes": _CHUNK_BYTES}
-        dataset = xr.open_dataset(path, engine="h5netcdf", decode_timedelta=False, cache=False, driver_kwds=kept)
-        if not is_large(dataset):
-            with dataset:
-                return dataset.load()
-        small = [name for name, variable in dataset.variables.items() if variable.nbytes <= IN_MEMORY_BYTES]
-        return dataset.assign({name: dataset[name].load() for name in small if name not in dataset.indexes})
+        return open_stored(path, partial(_named_if_damaged, path), _CHUNK_BYTES)
 
 
 def read_dataset(path: Path) -> xr.Dataset:
@@ -294,10 +323,17 @@ def told_if_damaged(path: Path) -> Iterator[None]:
         If its values stand in another file or nowhere, or the library of NetCDF cannot read it: HDF5 answers to damaged bytes with errors
         of several kinds, none of which names the file.
     """
-    try:
+    with _named_if_damaged(path):
         fault = hdf5_fault(path)
         if fault:
             raise DamagedProductError(f"{path}: is no product of thermofuse: {fault}; run the campaign again")
+        yield
+
+
+@contextmanager
+def _named_if_damaged(path: Path) -> Iterator[None]:
+    """Name the file where the library of NetCDF cannot read it."""
+    try:
         yield
     except (FileNotFoundError, IsADirectoryError, PermissionError, FusionError):
         raise

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -65,3 +66,14 @@ def test_a_product_of_another_run_is_told_by_its_hash(tmp_path: Path) -> None:
     for damaged in ({}, {"products": {"sensors.nc": {}}}, {"products": 1}):
         write_json(tmp_path / "provenance.json", damaged)
         require_own(tmp_path, ["sensors.nc"])
+
+
+def test_fields_of_another_kind_are_not_left_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fusion.products.store.IN_MEMORY_BYTES", 1_000)
+    path = write_dataset(tmp_path / "fields.nc", xr.Dataset({"rise": ("x", np.zeros(1_000))}))
+    with pytest.raises(DamagedProductError, match="another kind of file") as told:
+        read_product(tmp_path, "fields")
+    assert told.tb is not None, "the stack still holds what was opened"
+    # A file that is open for reading cannot be opened for writing.
+    with h5py.File(path, "r+"):
+        pass

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -191,3 +192,73 @@ def test_a_small_dataset_is_opened_into_memory(tmp_path: Path) -> None:
     (tmp_path / "bad.nc").write_bytes(path.read_bytes()[:200])
     with pytest.raises(DamagedProductError, match=r"bad\.nc: is damaged"):
         open_dataset(tmp_path / "bad.nc")
+
+
+@pytest.fixture
+def large_fields(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> Path:
+    """A product whose map stays in the file, stored in eleven parts."""
+    monkeypatch.setattr(store, "IN_MEMORY_BYTES", 50_000)
+    monkeypatch.setattr(store, "_CHUNK_BYTES", 80_000)
+    rise = rng.normal(size=(1_000, 10, 20)).astype("f4")
+    return write_dataset(tmp_path / "fields.nc", xr.Dataset({"rise": (("cycle", "y", "x"), rise)}))
+
+
+def open_handles(path: Path) -> int:
+    """How often this process has a file open."""
+    return sum(link.resolve() == path for link in Path("/proc/self/fd").iterdir())
+
+
+def test_damage_that_is_met_when_some_cycles_are_read_names_the_file(large_fields: Path) -> None:
+    damaged = bytearray(large_fields.read_bytes())
+    middle = len(damaged) // 2
+    damaged[middle : middle + 2_000] = bytes(2_000)
+    large_fields.write_bytes(damaged)
+    opened = open_dataset(large_fields)
+    assert opened["rise"][0].values.shape == (10, 20)
+    for read in (lambda: opened["rise"].values, lambda: list(in_pieces(opened["rise"])), opened.copy().load):
+        with pytest.raises(
+            DamagedProductError,
+            match=r"fields\.nc: is damaged or no product of thermofuse \(OSError\); run the campaign again",
+        ):
+            read()
+    opened.close()
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="open files are counted in /proc")
+def test_a_file_is_closed_with_its_dataset_and_where_opening_fails(
+    large_fields: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = open_dataset(large_fields)
+    assert open_handles(large_fields) == 1
+    opened.close()
+    assert open_handles(large_fields) == 0
+    # The damaged map is small enough to be read at once.
+    damaged = bytearray(large_fields.read_bytes())
+    middle = len(damaged) // 2
+    damaged[middle : middle + 2_000] = bytes(2_000)
+    large_fields.write_bytes(damaged)
+    monkeypatch.setattr(store, "IN_MEMORY_BYTES", 1_000_000)
+    with pytest.raises(DamagedProductError) as told:
+        open_dataset(large_fields)
+    assert told.tb is not None, "the stack still holds what was opened"
+    assert open_handles(large_fields) == 0
+
+
+def test_an_open_product_stays_the_file_that_was_opened(large_fields: Path, tmp_path: Path) -> None:
+    opened = open_dataset(large_fields)
+    rise = read_dataset(large_fields)["rise"].values
+    write_dataset(large_fields, xr.Dataset({"rise": (("cycle", "y", "x"), np.zeros_like(rise))}))
+    other = write_dataset(tmp_path / "other.nc", xr.Dataset({"rise": ("x", np.arange(3.0))}))
+    # The next file takes the place of the first one in the cache of xarray.
+    with xr.set_options(file_cache_maxsize=1), xr.open_dataset(other, engine="h5netcdf"):
+        assert (opened["rise"].values == rise).all()
+    opened.close()
+
+
+def test_an_open_product_can_be_sent_to_another_process(large_fields: Path) -> None:
+    opened = open_dataset(large_fields)
+    sent = pickle.loads(pickle.dumps(opened))
+    assert not sent["rise"].variable._in_memory
+    xr.testing.assert_identical(sent, opened)
+    opened.close()
+    assert sent["rise"][-1].values.shape == (10, 20)

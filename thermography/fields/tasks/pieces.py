@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from thermography._typing import Array
 from thermography.fields.tasks.spool import give_back
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 #: Size of a piece in double precision, bytes: what is computed from one takes ten times as much.
 PIECE_BYTES = 1 << 22
