@@ -93,7 +93,8 @@ class RecordGrounds:
         """Whether most of what a delayed copy explains is the sensor's rate, or acts before the sensor.
 
         Alike sensors share their coefficients in any way, so the sensitivity to a sensor is that of all columns to its course. A rate is
-        the sensor and its delayed copy with opposite signs that nearly cancel; a lead is a delayed copy that acts against the sensor.
+        the sensor and its delayed copy with opposite signs that nearly cancel; a lead is a delayed copy that acts against the sensor, whose
+        own sensitivity without the copy is known to have the other sign (two standard uncertainties).
         """
         model = self._model
         rise = _sensor_rise(self._record, str(candidate.parameters["sensor"]))
@@ -105,13 +106,13 @@ class RecordGrounds:
                 fit.system, fit.response, np.column_stack([fit.design, candidate.columns[rows]])
             )
             delayed = float(together.coefficients[-1])
-            alone, beside = (
-                float((fit.design[:, levels:] @ coefficients[levels:size]) @ course)
-                / max(float(course @ course), 1e-300)
-                for coefficients in (fit.coefficients, together.coefficients)
-            )
+            own = slice(levels, size)
+            share = fit.design[:, own].T @ course / max(float(course @ course), 1e-300)
+            alone, beside = (float(share @ each.coefficients[own]) for each in (fit, together))
+            alone_u = float(np.sqrt(share @ fit.covariance[own, own] @ share))
             cancels = beside * delayed < 0.0 and abs(beside + delayed) < 0.5 * max(abs(beside), abs(delayed))
-            weight[cancels or alone * delayed < 0.0] += abs(delayed) / max(fit.sigma, 1e-12)
+            leads = alone * delayed < 0.0 and abs(alone) > 2.0 * alone_u
+            weight[cancels or leads] += abs(delayed) / max(fit.sigma, 1e-12)
         return weight[True] > weight[False]
 
     def advantage_over_smoothing(self, candidate: Candidate) -> float:
