@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import os
 import re
+import secrets
 import threading
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-#: Stands before the suffix of a file that is being written, followed by a number.
+#: Stands before the suffix of a file that is being written, followed by the writer: a number of this process and that of the thread.
 PARTIAL = ".partial"
-_PARTIAL_NAME = re.compile(rf"\.(?P<stem>.+){re.escape(PARTIAL)}\d*(?P<suffix>(?:\.[^.]*)?)")
+_PARTIAL_NAME = re.compile(rf"\.(?P<stem>.+){re.escape(PARTIAL)}(?:[0-9a-f]{{8}}-)?\d*(?P<suffix>(?:\.[^.]*)?)")
+_PROCESS = secrets.token_hex(4)
 
 
 def partial_path(path: Path) -> Path:
@@ -24,9 +26,10 @@ def partial_path(path: Path) -> Path:
 
     Notes
     -----
-    The number of the thread, which no other of the machine has at the time, keeps apart two processes that write the same file.
+    The number of the thread keeps apart the writers of one system. Containers and machines that share a folder may have the same
+    numbers: these are kept apart by a random number of the process.
     """
-    return path.with_name(f".{path.stem}{PARTIAL}{threading.get_native_id()}{path.suffix}")
+    return path.with_name(f".{path.stem}{PARTIAL}{_PROCESS}-{threading.get_native_id()}{path.suffix}")
 
 
 def finished_path(partial: Path) -> Path | None:
