@@ -16,7 +16,7 @@ from interferometry.io.faults import LaserFormatError
 #: Cells of a spreadsheet, empty ones between the others among them; no laser test has that many.
 MOST_CELLS = 20_000_000
 #: So many of them may be empty, and so many more for each that is filled.
-_EMPTY_CELLS, _EMPTY_PER_FILLED = 1_000_000, 50
+_EMPTY_CELLS, _EMPTY_PER_FILLED = 5_000_000, 50
 #: Characters in all cells, a text as often as cells hold it.
 _MOST_TEXT = 200_000_000
 #: Bytes that the parts of a spreadsheet may unpack to: 20 million cells take about 50 to 100 bytes of XML each.
@@ -27,19 +27,26 @@ _LARGE_BYTES, _MOST_PACKED = 100_000_000, 200
 _MOST_PARTS = 2_000
 #: Last row and column of a sheet (XFD1048576).
 _LAST_ROW, _LAST_COLUMN = 1_048_576, 16_384
-#: Bytes of XML that are searched at a time, and those in which the value of a cell follows its tag.
-_PIECE, _NEAR = 1 << 20, 4096
-#: A row or a cell in the XML of a sheet, with its attributes, the place among these, as in <c r="B7" s="1" t="s">, and the text's number.
-_TAG = re.compile(rb"<(?:\w+:)?(row|c)(\s[^<>]*)?>")
+#: Bytes of XML that are searched at a time, those in which the value of a cell follows its tag, and the most that a number takes.
+_PIECE, _NEAR, _LONGEST_NUMBER = 1 << 20, 4096, 100
+#: A sheet, a row or a cell, with its attributes: in Office Open XML, as in <c r="B7" s="1" t="s">, and in OpenDocument.
+_TAG = re.compile(
+    rb"<(?:(?!/)[^\s<>:]*:)?(sheetData|row|c|table|table-row|table-cell|covered-table-cell)"
+    rb"(?=[\s/>])((?:[^<>\"']++|\"[^\"]*+\"|'[^']*+')*+)>"
+)
+#: The beginning of a tag with attributes.
+_OPEN = re.compile(rb"<[^\s<>!?/][^\s<>]*\s[^>]*+\Z")
+#: In Office Open XML: the place of a row or a cell, cells with a shared text and with one of their own, and the number of the shared one.
 _PLACE = re.compile(rb"\sr\s*=\s*[\"']([A-Za-z]*)(\d+)[\"']")
-_SHARED = re.compile(rb"\st\s*=\s*[\"']s[\"']")
+_SHARED, _OWN = (re.compile(rb"\st\s*=\s*[\"']" + kind + rb"[\"']") for kind in (rb"s", rb"(?:inlineStr|str)"))
 _NUMBER = re.compile(rb"<(?:\w+:)?v(?:\s[^<>]*)?>\s*(\d{1,9})")
-_TEXTS, _TEXT_END = re.compile(rb"<(?:\w+:)?sst[\s>]"), re.compile(rb"</(?:\w+:)?si>")
-#: The same in OpenDocument, where a row or a cell may stand for many alike.
-_ODS_TAG = re.compile(rb"<table:(table|table-row|table-cell|covered-table-cell)(\s[^<>]*)?>")
+_TEXTS, _TEXT_END = re.compile(rb"<(?:(?!/)[^\s<>:]*:)?sst[\s>]"), re.compile(rb"</(?:[^\s<>:]*:)?si\s*>")
+#: In OpenDocument, where a row or a cell may stand for many alike.
 _ODS_REPEATED = re.compile(rb"table:number-(?:rows|columns)-repeated\s*=\s*[\"'](\d{1,18})")
-#: Records of binary sheets ([MS-XLSB] 2.3.2): a sheet, a table of texts and one of them, a row, cells, those whose text is in the table.
-_XLSB_SHEET, _XLSB_TEXTS, _XLSB_TEXT, _XLSB_ROW, _XLSB_CELLS, _XLSB_SHARED = 129, 159, 19, 0, range(2, 12), 7
+#: Last letters of the name of a part that only archives with binary sheets have.
+_XLSB_CONTENTS = "workbook.bin.rels"
+#: Records of binary sheets ([MS-XLSB] 2.3.2): before the cells, before shared texts, one of these, a row, cells, those with a shared text.
+_XLSB_SHEET, _XLSB_TEXTS, _XLSB_TEXT, _XLSB_ROW, _XLSB_CELLS, _XLSB_SHARED = 145, 159, 19, 0, range(2, 12), 7
 
 
 @dataclass
@@ -63,25 +70,46 @@ class _Extent:
     _rows: int = field(default=0, init=False)
     _columns: int = field(default=0, init=False)
     _part: str = field(default="", init=False)
+    _largest: tuple[int, str, int, int] = field(default=(0, "", 0, 0), init=False)
 
     def begin(self, part: str) -> None:
         """Begin a sheet."""
-        self._before += self._rows * self._columns
-        self._rows = self._columns = 0
+        self._end_sheet()
         self._part = part
 
     def fill(self, row: int, column: int, text: int = 0) -> None:
         """Count a cell, or the last of a block of alike ones, of which `text` is the length of all texts."""
         self._filled += 1
         self._rows, self._columns = max(self._rows, row), max(self._columns, column)
-        cells = self._before + self._rows * self._columns
         outside = self._rows > _LAST_ROW or self._columns > _LAST_COLUMN
-        if outside or cells > min(MOST_CELLS, _EMPTY_CELLS + _EMPTY_PER_FILLED * self._filled):
-            raise LaserFormatError(
-                f"{self.path}, {self._part}: a cell in row {row} and column {column} lies far from the others; delete the cells that do "
-                "not belong to the table, and save the file again"
-            )
+        if outside or self._before + self._rows * self._columns > MOST_CELLS:
+            self._end_sheet()
+            self._refuse("at least ")
         self._add_text(text, f"the cells up to row {row}")
+
+    def end(self) -> None:
+        """Refuse sheets in which a reader would make very many empty cells, once all are counted."""
+        self._end_sheet()
+        if self._before > _EMPTY_CELLS + _EMPTY_PER_FILLED * self._filled:
+            self._refuse()
+
+    def _end_sheet(self) -> None:
+        cells = self._rows * self._columns
+        self._before += cells
+        self._largest = max(self._largest, (cells, self._part, self._rows, self._columns))
+        self._rows = self._columns = 0
+
+    def _refuse(self, least: str = "") -> None:
+        _, part, rows, columns = self._largest
+        cells = f"{self.path}, {part}: its cells reach {least}row {rows} and column {columns}"
+        if self._before > 2 * self._filled:
+            raise LaserFormatError(
+                f"{cells}, and most up to there are empty or repeated; delete the rows and columns beyond the table, not only what is "
+                "in them, and save the file again"
+            )
+        raise LaserFormatError(
+            f"{cells}, at most {MOST_CELLS / 1e6:.0f} million cells are read; save the sheet with the measured values alone"
+        )
 
     def share(self, part: str, length: int) -> None:
         """Count a text that cells may share."""
@@ -117,8 +145,8 @@ def refuse_bomb(path: Path, archive: BinaryIO) -> None:
     ------
     LaserFormatError
         The parts are more than 2,000 or lie over one another, or state more than 2 GB in all, or more than 100 MB and 200 times what
-        they are packed in; a cell lies so far from the others that the sheets would have more than 20 million cells, or more empty than
-        filled ones by far: a reader makes them all; or the texts in the cells have more than 200 million characters.
+        they are packed in; the cells reach so far that the sheets would have more than 20 million, or far more empty than filled ones, as a
+        reader makes them all; or the texts in the cells have more than 200 million characters.
     """
     size = archive.seek(0, 2)
     try:
@@ -130,8 +158,11 @@ def refuse_bomb(path: Path, archive: BinaryIO) -> None:
     with parts:
         _refuse_by_contents(path, parts.infolist(), size)
         extent = _Extent(path)
-        # The texts first: a cell names one by its number.
-        for look in (_count_texts, _count_cells):
+        looks = [_count_texts, _count_cells]
+        if any(part.filename.lower().endswith(_XLSB_CONTENTS) for part in parts.infolist()):
+            looks = [_count_texts, _count_binary_texts, _count_cells, _count_binary_cells]
+        # The texts first: a cell names one by its number. Every part is looked at to its end: its name and its beginning tell nothing.
+        for look in looks:
             for each in parts.infolist():
                 try:
                     with parts.open(each) as part:
@@ -152,6 +183,7 @@ def refuse_bomb(path: Path, archive: BinaryIO) -> None:
                         f"{path}: cannot be read as a spreadsheet ({each.filename}: {fault}); open it, remove a password if it has one, "
                         "and save it again as XLSX"
                     ) from None
+        extent.end()
     archive.seek(0)
 
 
@@ -174,114 +206,131 @@ def _refuse_by_contents(path: Path, parts: list[zipfile.ZipInfo], size: int) -> 
 
 
 def _count_texts(extent: _Extent, name: str, part: IO[bytes]) -> None:
-    """Count the texts of a part that holds those which cells share."""
-    start = part.read(_PIECE)
-    if _is_binary(start, _XLSB_TEXTS):
-        for kind, payload in _records(start, part):
-            if kind == _XLSB_TEXT:
-                extent.share(name, len(payload))
-    elif _TEXTS.search(start):
-        length = 0
-        for text, end in _pieces(start, part):
-            begin = 0
-            for found in _TEXT_END.finditer(text, 0, end):
-                extent.share(name, length + found.end() - begin)
-                length, begin = 0, found.end()
-            length += end - begin
+    """Count the texts of a part of XML that holds those which cells share."""
+    length, inside = 0, False
+    for text, end in _pieces(part):
+        begin = 0
+        if not inside:
+            opening = _TEXTS.search(text, 0, end) if b"sst" in text else None
+            if opening is None:
+                continue
+            inside, begin = True, opening.end()
+        for found in _TEXT_END.finditer(text, begin, end):
+            extent.share(name, length + found.end() - begin)
+            length, begin = 0, found.end()
+        length += end - begin
+    if inside:
         extent.share(name, length)
 
 
 def _count_cells(extent: _Extent, name: str, part: IO[bytes]) -> None:
-    """Count the cells of a part that is a sheet, by what it begins with. Cells that only have a format cost a reader nothing."""
-    start = part.read(_PIECE)
-    if _is_binary(start, _XLSB_SHEET):
-        extent.begin(name)
-        _count_binary(extent, start, part)
-    elif b"sheetData" in start:
-        extent.begin(name)
-        _count_xml(extent, start, part)
-    elif b"<table:table" in start:
-        extent.begin(name)
-        _count_ods(extent, name, start, part)
-
-
-def _count_xml(extent: _Extent, start: bytes, part: IO[bytes]) -> None:
-    """Count the cells of a sheet of Office Open XML."""
-    row = column = 0
-    for text, end in _pieces(start, part):
-        for found in _TAG.finditer(text, 0, end):
-            attributes = found[2] or b""
+    """Count the cells of the sheets in a part of XML. Cells that only have a format cost a reader nothing."""
+    row = column = rows = 0
+    inside = False
+    for tag, attributes, content, length in _tags(part):
+        if tag in (b"sheetData", b"table"):
+            extent.begin(name)
+            row, column, inside = 0, 0, True
+        elif not inside:
+            continue
+        elif tag == b"row":
             place = _PLACE.search(attributes)
-            if found[1] == b"row":
-                row, column = (row + 1 if place is None else int(place[2][:30])), 0
-                continue
+            row, column = (row + 1 if place is None else int(place[2][:30])), 0
+        elif tag == b"c":
+            place = _PLACE.search(attributes)
             # A cell without a place stands beside the one before it.
             column = column + 1 if place is None else _column_number(place[1][:10])
             row = row if place is None else int(place[2][:30])
-            if attributes.endswith(b"/") or text.startswith(b"</", found.end()):
-                continue
-            length = 0
-            if _SHARED.search(attributes):
-                number = _NUMBER.search(text, found.end(), found.end() + _NEAR)
-                length = extent.shared(None if number is None else int(number[1]))
-            extent.fill(row, column, length)
+            if not (attributes.endswith(b"/") or content.startswith(b"</")):
+                extent.fill(row, column, _text_length(extent, attributes, content, length))
+        elif tag == b"table-row":
+            rows = _times(attributes)
+            row, column = row + rows, 0
+        else:
+            times = _times(attributes)
+            column += times
+            alone = attributes.endswith(b"/")
+            if b"office:" in attributes or not alone:
+                text = len(attributes) * (b"office:string-value" in attributes) + length * (not alone)
+                extent.fill(row, column, text * times * rows)
 
 
-def _count_ods(extent: _Extent, name: str, start: bytes, part: IO[bytes]) -> None:
-    """Count the cells of OpenDocument sheets, of which a row or a cell may stand for many."""
-    row = column = rows = 0
-    for text, end in _pieces(start, part):
-        for found in _ODS_TAG.finditer(text, 0, end):
-            attributes = found[2] or b""
-            repeated = _ODS_REPEATED.search(attributes)
-            times = 1 if repeated is None else int(repeated[1])
-            if found[1] == b"table":
-                extent.begin(name)
-                row = column = 0
-            elif found[1] == b"table-row":
-                row, column, rows = row + times, 0, times
-            else:
-                column += times
-                if b"office:value" in attributes or not attributes.endswith(b"/"):
-                    following = text.find(b"<table:", found.end())
-                    length = (following if following >= 0 else len(text)) - found.end()
-                    extent.fill(row, column, length * times * rows)
+def _text_length(extent: _Extent, attributes: bytes, content: bytes, length: int) -> int:
+    """Return the length of the text in a cell of Office Open XML, with the XML around it; that of a number is 0."""
+    if _SHARED.search(attributes):
+        number = _NUMBER.search(content)
+        return extent.shared(None if number is None else int(number[1]))
+    return length if _OWN.search(attributes) or length > _LONGEST_NUMBER else 0
 
 
-def _count_binary(extent: _Extent, start: bytes, part: IO[bytes]) -> None:
+def _times(attributes: bytes) -> int:
+    """Return how many rows or cells of OpenDocument one stands for."""
+    repeated = _ODS_REPEATED.search(attributes)
+    return 1 if repeated is None else int(repeated[1])
+
+
+def _tags(part: IO[bytes]) -> Iterator[tuple[bytes, bytes, bytes, int]]:
+    """Yield the tags of sheets, rows and cells: name, attributes, the beginning of what follows up to the next, and its length."""
+    tag, attributes, content, length = b"", b"", b"", 0
+    for text, end in _pieces(part):
+        begin = 0
+        for found in _TAG.finditer(text, 0, end):
+            if tag:
+                content += text[begin : min(found.start(), begin + _NEAR)]
+                yield tag, attributes, content, length + found.start() - begin
+            tag, attributes, content, length, begin = found[1], found[2], b"", 0, found.end()
+        content = (content + text[begin : min(end, begin + _NEAR)])[:_NEAR]
+        length += end - begin
+    if tag:
+        yield tag, attributes, content, length
+
+
+def _pieces(xml: IO[bytes]) -> Iterator[tuple[bytes, int]]:
+    """Yield pieces of XML, each with the place up to which its tags are whole: what follows the last bracket comes again."""
+    text = xml.read(_PIECE)
+    while text:
+        following = xml.read(_PIECE)
+        end = text.rfind(b"<") if following else len(text)
+        if end < 0 or len(text) - end > 2 * _PIECE:
+            if _OPEN.match(text, max(end, 0)):
+                raise ValueError(f"a tag of more than {2 * _PIECE / 1e6:.0f} million characters")
+            end = len(text)
+        yield text, end
+        text = text[end:] + following
+
+
+def _count_binary_texts(extent: _Extent, name: str, part: IO[bytes]) -> None:
+    """Count the texts of a binary part that holds those which cells share."""
+    inside = False
+    for kind, payload in _records(part):
+        inside = inside or kind == _XLSB_TEXTS
+        if inside and kind == _XLSB_TEXT:
+            extent.share(name, len(payload))
+
+
+def _count_binary_cells(extent: _Extent, name: str, part: IO[bytes]) -> None:
     """Count the cells of a binary sheet."""
-    row = 0
-    for kind, payload in _records(start, part):
-        if kind == _XLSB_ROW:
+    row, inside = 0, False
+    for kind, payload in _records(part):
+        if kind == _XLSB_SHEET:
+            extent.begin(name)
+            inside = True
+        elif inside and kind == _XLSB_ROW:
             row = 1 + struct.unpack_from("<I", payload)[0]
-        elif kind in _XLSB_CELLS:
+        elif inside and kind in _XLSB_CELLS:
             shared = kind == _XLSB_SHARED
             length = extent.shared(struct.unpack_from("<I", payload, 8)[0]) if shared else len(payload)
             extent.fill(row, 1 + struct.unpack_from("<I", payload)[0], length)
 
 
-def _pieces(text: bytes, xml: IO[bytes]) -> Iterator[tuple[bytes, int]]:
-    """Yield pieces of XML, each with the place up to which its tags are whole: what follows the last bracket comes again."""
-    while text:
-        following = xml.read(_PIECE)
-        end = max(text.rfind(b"<"), 0) if following else len(text)
-        yield text, end
-        text = text[end:][-2 * _PIECE :] + following if following else b""
-
-
-def _is_binary(start: bytes, kind: int) -> bool:
-    """Whether a part begins with a record of this kind, written in two bytes."""
-    return start[:2] == bytes([kind & 0x7F | 0x80, kind >> 7])
-
-
-def _records(start: bytes, part: IO[bytes]) -> Iterator[tuple[int, bytes]]:
+def _records(part: IO[bytes]) -> Iterator[tuple[int, bytes]]:
     """Yield kind and content of the records of a binary part; a length that is not true ends them.
 
     References
     ----------
     [MS-XLSB], 2.1.4: kind in one or two bytes, length in one to four, seven bits each.
     """
-    content, place = start + part.read(), 0
+    content, place = part.read(), 0
     while place < len(content):
         kind, place = _number(content, place, 2)
         length, place = _number(content, place, 4)

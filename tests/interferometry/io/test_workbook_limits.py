@@ -55,7 +55,7 @@ def sheet_of(path: Path, rows: str, *, part: str = "xl/worksheets/sheet1.xml") -
         ('<row r="1"><c r="A1"/><c s="1" r="XFD1048576"><v>1</v></c></row>', "row 1048576 and column 16384"),
         ('<row r="1"><c r="nanA1"><v>1</v></c></row>', "row 1 and column 247105"),
         ('<row r="1"><c r="A1999999999999999999"><v>1</v></c></row>', "row 1999999999999999999 and column 1"),
-        (f'<row r="1000000">{"<c><v>1</v></c>" * 300}</row>', "row 1000000 and column 2"),
+        (f'<row r="1000000">{"<c><v>1</v></c>" * 300}</row>', "row 1000000 and column 21"),
     ],
 )
 @pytest.mark.parametrize("part", ["xl/worksheets/sheet1.xml", "xl/sheets/s1.xml"])
@@ -63,8 +63,61 @@ def test_a_cell_far_from_the_table_is_refused_before_memory_is_taken(
     tmp_path: Path, rows: str, told: str, part: str
 ) -> None:
     path = tmp_path / "laser.xlsx"
-    with pytest.raises(LaserFormatError, match=rf"{part}: a cell in {told} lies far from the others; delete the cells"):
+    with pytest.raises(LaserFormatError) as error:
         read_sheets(path, sheet_of(path, rows, part=part))
+    assert str(error.value) == (
+        f"{path}, {part}: its cells reach at least {told}, and most up to there are empty or repeated; delete the rows and columns "
+        "beyond the table, not only what is in them, and save the file again"
+    )
+
+
+def test_a_stray_cell_far_below_the_table_is_read_where_that_costs_little(tmp_path: Path) -> None:
+    rows = "".join(f'<row r="{row}">{f"<c><v>{row}</v></c>" * 7}</row>' for row in range(1, 5001))
+    stray = '<row r="{0}"><c r="G{0}" t="inlineStr"><is><t> </t></is></c></row>'
+    path = tmp_path / "laser.xlsx"
+    refuse_bomb(path, io.BytesIO(sheet_of(path, rows + stray.format(700_000))))
+    # The far cell is named wherever it stands, not the one that was counted last.
+    for order in (rows + stray.format(1_000_000), stray.format(1_000_000) + rows):
+        assert refused(path, sheet_of(path, order)).startswith(
+            ", xl/worksheets/sheet1.xml: its cells reach row 1000000 and column 7, and most up to there are empty or repeated; delete"
+        )
+
+
+@pytest.mark.parametrize("before", [" " * 3_000_000, "<i/>" * 800_000, f"<i k='{'>' * 500_000}'/>", "x"])
+@pytest.mark.parametrize("prefix", ["", "a-b:"])
+def test_a_sheet_is_found_wherever_it_begins_in_its_part(tmp_path: Path, before: str, prefix: str) -> None:
+    path = tmp_path / "laser.xlsx"
+    far = f"<{prefix}c k='>' r='XFD1048576'><v>1</v></{prefix}c>"
+    content = archive_of(path, sheet1=f"{before}<worksheet>{before}<{prefix}sheetData>{before}{far}")
+    assert ", xl/sheet1.xml: its cells reach at least row 1048576 and column 16384, and most" in refused(path, content)
+    text = f"<{prefix}si><t>{'A' * 1_000_000}</t></{prefix}si >"
+    shared = '<c t="s"><v>0</v></c>'
+    cells = f"<sheetData>{shared * 300}</sheetData>"
+    content = archive_of(path, sheet1=cells, texts=f"{before}<{prefix}sst>{text}")
+    assert "take more than 200 million characters" in refused(path, content)
+
+
+def test_a_tag_that_does_not_end_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "laser.xlsx"
+    content = archive_of(path, sheet1=f"<sheetData><c {' ' * 5_000_000}r='XFD1048576'><v>1</v></c></sheetData>")
+    assert "(xl/sheet1.xml: a tag of more than 2 million characters)" in refused(path, content)
+
+
+@pytest.mark.parametrize("kind", ['t="inlineStr"><is><t>{}</t></is>', 't="str"><v>{}</v>', "><is><t>{}</t></is>"])
+@pytest.mark.parametrize("length", [300, 3_000_000])
+def test_texts_in_the_cells_themselves_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, length: int
+) -> None:
+    path = tmp_path / "laser.xlsx"
+    rows = "".join(f'<row r="{row}"><c {kind.format("A" * length)}</c></row>' for row in range(1, 11))
+    monkeypatch.setattr("interferometry.io.workbook_limits._MOST_TEXT", 10 * (length + 100))
+    refuse_bomb(path, io.BytesIO(sheet_of(path, rows)))
+    monkeypatch.setattr("interferometry.io.workbook_limits._MOST_TEXT", 9 * length)
+    assert refused(path, sheet_of(path, rows)).startswith(", xl/worksheets/sheet1.xml: the cells up to row 9 take more")
+    numbers = "".join(f'<row r="{row}"><c><v>1.2345678901234567</v></c></row>' for row in range(1, length // 10))
+    monkeypatch.setattr("interferometry.io.workbook_limits._MOST_TEXT", 100)
+    if length == 300:
+        refuse_bomb(path, io.BytesIO(sheet_of(path, numbers)))
 
 
 def test_cells_that_only_have_a_format_are_no_table(tmp_path: Path) -> None:
@@ -85,7 +138,7 @@ def test_cells_are_found_across_the_pieces_in_which_a_sheet_is_read(
     refuse_bomb(path, io.BytesIO(sheet_of(path, near)))
     for shift in range(40):
         far = f'{near}<row r="60">{" " * shift}<c r="XFD1048576" s="12"><v>1</v></c></row>'
-        with pytest.raises(LaserFormatError, match="row 1048576 and column 16384"):
+        with pytest.raises(LaserFormatError, match="its cells reach at least row 1048576 and column 16384"):
             refuse_bomb(path, io.BytesIO(sheet_of(path, far)))
 
 
@@ -105,14 +158,14 @@ def refused(path: Path, content: bytes) -> str:
 def test_two_cells_in_opposite_corners_do_not_make_millions(tmp_path: Path) -> None:
     far = '<row r="1"><c r="A1"><v>1</v></c></row><row r="1048576"><c r="S1048576"><v>1</v></c></row>'
     told = refused(tmp_path / "a.xlsx", sheet_of(tmp_path / "a.xlsx", far))
-    assert "a cell in row 1048576 and column 19 lies far from the others" in told
+    assert "its cells reach row 1048576 and column 19, and most up to there are empty" in told
     # A million empty cells are nothing, in one sheet; in many sheets they are.
     near = far.replace("S1048576", "A1000000").replace("1048576", "1000000")
     sheet = f"<worksheet><sheetData>{near}</sheetData></worksheet>"
     one = archive_of(tmp_path / "b.xlsx", sheet1=sheet)
     refuse_bomb(tmp_path / "b.xlsx", io.BytesIO(one))
-    two = archive_of(tmp_path / "b.xlsx", sheet1=sheet, sheet2=sheet)
-    assert ", xl/sheet2.xml: a cell in row 1000000 and column 1 lies far" in refused(tmp_path / "b.xlsx", two)
+    many = archive_of(tmp_path / "b.xlsx", **{f"sheet{k}": sheet for k in range(1, 7)})
+    assert ": its cells reach row 1000000 and column 1, and most" in refused(tmp_path / "b.xlsx", many)
 
 
 @pytest.mark.parametrize("close", ["</si>", "</x:si>"])
@@ -181,26 +234,40 @@ def test_rows_and_cells_of_open_document_count_as_often_as_they_repeat(tmp_path:
     tail = row.format(rows.format(1_000_000), empty)
     sheets = read_sheets(path, written(row.format(rows.format(2), cell.format(columns.format(3)) + empty) + tail))
     assert sheets == {"X": [(1, ["1"] * 3), (2, ["1"] * 3)]}
+    bare = f'<table:table-cell office:value="1"{columns.format(1_000)}/>'
     for bomb, place in [
-        (row.format("", cell.format(columns.format(20_000))), "row 1 and column 20000"),
-        (row.format(rows.format(2_000), cell.format(columns.format(1_000))), "row 2000 and column 1000"),
-        (tail + row.format("", empty + cell.format("")), "row 1000001 and column 16001"),
+        (row.format("", cell.format(columns.format(20_000))), "at least row 1 and column 20000"),
+        (row.format(rows.format(6_000), bare), "row 6000 and column 1000"),
+        (tail + row.format("", empty + cell.format("")), "at least row 1000001 and column 16001"),
+        (row.format("", f"{'<table:table-cell/>' * 16_384}{cell.format('')}"), "at least row 1 and column 16385"),
     ]:
-        assert refused(path, written(bomb)).startswith(f", content.xml: a cell in {place} lies far from the others")
+        assert refused(path, written(bomb)).startswith(f", content.xml: its cells reach {place}")
+    # Formats that a program lists before the tables.
+    styles = f"<office:automatic-styles>{'<style:style/>' * 100_000}</office:automatic-styles>"
+    parts["content.xml"] = ODS.format(rows=row.format("", cell.format(columns.format(20_000)))).replace(
+        "<office:body>", f"{styles}<office:body>"
+    )
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in parts.items():
+            archive.writestr(name, content)
+    assert "its cells reach at least row 1 and column 20000" in refused(path, path.read_bytes())
     long = cell.format(columns.format(1_000)).replace(">1<", f">{'1' * 3_000}<")
-    assert "take more than 200 million characters" in refused(path, written(row.format(rows.format(100), long)))
+    attribute = f'<table:table-cell office:string-value="{3_000 * str(1)}"{columns.format(1_000)}/>'
+    for text in (long, attribute):
+        assert "take more than 200 million characters" in refused(path, written(row.format(rows.format(100), text)))
 
 
-def binary_sheet(path: Path, *cells: tuple[int, int]) -> bytes:
+def binary_sheet(path: Path, *cells: tuple[int, int], before: bytes = b"") -> bytes:
     """A sheet of [MS-XLSB] with a number in every cell."""
 
     def record(kind: int, payload: bytes = b"") -> bytes:
         return (bytes([kind]) if kind < 128 else bytes([kind & 127 | 128, kind >> 7])) + bytes([len(payload)]) + payload
 
-    content = record(129) + record(145)
+    content = before + record(129) + record(145)
     for row, column in cells:
         content += record(0, struct.pack("<I", row) + bytes(21)) + record(5, struct.pack("<IId", column, 0, 1.0))
     with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("xl/_rels/workbook.bin.rels", "<Relationships/>")
         archive.writestr("xl/worksheets/sheet1.bin", content + record(146) + record(130))
     return path.read_bytes()
 
@@ -208,8 +275,10 @@ def binary_sheet(path: Path, *cells: tuple[int, int]) -> bytes:
 def test_cells_of_a_binary_sheet_are_counted(tmp_path: Path) -> None:
     path = tmp_path / "laser.xlsb"
     refuse_bomb(path, io.BytesIO(binary_sheet(path, (0, 0), (9, 200))))
-    told = refused(path, binary_sheet(path, (0, 0), (1_048_575, 0), (1_048_575, 16_383)))
-    assert told.startswith(", xl/worksheets/sheet1.bin: a cell in row 1048576 and column 1 lies far from the others")
+    # A sheet may begin with any record, one that looks like XML among them.
+    for before in (b"", b"\x3c\x00", b"\x25\x01x" * 500_000):
+        told = refused(path, binary_sheet(path, (0, 0), (1_048_575, 0), (1_048_575, 16_383), before=before))
+        assert told.startswith(", xl/worksheets/sheet1.bin: its cells reach at least row 1048576 and column 16384, and")
 
 
 def test_an_archive_is_refused_by_its_table_of_contents(tmp_path: Path) -> None:
