@@ -17,6 +17,7 @@ import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from statistics import median
 
@@ -103,7 +104,7 @@ def main() -> None:
     kept = HERE / "build" / "speeds.md"
     kept.parent.mkdir(exist_ok=True)
     lines = ["| work | before | now | aim |", "|---|---|---|---|"]
-    for line in (*commands(trees, given.turns), *benchmarks(trees)):
+    for line in chain(commands(trees, given.turns), benchmarks(trees)):
         lines.append(line)
         kept.write_text("\n".join(lines) + "\n")
         print(line, flush=True)
