@@ -135,8 +135,10 @@ def correct_camera(
     errors = find_field_errors(result, fields, fused)
     if not errors:
         return None
+    # Errors of reading that were left out stay out.
+    used = deviations.assign(deviation=deviations["deviation"].where(fused["deviation"].notnull()))
     aligned = align(
-        deviations,
+        used,
         correct_fields(fields, errors),
         source.axis,
         environment=source.environment,

@@ -15,6 +15,7 @@ from fusion.effects.library import library
 from fusion.loop.camera_correction import FieldFault
 from fusion.loop.result import rmse
 from fusion.model.fit import fit_model
+from fusion.pipeline import drift_model
 from fusion.pipeline.drift_model import (
     CorrectedCamera,
     both_models,
@@ -273,3 +274,14 @@ def test_the_loop_stands_beside_the_readings_and_the_attribution_in_a_group():
     # What every product says of itself is said once, at the root.
     assert tree["correlation"].attrs == {"lag": "30 s"} and "map" in tree["correlation"]
     assert maps.attrs == {"Conventions": "CF-1.13", "lag": "30 s"}
+
+
+def test_an_error_of_reading_stays_out_where_the_fields_are_corrected(monkeypatch):
+    deviations = xr.Dataset({"deviation": ("reading", [1.0, 900.0, 3.0])})
+    fused = xr.Dataset({"deviation": ("reading", [1.0, np.nan, 3.0])})
+    monkeypatch.setattr(drift_model, "find_field_errors", lambda *given: ["an error"])
+    monkeypatch.setattr(drift_model, "correct_fields", lambda *given: None)
+    monkeypatch.setattr(drift_model, "align", lambda used, *given, **named: used)
+    source = SimpleNamespace(axis=None, environment=None, drivers=None)
+    corrected = drift_model.correct_camera(source, None, None, fused, deviations)
+    np.testing.assert_array_equal(corrected.fused["deviation"], [1.0, np.nan, 3.0])
