@@ -8,7 +8,10 @@ of fusion.nc without a prefix; see `fusion.products.store.write_dataset`.
 
 from __future__ import annotations
 
+import numpy as np
 import xarray as xr
+
+from interferometry.deviations import DIRECTIONS
 
 
 def joined(base: xr.Dataset, **parts: xr.Dataset) -> xr.Dataset:
@@ -74,3 +77,21 @@ def has(dataset: xr.Dataset, name: str) -> bool:
     bool
     """
     return any(str(variable).startswith(f"{name}_") for variable in dataset.data_vars)
+
+
+def by_approach(variable: xr.DataArray, **places: np.ndarray) -> np.ndarray:
+    """Return the values at places of one dimension, by place and direction of approach, for a table that goes through them.
+
+    Parameters
+    ----------
+    variable : DataArray
+        Over that dimension and ``direction``, in any order and unit.
+    **places : ndarray
+        Labels along the dimension, by its name.
+
+    Returns
+    -------
+    (place, 2) ndarray
+        The positive approach first.
+    """
+    return variable.sel({**places, "direction": list(DIRECTIONS)}).transpose(*places, "direction").values

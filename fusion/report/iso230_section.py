@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from fusion.products.grouped import group, has
+from fusion.products.grouped import by_approach, group, has
 from fusion.products.results_axis import Iso230Contribution, Iso230Part, Iso230Window
 from fusion.report.findings import ISO230_TERMS, approach_of, reversal_note
 from fusion.report.tables import Row, Table, Words, table
@@ -88,20 +88,23 @@ def _positions_table(settled: xr.Dataset, position: xr.DataArray, unit: str) -> 
     def shown(value: float) -> str:
         return f"{value:.{places}f}".replace("-", "−") if np.isfinite(value) else "–"
 
-    ordered = settled.sel(target=_along(position), direction=list(_ARROWS))
-    by_approach = {
-        name: ordered[name].transpose("target", "direction").values
-        for name in ("mean_unidirectional", "standard_deviation", "repeatability", "count")
-    }
-    of_target = [ordered[name].values for name in ("mean_bidirectional", "reversal", "repeatability_bidirectional")]
-    rows = []
-    along = position.sel(target=ordered["target"])
-    for at, (target, place) in enumerate(zip(along["target"].values, along.values, strict=True)):
-        cells = [str(target), f"{place:g}"]
-        for name in ("mean_unidirectional", "standard_deviation", "repeatability"):
-            cells += [shown(value) for value in by_approach[name][at]]
-        cells += [shown(values[at]) for values in of_target]
-        rows.append([*cells, ", ".join(str(int(count)) for count in by_approach["count"][at])])
+    along = _along(position)
+    of_both = ("mean_bidirectional", "reversal", "repeatability_bidirectional")
+    values = np.hstack(
+        [
+            *(
+                by_approach(settled[name], target=along)
+                for name in ("mean_unidirectional", "standard_deviation", "repeatability")
+            ),
+            *(settled[name].sel(target=along).values[:, None] for name in of_both),
+        ]
+    )
+    rows = [
+        [str(target), f"{place:g}", *(shown(value) for value in row), ", ".join(str(int(count)) for count in counts)]
+        for target, place, row, counts in zip(
+            along, position.sel(target=along).values, values, by_approach(settled["count"], target=along), strict=True
+        )
+    ]
     titles = [f"{symbol}{arrow} / {unit}" for symbol in ("x̄", "s", "R") for arrow in _ARROWS.values()]
     unit_along = str(position.attrs.get("units", "mm"))
     return table(
@@ -150,12 +153,15 @@ def single_run_table(dataset: xr.Dataset) -> Table:
         Keeps ``interferometry.contract.DEVIATIONS``; its first cycle is shown.
     """
     unit, place = (print_unit(str(dataset[name].attrs["units"])) for name in ("deviation", "position"))
+    along = _along(dataset["position"])
+    places, values = (
+        dataset["position"].sel(target=along).values,
+        by_approach(dataset["deviation"].isel(cycle=0), target=along),
+    )
     rows = []
-    for target in _along(dataset["position"]):
-        reading = dataset["deviation"].sel(target=target).isel(cycle=0)
-        values = [float(reading.sel(direction=direction)) for direction in _ARROWS]
-        cells = [f"{value:.2f}".replace("-", "−") if np.isfinite(value) else "–" for value in values]
-        rows.append([str(target), f"{float(dataset['position'].sel(target=target)):g}", *cells])
+    for target, at, readings in zip(along, places, values, strict=True):
+        cells = [f"{value:.2f}".replace("-", "−") if np.isfinite(value) else "–" for value in readings]
+        rows.append([str(target), f"{at:g}", *cells])
     return table(["Target", place, *(f"deviation{arrow} / {unit}" for arrow in _ARROWS.values())], rows)
 
 

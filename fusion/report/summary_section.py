@@ -11,7 +11,7 @@ import xarray as xr
 from fusion.attribution.family_wise import LEVEL as ATTRIBUTION_LEVEL
 from fusion.diagnosis.remainder import LEVEL as REMAINDER_LEVEL
 from fusion.loop.axis import ENTRY_LEVEL, SEARCH_LEVEL, SECOND_LEVEL
-from fusion.products.grouped import group, has
+from fusion.products.grouped import by_approach, group, has
 from fusion.products.results import Results
 from fusion.products.results_axis import NeighboursPart
 from fusion.products.results_inputs import Figures
@@ -483,8 +483,8 @@ def _positions_table(deviations: xr.Dataset) -> Table:
     drift, conventional = group(deviations, "drift"), group(deviations, "conventional")
     decimals = {name: decimals_of(float(drift[f"{name}_u"].median())) for name in ("profile", "scatter")}
     targets = deviations["target"].values
-    laid = {name: _by_approach(drift[name], target=targets) for key in decimals for name in (key, f"{key}_u")}
-    s = _by_approach(conventional["standard_deviation"], target=targets)
+    laid = {name: by_approach(drift[name], target=targets) for key in decimals for name in (key, f"{key}_u")}
+    s = by_approach(conventional["standard_deviation"], target=targets)
     rows = []
     for at, (target, position_mm) in enumerate(zip(targets, deviations["position"].values, strict=True)):
         row = [str(target), f"{position_mm:g}"]
@@ -494,11 +494,6 @@ def _positions_table(deviations: xr.Dataset) -> Table:
         rows.append([*row, *(f"{value:.2f}" for value in s[at])])
     quantities = ("Profile", "Scatter s", "Conventional s")
     return table(["Position", "mm", *(f"{name} {sign} / µm" for name in quantities for sign in _SIGNS.values())], rows)
-
-
-def _by_approach(variable: xr.DataArray, **places: np.ndarray) -> np.ndarray:
-    """Return the values at places of one dimension, by place and approach."""
-    return variable.sel({**places, "direction": list(_SIGNS)}).transpose(*places, "direction").values
 
 
 def _comparison_table(deviations: xr.Dataset) -> Table:
@@ -512,7 +507,7 @@ def _comparison_table(deviations: xr.Dataset) -> Table:
     }
     columns = [name for name in headings if name in comparison]
     links = comparison["link"].values
-    values = np.stack([_by_approach(comparison[name], link=links) for name in columns], axis=-1)
+    values = np.stack([by_approach(comparison[name], link=links) for name in columns], axis=-1)
     rows = [
         [str(link), *(f"{value:.2f}" for value in of_link.ravel())] for link, of_link in zip(links, values, strict=True)
     ]

@@ -605,7 +605,7 @@ def _scatter_variables(grid: _Grid, joint: JointFit, scatter: Array, freedom: Ar
         / np.where(pooled_freedom, pooled_freedom, np.nan)
     )
     # Where the drift's own uncertainty is all that a cell shows, its scatter is not known to be nothing: the common one stands for it.
-    typical = np.where(scatter > 0.0, scatter, np.where(np.isnan(scatter), np.nan, joint.fit.sigma))
+    typical = np.where(scatter == 0.0, joint.fit.sigma, scatter)
     scatter_u = typical / np.sqrt(2 * np.maximum(freedom, 1.0))
     dims = DIMS[1:]
     return {

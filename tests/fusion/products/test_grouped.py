@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from fusion.products.grouped import group, has, joined
+from fusion.products.grouped import by_approach, group, has, joined
 from fusion.products.store import annotate, read_tree, write_dataset
 
 READINGS = xr.Dataset({"deviation": ("target", [0.1, 0.2])}, {"target": [1, 2]})
@@ -40,3 +40,12 @@ def test_every_group_opens_by_itself_with_its_coordinates(tmp_path: Path) -> Non
         assert set(opened.coords) == {"channel", "mode"}
     xr.testing.assert_identical(read_tree(path), tree)
     assert READINGS["deviation"].attrs == {}
+
+
+def test_values_by_place_and_approach_are_those_of_their_labels() -> None:
+    values = xr.DataArray(
+        [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]],
+        dims=("direction", "target"),
+        coords={"direction": ["negative", "positive"], "target": [1, 2, 7]},
+    )
+    np.testing.assert_array_equal(by_approach(values, target=np.array([7, 1])), [[6.0, 3.0], [4.0, 1.0]])
