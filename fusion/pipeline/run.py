@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
@@ -42,7 +42,7 @@ from fusion.pipeline.sizes import choose_targets, lacks_for_correlation, lacks_f
 from fusion.pipeline.stages import FILES, Run, Stage
 from fusion.products.folder import claim, discard, open_folder, read_manifest
 from fusion.products.progress import Report, silent
-from fusion.products.results import Results, assemble
+from fusion.products.results import Outcome, Results, assemble
 from fusion.products.store import (
     StageStamps,
     is_large,
@@ -261,16 +261,18 @@ def _run_both(run: Run, source: Source, *, scheduler: str | None) -> tuple[dict[
     too_small = [*lacks_for_model(deviations), *lacks_for_correlation(fields)]
     modelled, left_out = choose_targets(fused)
     run.notices.extend(too_small or left_out)
-    correlated = None if too_small else run.begin(_correlation(source, fields, modelled))
-    _draw_beside(run, fields, deviations)
+    draw = partial(_draw_attributed, fused, modelled)
+    correlated = None if too_small else run.begin(_correlation(source, fields, modelled), draw)
+    run.draw(partial(_draw_measured, fields, deviations, fused))
     checked = run.beside.start(partial(check_fields, _without_frames(source), fields, fused))
     written = _write_maps(run, fields)
-    maps = model = None
+    model = None
     if correlated is None:
         run.parts["hotspots"] = attribution.describe_hotspots(fields)
     else:
         model = _model(run, source, fields, modelled, deviations, after=("fields", "deviations"))
-        maps = correlated()
+    _draw_model(run, deviations, fused, modelled, model)
+    maps = None if correlated is None else correlated()
     fusion = _write_fusion(run, fused, modelled, maps, model)
     written()
     checks = [*check_plan(source, run.parts["registration"]), *checked()]
@@ -282,7 +284,7 @@ def _run_camera(run: Run, source: CameraInputs, *, scheduler: str | None) -> tup
     """Fields and hotspots, by windows of time in place of cycles."""
     fields = _reduce(run, source, ("thermography", "plan"), scheduler=scheduler)
     run.parts["hotspots"] = attribution.describe_hotspots(fields)
-    _draw_beside(run, fields, None)
+    run.draw(partial(_draw_measured, fields, None, None))
     _write_maps(run, fields)()
     checks = [*check_plan(source, run.parts["registration"]), *check_fields_alone(source, fields)]
     return {"fields": fields}, checks
@@ -291,15 +293,17 @@ def _run_camera(run: Run, source: CameraInputs, *, scheduler: str | None) -> tup
 def _run_laser(run: Run, source: LaserInputs) -> tuple[dict[str, Any], list[Check]]:
     """Deviations, and the model of the drift from what was logged."""
     deviations = _evaluate(run, source, partial(run.stage, _evaluation(source, after=())))
-    _draw_beside(run, None, deviations)
     if "drift" not in run.parts:
         # Readings without times: nothing can be set beside them.
+        run.draw(partial(_draw_measured, None, deviations, None))
         return {"deviations": deviations}, []
     fused, outside = interferometry.align_with_logs(source, deviations)
+    run.draw(partial(_draw_measured, None, deviations, fused))
     too_small = lacks_for_model(deviations)
     modelled, left_out = choose_targets(fused)
     run.notices.extend([*outside, *(too_small or left_out)])
     model = None if too_small else _model(run, source, None, modelled, deviations, after=("deviations",))
+    _draw_model(run, deviations, fused, modelled, model)
     fusion = _write_fusion(run, fused, modelled, None, model)
     checks = [] if model is None else check_loop(run.parts["loop"], source)
     return {"deviations": deviations, "fusion": fusion}, checks
@@ -372,6 +376,15 @@ def _model(
     )
 
 
+def _draw_model(
+    run: Run, deviations: xr.Dataset, fused: xr.Dataset, modelled: xr.Dataset, model: xr.Dataset | None
+) -> None:
+    """Begin to draw what the model found, while the rest is written."""
+    found = drift_model.join_fusion(fused, modelled, None, model).to_dataset()
+    standing_out = {anomaly["target"] for anomaly in run.parts.get("anomalies") or ()}
+    run.draw(partial(_draw_modelled, deviations, found, standing_out))
+
+
 def _write_maps(run: Run, fields: xr.Dataset) -> Callable[[], object]:
     """Begin to write the maps of every cycle as OpenEXR; return what waits for them."""
     names = [f"maps/{thermal.map_name(cycle)}" for cycle in fields["cycle"].values]
@@ -411,28 +424,44 @@ def _discard_stale(run: Run, datasets: Mapping[str, Any]) -> None:
         run.stamps.forget(name)
 
 
-def _draw_beside(run: Run, fields: xr.Dataset | None, deviations: xr.Dataset | None) -> None:
-    """Begin to draw what was measured."""
-    run.measured = run.beside.start(partial(_draw_measured, fields, deviations))
-
-
-def _draw_measured(fields: xr.Dataset | None, deviations: xr.Dataset | None) -> Drawn:
+def _draw_measured(fields: xr.Dataset | None, deviations: xr.Dataset | None, fused: xr.Dataset | None) -> Drawn:
     """The charts of what was measured; their library takes a third of a second to import, which may be done beside the run."""
     from fusion.report.charts.campaign import draw_measured
 
-    return draw_measured(fields, deviations)
+    return draw_measured(fields, deviations, fused)
 
 
-def _draw_found(results: Results, datasets: Mapping[str, Any]) -> Drawn:
-    """The charts of what was found."""
-    from fusion.report.charts.campaign import draw_found
+def _draw_attributed(fused: xr.Dataset, modelled: xr.Dataset, outcome: Outcome[xr.DataTree]) -> Drawn:
+    """The charts of where drift and field agree."""
+    from fusion.report.charts.campaign import draw_attributed
 
-    return draw_found(results, datasets)
+    correlation = outcome.parts["correlation"]
+    joined = drift_model.join_fusion(fused, modelled, outcome.dataset, None)
+    return draw_attributed(joined, correlation["source"]["part"], correlation["least_p"])
 
 
-def _together(measured: Callable[[], Drawn], found: Callable[[], Drawn]) -> Drawn:
+def _draw_modelled(deviations: xr.Dataset, fused: xr.Dataset, standing_out: Set[int]) -> Drawn:
+    """The charts of what the model found."""
+    from fusion.report.charts.campaign import draw_modelled
+
+    return draw_modelled(deviations, fused, standing_out)
+
+
+def _draw_placed(
+    results: Results, fields: xr.Dataset | None, position: xr.DataArray | None, logged: xr.Dataset | None
+) -> Drawn:
+    """The map of the places that were found."""
+    from fusion.report.charts.campaign import draw_placed
+
+    return draw_placed(results, fields, position, logged)
+
+
+def _together(parts: Sequence[Callable[[], Drawn]]) -> Drawn:
     """Wait for all charts."""
-    return measured().with_more(found())
+    drawn = parts[0]()
+    for part in parts[1:]:
+        drawn = drawn.with_more(part())
+    return drawn
 
 
 def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
@@ -443,9 +472,10 @@ def _finish(run: Run, datasets: Mapping[str, Any]) -> Results:
     results = assemble(run.campaign.campaign.title, run.parts, run.notices)
     run.report("report", 0, 1)
     drawn = None
-    if run.measured is not None:
-        found = run.beside.start(partial(_draw_found, results, datasets))
-        drawn = partial(_together, run.measured, found)
+    if run.drawn:
+        position = datasets["deviations"]["position"] if "deviations" in datasets else None
+        run.draw(partial(_draw_placed, results, datasets.get("fields"), position, datasets.get("sensors")))
+        drawn = partial(_together, run.drawn)
     content = write_json(run.folder / "results.json", results.as_json())
     provenance = describe_run(
         run.campaign,

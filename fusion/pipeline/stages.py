@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic
 
@@ -72,6 +72,14 @@ def _timed(compute: Callable[..., Outcome[Product]], *, report: Report) -> tuple
     return compute(report=report), time.monotonic() - begun
 
 
+def _timed_and_drawn(
+    compute: Callable[..., Outcome[Product]], draw: Callable[[Outcome[Product]], Drawn], *, report: Report
+) -> tuple[tuple[Outcome[Product], float], Drawn]:
+    """Compute a stage, and draw what it found where that is at hand; see `_timed`."""
+    outcome, spent_s = _timed(compute, report=report)
+    return (outcome, spent_s), draw(outcome)
+
+
 def _return_freed_memory() -> None:
     """Give the memory that was left back to the system, where the C library keeps it for what follows (glibc does)."""
     with suppress(AttributeError, OSError, TypeError):
@@ -104,8 +112,8 @@ class Run:
         Takes stages that the next one does not wait for.
     depends : tuple
         What every stage depends on beside campaign and files, as it was at the start.
-    measured : callable, optional
-        Returns the charts of what was measured.
+    drawn : list of callable
+        Each waits for a part of the charts and returns it.
     parts, notices : dict, list
         Parts of results.json and notices of the stages so far.
     seconds, keys : dict
@@ -124,7 +132,7 @@ class Run:
     address: str | None = None
     beside: Beside = field(default_factory=InTurn)
     depends: tuple[Any, ...] = field(default_factory=dependencies)
-    measured: Callable[[], Drawn] | None = None
+    drawn: list[Callable[[], Drawn]] = field(default_factory=list)
     parts: dict[str, Any] = field(default_factory=dict)
     notices: list[Notice] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
@@ -141,17 +149,43 @@ class Run:
         """
         return self._finish(stage, partial(_timed, stage.compute, report=self.report))
 
-    def begin(self, stage: Stage[Product]) -> Callable[[], Product]:
+    def begin(
+        self, stage: Stage[Product], draw: Callable[[Outcome[Product]], Drawn] | None = None
+    ) -> Callable[[], Product]:
         """Begin a stage beside what follows, where it is not kept; return what waits for it and gives its product, as `stage` does.
 
         Parameters
         ----------
         stage : Stage
             Its work can be pickled.
+        draw : callable, optional
+            Draws what the stage found, for `drawn`; it can be pickled too.
         """
         if self.stamps.done(stage.name, self.key_of(stage)):
+            if draw is not None:
+                self.draw(partial(draw, self._kept(stage)))
             return partial(self.stage, stage)
-        return partial(self._finish, stage, self.beside.start(partial(_timed, stage.compute), self.report))
+        if draw is None:
+            return partial(self._finish, stage, self.beside.start(partial(_timed, stage.compute), self.report))
+        both = cache(self.beside.start(partial(_timed_and_drawn, stage.compute, draw), self.report))
+        self.drawn.append(lambda: both()[1])
+        return partial(self._finish, stage, lambda: both()[0])
+
+    def draw(self, work: Callable[[], Drawn]) -> None:
+        """Begin to draw a part of the charts.
+
+        Parameters
+        ----------
+        work : callable
+            It can be pickled.
+        """
+        self.drawn.append(self.beside.start(work))
+
+    def _kept(self, stage: Stage[Product]) -> Outcome[Product]:
+        """Return what is kept of a stage."""
+        note = self.stamps.note(stage.name)
+        notices = tuple(Notice(**item) for item in note["notices"])
+        return Outcome(stage.read(self.folder / FILES[stage.name]), note["parts"], notices)
 
     def _finish(self, stage: Stage[Product], compute: Callable[[], tuple[Outcome[Product], float]]) -> Product:
         """Write and stamp what a stage computes in so many seconds, or read what is kept of it."""
@@ -162,8 +196,7 @@ class Run:
         computed, spent_s = (None, 0.0) if kept else compute()
         begun = time.monotonic()
         if computed is None:
-            note = self.stamps.note(name)
-            outcome = Outcome(stage.read(path), note["parts"], tuple(Notice(**item) for item in note["notices"]))
+            outcome = self._kept(stage)
             self.report(f"{LABELS[name]} (kept)", 1, 1)
         else:
             outcome = replace(computed, dataset=self.described(computed.dataset))

@@ -1,8 +1,11 @@
-"""The charts of a campaign's report: those of what was measured, which wait for no model, and those of what was found."""
+"""The charts of a campaign's report, in the parts in which a run comes to know what they show.
+
+What was measured, and where drift and field agree, wait for no model and can be drawn while it is fitted.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from typing import Any, NamedTuple
 
 import xarray as xr
@@ -58,16 +61,27 @@ def draw_campaign(results: Results, datasets: Mapping[str, Any]) -> Drawn:
     -------
     Drawn
     """
-    return draw_measured(datasets.get("fields"), datasets.get("deviations")).with_more(draw_found(results, datasets))
+    fields, deviations, fused = (datasets.get(name) for name in ("fields", "deviations", "fusion"))
+    drawn = draw_measured(fields, deviations, None if fused is None else fused.to_dataset())
+    correlation = results.correlation
+    if fused is not None and correlation is not None and "correlation" in fused.children:
+        drawn = drawn.with_more(draw_attributed(fused, correlation.source.part, correlation.least_p))
+    if deviations is not None:
+        readings = xr.Dataset() if fused is None else fused.to_dataset()
+        drawn = drawn.with_more(draw_modelled(deviations, readings, {one.target for one in results.anomalies or ()}))
+    position = None if deviations is None else deviations["position"]
+    return drawn.with_more(draw_placed(results, fields, position, datasets.get("sensors")))
 
 
-def draw_measured(fields: xr.Dataset | None, deviations: xr.Dataset | None) -> Drawn:
+def draw_measured(fields: xr.Dataset | None, deviations: xr.Dataset | None, fused: xr.Dataset | None = None) -> Drawn:
     """Draw what was measured and evaluated before anything is modelled.
 
     Parameters
     ----------
     fields, deviations : Dataset, optional
         Contents of fields.nc and deviations.nc.
+    fused : Dataset, optional
+        Both on one clock, the root of fusion.nc; what was found beside them is not looked at.
 
     Returns
     -------
@@ -81,18 +95,67 @@ def draw_measured(fields: xr.Dataset | None, deviations: xr.Dataset | None) -> D
     if deviations is not None:
         charts |= _reading_charts(deviations)
         charts |= _drift_charts(deviations) if has(deviations, "drift") else {}
+    if fused is not None:
+        charts |= _clock_charts(fused, deviations)
     return Drawn(embed(charts))
 
 
-def draw_found(results: Results, datasets: Mapping[str, Any]) -> Drawn:
-    """Draw what was found in the measurements.
+def draw_attributed(fused: xr.DataTree, channel: str, least_p: float | None) -> Drawn:
+    """Draw where drift and field agree.
+
+    Parameters
+    ----------
+    fused : DataTree
+        Content of fusion.nc with its groups of the correlation; the model's are not looked at.
+    channel : str
+        Part of the drift whose source is the leading one.
+    least_p : float or None
+        Least p-value that the cycles allow.
+
+    Returns
+    -------
+    Drawn
+    """
+    return Drawn(embed(_correlation_charts(fused, channel, least_p)))
+
+
+def draw_modelled(deviations: xr.Dataset, fused: xr.Dataset, standing_out: Set[int]) -> Drawn:
+    """Draw what a model of the drift found, and the positions that stand out.
+
+    Parameters
+    ----------
+    deviations : Dataset
+        Content of deviations.nc.
+    fused : Dataset
+        Root of fusion.nc; without the variables of the loop, none of its charts is drawn.
+    standing_out : set of int
+        Targets that stand out.
+
+    Returns
+    -------
+    Drawn
+    """
+    charts = _anomaly_charts(deviations, standing_out) if has(deviations, "drift") else {}
+    if has(fused, "loop"):
+        charts |= _loop_charts(group(fused, "loop"), deviations)
+    return Drawn(embed(charts))
+
+
+def draw_placed(
+    results: Results, fields: xr.Dataset | None, position: xr.DataArray | None, logged: xr.Dataset | None
+) -> Drawn:
+    """Draw the thermal map with all places that were found on it, and the contact sensors.
 
     Parameters
     ----------
     results : Results
         Results of the run.
-    datasets : mapping
-        As for `fusion.report.html.render_report`.
+    fields : Dataset, optional
+        Content of fields.nc.
+    position : DataArray, optional
+        Nominal position of the targets, mm.
+    logged : Dataset, optional
+        Content of sensors.nc.
 
     Returns
     -------
@@ -100,35 +163,24 @@ def draw_found(results: Results, datasets: Mapping[str, Any]) -> Drawn:
     """
     charts: dict[str, Chart] = {}
     controls = None
-    fields, deviations, fused = (datasets.get(name) for name in ("fields", "deviations", "fusion"))
-    if deviations is not None and has(deviations, "drift"):
-        charts |= _anomaly_charts(results, deviations)
-    if "sensors" in datasets:
-        charts["sensors"] = sensors.plot_sensors(datasets["sensors"])
-    if fused is not None:
-        charts |= _fusion_charts(results, fused, deviations)
+    if logged is not None:
+        charts["sensors"] = sensors.plot_sensors(logged)
     if fields is not None:
-        position = None if deviations is None else deviations["position"]
         charts["thermal_map"], controls = plot_thermal_map(
             fields, results.hotspots or (), position, sensors=results.sensors or ()
         )
     return Drawn(embed(charts), controls)
 
 
-def _fusion_charts(results: Results, fused: xr.DataTree, deviations: xr.Dataset | None) -> dict[str, Chart]:
-    """The charts of both recordings on one clock, of the attribution and of the closed loop."""
+def _clock_charts(fused: xr.Dataset, deviations: xr.Dataset | None) -> dict[str, Chart]:
+    """The charts of both recordings on one clock."""
     charts: dict[str, Chart] = {}
-    root = fused.to_dataset()
-    if "time" in root:
-        charts["timeline"] = timeline.plot_timeline(root)
-    if "local_rise" in root:
-        charts["axis_temperature"] = plan.plot_axis_temperature(root)
+    if "time" in fused:
+        charts["timeline"] = timeline.plot_timeline(fused)
+    if "local_rise" in fused:
+        charts["axis_temperature"] = plan.plot_axis_temperature(fused)
         if deviations is not None:
-            charts["drift_temperature"] = plan.plot_drift_temperature(root, group(deviations, "drift"))
-    if results.correlation is not None and "correlation" in fused.children:
-        charts |= _correlation_charts(fused, results.correlation.source.part, results.correlation.least_p)
-    if has(root, "loop") and deviations is not None:
-        charts |= _loop_charts(group(root, "loop"), deviations)
+            charts["drift_temperature"] = plan.plot_drift_temperature(fused, group(deviations, "drift"))
     return charts
 
 
@@ -172,14 +224,13 @@ def _drift_charts(deviations: xr.Dataset) -> dict[str, Chart]:
     }
 
 
-def _anomaly_charts(results: Results, deviations: xr.Dataset) -> dict[str, Chart]:
+def _anomaly_charts(deviations: xr.Dataset, standing_out: Set[int]) -> dict[str, Chart]:
     """The charts of the positions that stand out."""
     joint = group(deviations, "drift")
-    flagged = {anomaly.target for anomaly in results.anomalies or ()}
-    shown = min(flagged, default=int(deviations["target"][min(3, deviations.sizes["target"] - 1)]))
+    shown = min(standing_out, default=int(deviations["target"][min(3, deviations.sizes["target"] - 1)]))
     return {
         "history": readings.plot_history(deviations, joint, shown),
-        "anomalies": drift.plot_position_scatter(joint, deviations["position"], flagged),
+        "anomalies": drift.plot_position_scatter(joint, deviations["position"], standing_out),
     }
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
+
 import numpy as np
 import xarray as xr
 from bokeh.models import BoxAnnotation, Label, LinearColorMapper
@@ -162,7 +164,7 @@ def plot_reversal(drift: xr.Dataset, position: xr.DataArray) -> Chart:
     return Chart(drawn, seen, {"position / mm": x, "reversal / µm": value, "95 % interval ± / µm": half})
 
 
-def plot_position_scatter(drift: xr.Dataset, position: xr.DataArray, flagged: set[int]) -> Chart:
+def plot_position_scatter(drift: xr.Dataset, position: xr.DataArray, flagged: Set[int]) -> Chart:
     """Draw the random scatter of every position and approach with its 95 % interval; flagged positions are shaded.
 
     Parameters

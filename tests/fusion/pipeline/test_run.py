@@ -131,9 +131,9 @@ class Noting(Beside):
 
     def start(self, work: Callable[..., Any], report: Report | None = None) -> Callable[[], Any]:
         # A stage is timed where it is computed.
-        self.names.append(work.args[0].func.__name__ if work.func.__name__ == "_timed" else work.func.__name__)
+        self.names.append(work.args[0].func.__name__ if work.func.__name__.startswith("_timed") else work.func.__name__)
         # What is no function of a module cannot be sent.
-        return self.second.start((lambda: work()) if self.names[-1] == "_draw_found" else work, report)
+        return self.second.start((lambda: work()) if self.names[-1] == "_draw_placed" else work, report)
 
     def end(self) -> None:
         self.second.end()
@@ -147,7 +147,7 @@ def test_a_second_process_takes_its_part_and_changes_nothing(
         beside = Noting(second)
         run_campaign(campaign_folder / "campaign.toml", tmp_path / "results", beside=beside)
     assert beside.names == [
-        "evaluate_interferometry", "correlate_field", "_draw_measured", "check_fields", "write_exr", "_draw_found",
+        "evaluate_interferometry", "correlate_field", "_draw_measured", "check_fields", "write_exr", "_draw_modelled", "_draw_placed",
     ]  # fmt: skip
     provenance = json.loads((tmp_path / "results" / "provenance.json").read_text())
     (fault,) = provenance["second_process_faults"]

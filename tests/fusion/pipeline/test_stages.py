@@ -20,6 +20,7 @@ from fusion.pipeline.stages import Run, Stage
 from fusion.products.progress import Report, silent
 from fusion.products.results import Notice, Outcome
 from fusion.products.store import StageStamps, read_dataset
+from fusion.report.charts.campaign import Drawn
 
 
 class Counting:
@@ -91,6 +92,23 @@ def test_what_is_kept_is_not_begun_beside(copied: Path, tmp_path: Path) -> None:
     begun()
     kept = run_of(file, tmp_path / "results", Elsewhere()).begin(deviations(work))
     assert kept()["drift"].values.tolist() == [0.5, 1.0] and work.times == 1
+
+
+def test_what_a_stage_found_is_drawn_where_it_was_computed_or_from_what_is_kept(copied: Path, tmp_path: Path) -> None:
+    work, file, seen = Counting(), copied / "campaign.toml", []
+
+    def draw(outcome: Outcome[xr.Dataset]) -> Drawn:
+        seen.append((outcome.parts, outcome.dataset["drift"].values.tolist()))
+        return Drawn({})
+
+    for _ in range(2):
+        run = run_of(file, tmp_path / "results", Elsewhere())
+        begun = run.begin(deviations(work), draw)
+        (drawn,) = run.drawn
+        assert drawn() == Drawn({})
+        assert begun()["drift"].values.tolist() == [0.5, 1.0] and drawn() == Drawn({})
+    assert work.times == 1, "computed once, then kept"
+    assert seen == [({"drift": 1.0}, [0.5, 1.0])] * 2, "drawn once by each run"
 
 
 def test_a_stage_begun_beside_counts_the_time_of_its_work_and_not_of_the_wait(copied: Path, tmp_path: Path) -> None:
