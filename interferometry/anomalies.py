@@ -22,7 +22,7 @@ import numpy as np
 import xarray as xr
 from numba import njit
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from interferometry._typing import Array
 from interferometry.contract import check_dataset
@@ -272,10 +272,10 @@ def _scatter_direction(estimated: xr.Dataset, target: int, others: NDArray[np.in
         return "both"
     weak = int(np.argmin(variance / typical))
     strong = 1 - weak
-    weak_is_ordinary = stats.chi2.sf(variance[weak] / typical[weak] * freedom[weak], freedom[weak]) > 0.05
+    weak_is_ordinary = special.chdtrc(freedom[weak], variance[weak] / typical[weak] * freedom[weak]) > 0.05
     # Noise with memory can leave the scatter of one direction at zero.
     ratio = (variance[strong] / typical[strong]) / (variance[weak] / typical[weak]) if variance[weak] > 0 else np.inf
-    directions_differ = stats.f.sf(ratio, freedom[strong], freedom[weak]) < 0.025
+    directions_differ = special.fdtrc(freedom[strong], freedom[weak], ratio) < 0.025
     return str(names[strong]) if weak_is_ordinary and directions_differ else "both"
 
 
@@ -528,7 +528,7 @@ def generalised_esd(values: Array, *, most: int, level: float = 0.05, high_only:
         deviate = np.where(remaining, deviate, -np.inf)
         extreme = int(np.argmax(deviate))
         p = 1 - level / ((1 if high_only else 2) * (n - i + 1))
-        t = stats.t.ppf(p, n - i - 1)
+        t = special.stdtrit(n - i - 1, p)
         if deviate[extreme] > (n - i) * t / np.sqrt((n - i - 1 + t**2) * (n - i + 1)):
             outliers = i
         removed.append(extreme)

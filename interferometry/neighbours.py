@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
-from scipy import optimize, stats
+from scipy import optimize, special
 
 from interferometry.contract import check_dataset
 from interferometry.errors import InterferometryError
@@ -59,7 +59,7 @@ def coverage_factor(repetitions: np.ndarray) -> np.ndarray:
         Of the same shape (1); NaN where n < 2.
     """
     n = np.asarray(repetitions)
-    student = stats.t.ppf(0.5 + TWO_SIGMA_PROBABILITY / 2, np.maximum(n - 1, 1))
+    student = special.stdtrit(np.maximum(n - 1, 1), 0.5 + TWO_SIGMA_PROBABILITY / 2)
     return np.where(n < 2, np.nan, np.where(n < ENOUGH_REPETITIONS, student, 2.0))
 
 

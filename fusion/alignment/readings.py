@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from fusion._typing import Array
 from fusion.errors import FusionError
+from thermography._robust import scatter_by_median
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -248,7 +248,7 @@ def sample_noise(samples: Array) -> float:
     The second difference of white noise has six times its variance, and a slow series cancels in it. Its scatter is the normalised
     median absolute deviation (Rousseeuw and Croux 1993, J. Am. Stat. Assoc. 88, 1273), which outliers do not enlarge.
     """
-    return float(scipy.stats.median_abs_deviation(np.diff(samples, 2), scale="normal") / np.sqrt(6.0))
+    return float(scatter_by_median(np.diff(samples, 2)) / np.sqrt(6.0))
 
 
 def read_fused(fused: xr.Dataset) -> Readings:

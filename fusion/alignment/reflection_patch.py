@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg
 
 from fusion._typing import Array
+from thermography._robust import scatter_by_median
 from thermography.fields.tasks.pieces import in_pieces, piece_slices
 
 #: A change counts as a jump where it exceeds the usual change of its patch this many times (robust sigma).
@@ -99,7 +100,7 @@ def find_switching_patch(frames: Array | xr.DataArray) -> SwitchingPatch | None:
         component = np.asarray(along_all / np.linalg.norm(along_all))
         score = np.concatenate([sudden @ component for sudden in _sudden_changes(frames, seen)])
     score /= component @ component
-    scatter = max(float(stats.median_abs_deviation(score, scale="normal")), 1e-9)
+    scatter = max(scatter_by_median(score), 1e-9)
     jumps = np.abs(score) > _JUMP_SIGMAS * scatter
     # The upper percent stands for the patch's own height, so that one noisy cell does not make a pattern local.
     height = float(np.quantile(component, 0.99))

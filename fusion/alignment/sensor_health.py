@@ -12,7 +12,6 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from fusion._typing import Array
 from fusion.alignment.sensor_changes import (
@@ -25,6 +24,7 @@ from fusion.alignment.sensor_changes import (
     level_beyond_prediction,
     predicted_changes,
 )
+from thermography._robust import scatter_by_median
 
 #: Probability of naming any sensor of a sound record.
 FAMILY_LEVEL = 0.01
@@ -390,7 +390,7 @@ def _noisier(seconds: Array, temperature: Array, grid: Grid, kept: Sequence[int]
             values = temperature[window * size : (window + 1) * size, k]
             values = np.diff(values[np.isfinite(values)], 2)
             if values.size >= _NOISE_SAMPLES // 2:
-                noise = float(stats.median_abs_deviation(values, scale="normal")) / np.sqrt(6.0)
+                noise = scatter_by_median(values) / np.sqrt(6.0)
                 scale[window, place] = max(noise, least)
     with np.errstate(all="ignore"):
         course = np.log(scale) - np.log(np.nanmedian(scale, axis=0))

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from fusion._typing import Array
 from fusion.alignment.first_order_lag import respond
@@ -201,13 +201,13 @@ def _assess(machine: Machine, hours: float, law: DutyLaw, rng: np.random.Generat
     columns = np.stack(
         [_drift_responses(machine, tau, law, fine, cycles, rng) for tau in machine.time_constants_s], axis=2
     )
-    threshold = stats.chi2.isf(LEVEL / (_EFFECTIVE_RESPONSES * len(machine.sources)), 1)
+    threshold = special.chdtri(1, LEVEL / (_EFFECTIVE_RESPONSES * len(machine.sources)))
     powers = np.zeros((_SCHEDULES, len(machine.sources)))
     separations = np.zeros_like(powers)
     for k in range(_SCHEDULES):
         free = _without(white @ columns[:, k], trend)
         size = (free**2).sum(axis=0)
-        powers[k] = stats.norm.sf(np.sqrt(threshold) - machine.effect_um * np.sqrt(size) / machine.noise_um)
+        powers[k] = special.ndtr(machine.effect_um * np.sqrt(size) / machine.noise_um - np.sqrt(threshold))
         for j in range(size.size):
             alone = _without(free[:, j], np.delete(free, j, axis=1)) if size.size > 1 else free[:, j]
             separations[k, j] = (alone @ alone) / max(float(size[j]), 1e-30)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 from threadpoolctl import threadpool_limits
 
 from fusion._typing import Array
@@ -141,7 +141,7 @@ def _check_law(place: str, seconds: Array, states: Array, law: DutyLaw) -> None:
     expected = seconds[-1] / law.mean_dwell_s
     if (
         changes.size
-        and min(stats.poisson.cdf(changes.size, expected), stats.poisson.sf(changes.size - 1, expected)) < _IMPOSSIBLE
+        and min(special.pdtr(changes.size, expected), special.pdtrc(changes.size - 1, expected)) < _IMPOSSIBLE
     ):
         raise RandomisationError(
             f"{place} was switched {changes.size} times in {seconds[-1] / 3600:.1f} h, where a mean dwell of {law.mean_dwell_s:g} s makes "

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from fusion._typing import Array
 from fusion.attribution.attribute import ATTRIBUTABLE, NOT_ATTRIBUTABLE, NOT_SEPARABLE
@@ -263,8 +263,8 @@ def _power(sensitivity: float, other: xr.Dataset, cell: tuple[int, int]) -> floa
     root, limit = float(np.sqrt(other["threshold"])), float(other["detectable_sensitivity"].values[cell])
     if not (np.isfinite(limit) and limit > 0):
         return None
-    u = limit / (root + float(stats.norm.ppf(0.8)))
-    return float(stats.norm.cdf(abs(sensitivity) / u - root))
+    u = limit / (root + float(special.ndtri(0.8)))
+    return float(special.ndtr(abs(sensitivity) / u - root))
 
 
 def _tell_apart(

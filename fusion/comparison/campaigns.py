@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from scipy import stats
+from scipy import special
 
 from fusion.comparison.profile_changes import SAME_POSITION_MM, ComparisonError, ProfileChange, compare_profiles
 from fusion.comparison.scatter_changes import compare_scatters
@@ -325,5 +325,5 @@ def _difference(quantity: str, kind: str, unit: str, before: Quantity, after: Qu
     """The difference of two quantities with independent uncertainties; without an uncertainty it is shown and never significant."""
     change = float(after.value or 0.0) - float(before.value or 0.0)
     u = math.hypot(before.u, after.u) if before.u and after.u else None
-    p = 1.0 if u is None else float(2.0 * stats.norm.sf(abs(change) / u))
+    p = 1.0 if u is None else float(2.0 * special.ndtr(-abs(change) / u))
     return Change(quantity, kind, None, unit, before, after, Quantity(value=change, u=u), p, machine)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from fusion.errors import FusionError
 from interferometry.drift.components import COMPONENTS
@@ -127,7 +127,7 @@ class _Difference:
 
     def p_value(self, ratio: float) -> float:
         """Return the two-sided p-value of a change over its standard uncertainty."""
-        return float(2.0 * stats.t.sf(abs(ratio), self.freedom))
+        return float(2.0 * special.stdtr(self.freedom, -abs(ratio)))
 
 
 def compare_profiles(before: xr.Dataset, after: xr.Dataset, *, level: float, tests: int = 0) -> ProfileChange:

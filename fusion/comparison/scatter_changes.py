@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special, stats
+from scipy import special
+
+from thermography._robust import scatter_by_median
 
 Array = NDArray[np.float64]
 
@@ -66,10 +68,10 @@ def compare_scatters(
     ratio = 2.0 * np.log(other / one)
     beyond = ratio - np.median(ratio)
     expected = special.polygamma(1, freedoms / 2.0).sum(axis=0)
-    spread = float(stats.median_abs_deviation(beyond / np.sqrt(expected), center=lambda x, axis: 0.0, scale="normal"))
+    spread = scatter_by_median(beyond / np.sqrt(expected), centre=0.0)
     earlier, later = np.maximum(freedoms / max(spread, 1.0) ** 2, 1.0)
-    f_ratio = np.exp(beyond) * stats.f.median(later, earlier)
-    p = 2.0 * np.minimum(stats.f.sf(f_ratio, later, earlier), stats.f.cdf(f_ratio, later, earlier))
+    f_ratio = np.exp(beyond) * special.fdtri(later, earlier, 0.5)
+    p = 2.0 * np.minimum(special.fdtrc(later, earlier, f_ratio), special.fdtr(later, earlier, f_ratio))
     return [
         ScatterChange(float(at), float(was), float(now), float(min(chance, 1.0)))
         for at, was, now, chance in zip(place, one, other, p, strict=True)

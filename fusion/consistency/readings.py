@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import xarray as xr
-from scipy import sparse, stats
+from scipy import sparse, special
 
 from fusion._typing import Array
 from fusion.consistency.checks import Check, Severity
+from thermography._robust import scatter_by_median
 
 #: Largest positioning deviation that a machine can have, um per metre of travel: 1 % is no deviation but another unit.
 _LARGEST_UM_PER_M = 10_000.0
@@ -87,7 +88,7 @@ def random_part_um(values: Array) -> float:
     second = values[2:] - 2.0 * values[1:-1] + values[:-2]
     second = second[np.isfinite(second)]
     # The second difference of independent readings has six times their variance.
-    return float(stats.median_abs_deviation(second, scale="normal") / np.sqrt(6.0)) if second.size else float("nan")
+    return float(scatter_by_median(second) / np.sqrt(6.0))
 
 
 def find_gross_readings(standardised: xr.DataArray) -> xr.DataArray:
@@ -106,7 +107,7 @@ def find_gross_readings(standardised: xr.DataArray) -> xr.DataArray:
     """
     size = abs(standardised)
     # The median absolute deviation about zero, in standard deviations of a normal distribution.
-    scatter = (size.median("cycle") / stats.norm.ppf(0.75)).fillna(1.0).clip(min=1.0)
+    scatter = (size.median("cycle") / special.ndtri(0.75)).fillna(1.0).clip(min=1.0)
     return size > _GROSS_SIGMAS * scatter
 
 
@@ -243,7 +244,7 @@ def _exchanged_approaches(deviations: xr.Dataset, noise_um: float) -> Check:
     early, late = before[:, both], after[:, both]
     spread = np.sqrt(np.nanvar(early, axis=0) / early.shape[0] + np.nanvar(late, axis=0) / late.shape[0])
     total = (np.nanmean(early, axis=0) + np.nanmean(late, axis=0)) / np.maximum(spread, 1e-12)
-    opposite = float(stats.chi2.sf(float(total @ total), total.size))
+    opposite = float(special.chdtrc(total.size, float(total @ total)))
     # An exchange happens from one cycle to the next, a reversal that drifts does not.
     near = np.nanmean(reversal[max(0, place - _LEAST_SIDE) : place]), np.nanmean(reversal[place : place + _LEAST_SIDE])
     sudden = abs(near[1] - near[0]) > 0.7 * abs(np.nanmean(after) - np.nanmean(before))
@@ -280,7 +281,7 @@ def _datum(deviations: xr.Dataset, noise_um: float) -> Check:
     jump = values[place + 1] - values[place - 1]
     size = float(np.nanmedian(jump))
     beside = max(float(np.ptp(level[:place])), float(np.ptp(level[place + 1 :])), noise_um)
-    spread = float(stats.median_abs_deviation(jump, scale="normal", nan_policy="omit"))
+    spread = scatter_by_median(jump)
     common = spread <= _COMMON_SHARE * abs(size) + 2.0 * noise_um
     multiple = abs(size) / beside
     if multiple <= _DATUM_RANGES or abs(size) <= _LEAST_DATUM_UM or not common:

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from fusion._typing import Array
 from fusion.effects.effect import Effect
@@ -122,7 +122,7 @@ def pattern_p_value(model: ModelFit, term: Term) -> float:
     per_target = np.bincount(sites // 2, share)
     freedom = int(kept.sum())
     left = float(score @ score) - max(0.0, float(per_target.max()))
-    return float(stats.chi2.sf(left, max(1, freedom - 2)))
+    return float(special.chdtrc(max(1, freedom - 2), left))
 
 
 def _course(model: ModelFit, term: Term) -> Array:

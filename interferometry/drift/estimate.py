@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 from threadpoolctl import threadpool_limits
 
 from interferometry._typing import Array
@@ -577,13 +577,13 @@ def _scatter(joint: JointFit, smoothed: Smoothed, standardised: Array) -> tuple[
 
 def _normal_mad_about_zero(values: Array) -> float:
     """Return the median absolute deviation from zero, the expectation of a residual, as a normal standard deviation."""
-    return float(stats.median_abs_deviation(values, center=lambda x, axis: 0.0, scale="normal"))
+    return float(np.median(np.abs(values)) / special.ndtri(0.75))
 
 
 def _excess_variance(scatter: Array, freedom: Array, joint: JointFit) -> Array:
     """Return what cells that scatter clearly more than the common sigma add to the variance of their profile value, um2."""
     ratio = np.nan_to_num(scatter / joint.fit.sigma) ** 2
-    clear = stats.chi2.sf(ratio * freedom, np.maximum(freedom, 1.0)) < EXCESS_LEVEL
+    clear = special.chdtrc(np.maximum(freedom, 1.0), ratio * freedom) < EXCESS_LEVEL
     readings = np.bincount(joint.cell, minlength=len(joint.cells))
     return np.where(clear, (ratio - 1.0) * joint.fit.sigma**2 / readings, 0.0)
 

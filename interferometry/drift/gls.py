@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy import linalg, optimize, stats
+from scipy import linalg, optimize, special
 from scipy.linalg import lapack
 
 from interferometry._typing import Array
@@ -628,4 +628,4 @@ def von_neumann_p_value(series: Array) -> float:
     centred = series - series.mean()
     ratio = float((np.diff(series) ** 2).sum() / (centred**2).sum())
     deviation = np.sqrt(4.0 * (n - 2.0) / (n**2 - 1.0))
-    return float(stats.norm.cdf((ratio - 2.0) / deviation))
+    return float(special.ndtr((ratio - 2.0) / deviation))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from scipy import optimize, stats
+from scipy import optimize, special
 
 from interferometry._typing import Array
 from interferometry.errors import InterferometryError
@@ -258,7 +258,7 @@ def _fit_exponential(name: str, seconds: Array, series: Array) -> Settling | Non
     correlation = float((residual[1:] * residual[:-1]).sum() / max(float((residual**2).sum()), 1e-300))
     independent = max(seconds.size * (1 - max(correlation, 0.0)) / (1 + max(correlation, 0.0)), 5.0)
     f_ratio = (float(((series - series.mean()) ** 2).sum()) - lowest) / 2 / max(lowest / (independent - 3), 1e-300)
-    if stats.f.sf(f_ratio, 2, independent - 3) > SETTLING_LEVEL:
+    if special.fdtrc(2, independent - 3, f_ratio) > SETTLING_LEVEL:
         return None
     limit = max(lowest, 1e-12) * (1 + 3.84 / (independent - 3))
 

@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 import xarray as xr
-from scipy.stats import norm
+from scipy import special
 
 from interferometry.compensation import REFERENCE_TEMPERATURE_DEGC
 from interferometry.contract import check_dataset
@@ -318,7 +318,7 @@ def _reversal_of_scatter(s: np.ndarray, count: np.ndarray) -> float:
     """
     variance = (s**2 / np.fmax(count, 1)).sum(axis=0)
     both = variance[np.isfinite(variance)]
-    return float(norm.ppf((1.0 + 0.5 ** (1.0 / both.size)) / 2.0) * np.sqrt(both.mean())) if both.size else np.nan
+    return float(special.ndtri((1.0 + 0.5 ** (1.0 / both.size)) / 2.0) * np.sqrt(both.mean())) if both.size else np.nan
 
 
 def _can_be_evaluated(deviations: xr.Dataset) -> bool:

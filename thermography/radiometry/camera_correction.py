@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, optimize, stats
+from scipy import linalg, optimize, special
 
 from thermography._constants import MAD_TO_SIGMA
 from thermography._typing import Array
@@ -218,7 +218,7 @@ def hold_constant(level: Array) -> CameraCorrection:
     if n < _LEAST_FRAMES or not change.any():
         return CameraCorrection(nothing, nothing, (), nothing, change)
     ratio = float(np.mean(np.diff(level) ** 2) / 2.0 / np.var(level, ddof=1))
-    limit = 1.0 + stats.norm.ppf(_SIGNIFICANCE) * np.sqrt((n - 2) / (n**2 - 1))
+    limit = 1.0 + special.ndtri(_SIGNIFICANCE) * np.sqrt((n - 2) / (n**2 - 1))
     scatter = MAD_TO_SIGMA * float(np.median(np.abs(np.diff(level))))
     u_K = np.where(np.arange(n) == 0, 0.0, scatter)
     if ratio >= limit:
@@ -335,7 +335,7 @@ def _fit(change: Array, design: Array, seconds: Array) -> _Fit:
     precision = np.diag(linalg.cho_solve_banded((factor, True), np.eye(len(change))))
     precision = precision - np.einsum("ij,jk,ik->i", projected, unit, projected)
     shocks = weighted / np.sqrt(np.maximum(precision, 1e-12) * scale)
-    limit = float(stats.t.isf(_SIGNIFICANCE / (2 * len(change)), freedom))
+    limit = float(-special.stdtrit(freedom, _SIGNIFICANCE / (2 * len(change))))
     return _Fit(values, unit * scale, shocks, freedom, limit)
 
 
@@ -366,7 +366,7 @@ def _missed_variance(sizes: Array, sizes_u: Array, limit: float) -> float:
     if not sizes.size:
         return 0.0
     smallest = max(_LEAST_STEP_K, limit * float(np.median(sizes_u)))
-    below = 2.0 * float(stats.norm.cdf(smallest / np.sqrt(np.mean(sizes**2)))) - 1.0
+    below = 2.0 * float(special.ndtr(smallest / np.sqrt(np.mean(sizes**2)))) - 1.0
     return float(sizes.size * below / (1.0 - below) * smallest**2 / 3.0)
 
 
@@ -376,7 +376,7 @@ def _significant(fit: _Fit, chosen: slice) -> bool:
     if not values.size:
         return False
     ratio = float(values @ np.linalg.solve(covariance, values)) / values.size
-    return bool(stats.f.sf(ratio, values.size, fit.freedom) < _SIGNIFICANCE)
+    return bool(special.fdtrc(values.size, fit.freedom, ratio) < _SIGNIFICANCE)
 
 
 def _first_after(series: LevelSeries, kept: NDArray[np.intp], place: int) -> int:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy import special
 
 from thermography._typing import Array
 from thermography.errors import ThermographyError
@@ -426,8 +426,8 @@ def _draw_lines(
         value, u, (low, high) = getattr(p, name), getattr(inputs, name), _RANGES[name]
         if u == 0:
             return np.full(_DRAWS, value)
-        below, above = stats.norm.cdf([(low - value) / u, (high - value) / u])
-        return np.asarray(value + u * stats.norm.ppf(rng.uniform(below, above, _DRAWS)))
+        below, above = special.ndtr([(low - value) / u, (high - value) / u])
+        return np.asarray(value + u * special.ndtri(rng.uniform(below, above, _DRAWS)))
 
     distance, humidity, air = (
         draw(name) for name in ("object_distance_m", "relative_humidity", "atmospheric_temperature_K")

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as f_distribution
+from scipy import special
 
 from thermography.errors import ThermographyError
 from thermography.registration.projection import (
@@ -104,7 +104,7 @@ def _passes(
     # An agreeing disc is held against the scatter of the others: its own share of the chi-square is taken out.
     others = np.where(agreeing, np.maximum((factor * freedom - squares) / max(freedom - 2, 1), 1.0), factor)
     degrees = np.where(agreeing, max(freedom - 2, 1), max(freedom, 1))
-    unlikely = squares / 2 / others > f_distribution.isf(_FALSE_ALARM / len(squares), 2, degrees)
+    unlikely = squares / 2 / others > special.fdtri(2, degrees, 1.0 - _FALSE_ALARM / len(squares))
     missed_mm = np.linalg.norm(
         np.linalg.solve(projection.jacobian(observations.centres_mm), errors[..., None])[..., 0], axis=1
     )

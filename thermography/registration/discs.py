@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import median_abs_deviation
 
 from thermography._constants import MAD_TO_SIGMA
+from thermography._robust import scatter_by_median
 from thermography._typing import Array
 from thermography.registration.plan import Fiducial, PlanGrid
 
@@ -108,7 +108,7 @@ def detect_discs(temperature: NDArray[np.floating], *, limit: int = 40) -> list[
 
 def _spots_in(top_hat: NDArray[np.float32], sign: float, width: int) -> list[tuple[bool, Spot]]:
     """Elliptic spots of a top-hat transform with a structuring element of `width` px, and whether the noise cuts them above half height."""
-    noise = float(median_abs_deviation(top_hat, axis=None, scale="normal"))
+    noise = scatter_by_median(top_hat)
     least = float(np.median(top_hat)) + 6 * max(noise, 1e-3)
     marked = (top_hat > least).astype(np.uint8)
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(marked, connectivity=4)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from thermography._typing import Array
 from thermography.registration.consensus import fit_agreeing
@@ -479,7 +479,7 @@ def _registration(
 
 def _student_factor(freedom: float) -> float:
     """Square of the half-width of Student's t that holds 68 %: few residuals tell their scatter badly (JCGM 100:2008, annex G)."""
-    return float(stats.t.ppf(stats.norm.cdf(1.0), freedom)) ** 2 if freedom >= 1.0 else 1.0
+    return float(special.stdtrit(freedom, special.ndtr(1.0))) ** 2 if freedom >= 1.0 else 1.0
 
 
 def _with_places_unchecked(

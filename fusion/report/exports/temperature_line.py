@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.stats import t
+from scipy import special
 
 from fusion.products.grouped import group
 from fusion.report.exports.errors import ExportError
@@ -63,7 +63,7 @@ class TemperatureLine:
                 "the material temperature does not predict the drift: the error of predicting each block of cycles from the others is "
                 f"{self.after_um:.3g} um with the line and {self.before_um:.3g} um without it"
             ]
-        limit = float(t.ppf(1.0 - _LEVEL / 2.0, _BLOCKS - 1))
+        limit = float(special.stdtrit(_BLOCKS - 1, 1.0 - _LEVEL / 2.0))
         pairs = (
             (self.offset_um_per_K, self.offset_u_um_per_K),
             (self.gradient_ppm_per_K, self.gradient_u_ppm_per_K),
