@@ -72,13 +72,14 @@ def test_a_run_shows_a_sign_of_life_before_it_loads_the_libraries(campaign_folde
         (["--help"], {"numpy", "xarray"}),
         (["inspect", "FRAME"], {"xarray", "pandas", "scipy", "numba"}),
         (["run", "CAMPAIGN", "--out", "RESULTS", "--resume"], {"xarray", "pandas", "scipy.stats", "numba", "bokeh"}),
+        (["check", "CAMPAIGN"], {"scipy.stats", "bokeh", "matplotlib"}),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
 def test_a_short_answer_loads_no_library_that_it_does_not_need(
     arguments: list[str], unneeded: set[str], campaign_folder: Path, results_folder: Path
 ) -> None:
-    """Help, one frame, and a run that is whole: loading the libraries of the analysis would take most of the time."""
+    """Help, one frame, a run that is whole, inputs alone: loading the libraries of the analysis would take most of the time."""
     places = {
         "FRAME": sorted((campaign_folder / "thermal").iterdir())[0],
         "CAMPAIGN": campaign_folder / "campaign.toml",
