@@ -22,7 +22,6 @@ from typing import Any
 from urllib.parse import quote, unquote, urljoin, urlsplit
 
 import filelock
-import pooch
 
 from fusion.errors import FusionError
 from fusion.products.progress import Report, silent
@@ -72,8 +71,12 @@ def is_address(place: object) -> bool:
 
 def cache_folder() -> Path:
     """Return the folder that keeps what is fetched: that of THERMOFUSE_CACHE, or one in the user's cache."""
-    named = os.environ.get(CACHE_VARIABLE)
-    return Path(named) if named else Path(pooch.os_cache("thermofuse")) / "remote"
+    if named := os.environ.get(CACHE_VARIABLE):
+        return Path(named)
+    # Few runs ask for it.
+    import pooch
+
+    return Path(pooch.os_cache("thermofuse")) / "remote"
 
 
 def require_outside_cache(folder: Path) -> None:

@@ -33,6 +33,7 @@ from fusion.attribution.drift_channels import DriftSeries, clock_readings, reduc
 from fusion.attribution.family_wise import LAGS_S
 from fusion.attribution.likelihood_ratio import null_bank, whitening_grid
 from fusion.attribution.warm_up import thermal_modes
+from thermography.fields.tasks.spool import empty_array, give_back
 
 #: The camera is represented by at most this many thermal modes.
 _CAMERA_MODES = 6
@@ -200,15 +201,18 @@ class _Part:
         ones = np.ones((self.values.size, 1))
         grid = whitening_grid(series.seconds[kept], series.variance[kept], ones)
         self.freedom = grid.freedom
-        self.projects = np.empty((len(grid.whitenings), self.values.size, self.values.size))
+        # Of a long test all grid points together fill the memory: they are in a temporary file.
+        self.projects = empty_array((len(grid.whitenings), self.values.size, self.values.size), float)
+        self.white = np.empty(self.projects.shape[:2])
         for g, point in enumerate(grid.whitenings):
-            self.projects[g] = point.project
+            project = point.project
+            self.projects[g], self.white[g] = project, project @ self.values
+            give_back(self.projects)
         self.penalty = np.array([point.log_penalty for point in grid.whitenings])
-        self.white = self.projects @ self.values
 
-    def columns(self, temperatures: Array) -> Array:
-        """Regressors of the kept values under every lag, (lags, n, p), from temperatures (frames, p)."""
-        return np.asarray(self.task.responses[:, self.kept] @ temperatures, float)
+    def columns(self, temperatures: Array, lag: int) -> Array:
+        """Regressors of the kept values under one lag, (n, p), from temperatures (frames, p)."""
+        return np.asarray(self.task.responses[lag][self.kept] @ temperatures, float)
 
 
 @dataclass(frozen=True)
@@ -232,7 +236,7 @@ class _Fit:
 
 def _fit(part: _Part, temperatures: Array) -> _Fit:
     """Fit the sensitivities to temperatures (frames, p) that share one lag and one prior."""
-    columns = part.columns(temperatures)
+    columns = np.stack([part.columns(temperatures, lag) for lag in range(len(part.task.responses))])
     size = float(np.sqrt((columns[0] ** 2).mean())) + 1e-30
     freedom = part.freedom
     best = _Fit(0, 0, 0.0, np.zeros(temperatures.shape[1]), np.inf)
@@ -250,6 +254,7 @@ def _fit(part: _Part, temperatures: Array) -> _Fit:
             lag = int(np.argmin(score))
             if score[lag] < best.score:
                 best = _Fit(drift, lag, prior, vectors[lag] @ (shrunk[lag] * along[lag]), float(score[lag]))
+        give_back(project)
     return best
 
 
@@ -260,8 +265,8 @@ def _place(parts: Sequence[_Part], fits: Sequence[_Fit], contact: Array, most: i
     states = []
     for part, fit in zip(parts, fits, strict=True):
         project = part.projects[fit.drift]
-        # A copy: that of one lag, without the others.
-        states.append((project.T @ project, part.columns(contact)[fit.lag].copy()))
+        states.append((project.T @ project, part.columns(contact, fit.lag)))
+        give_back(project)
     for _ in range(most):
         gain = np.zeros(contact.shape[1])
         for part, fit, (inverse, columns) in zip(parts, fits, states, strict=True):

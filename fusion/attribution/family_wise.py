@@ -24,7 +24,6 @@ from fusion.alignment.first_order_lag import lag_operators
 from fusion.attribution.drift_channels import DriftSeries
 from fusion.attribution.likelihood_ratio import (
     Array32,
-    Estimate,
     NullBank,
     Whitened,
     estimate_effects,
@@ -373,14 +372,16 @@ def _test_tile(sources: Sequence[_Source], field: Array32, lags: int, joint: boo
     for ratio, together in zip(ratios, summed, strict=True):
         chosen = ratio[0].argmax(axis=1)
         columns = np.arange(count) * lags + chosen
-        parts = np.stack([_stack(estimate_effects(sources[k].bank, regressors[k][:, columns])) for k in together])
+        parts = np.stack([_estimate(sources[k], regressors[k][:, columns]) for k in together])
         effects = np.stack([parts[:, 0].sum(axis=0), *np.hypot.reduce(parts[:, 1:])])
         # Lag after lag: over an axis as short as that of the lags `max` takes six times as long.
         channels.append(_Channel(reduce(np.maximum, ratio.transpose(2, 0, 1)), chosen, effects))
     return channels
 
 
-def _stack(estimate: Estimate) -> Array:
+def _estimate(source: _Source, regressors: Array32) -> Array:
+    """Coefficients of regressors (n, columns), their uncertainties, and those under the fitted null model, (3, columns)."""
+    estimate = estimate_effects(source.bank, regressors, whitened=source.whitened)
     return np.stack([estimate.coefficient, estimate.coefficient_u, estimate.null_u])
 
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from fusion._typing import Array
 from interferometry.drift.state_space import DriftSystem, Order, drift_system
+from thermography.fields.tasks.spool import empty_array, give_back
 
 Array32 = NDArray[np.float32]
 
@@ -44,8 +45,6 @@ class Whitening:
         0 no drift, 1 random walk, 2 integrated random walk.
     per_hour : float
         Standard deviation of the increment of the drift over one hour, over the noise of one value.
-    project32 : (n, n) ndarray
-        Whitens and removes the nuisance regressors, in single precision.
     system : DriftSystem
         The drift and the noise of the values.
     basis : (n, k) ndarray
@@ -56,14 +55,13 @@ class Whitening:
 
     order: int
     per_hour: float
-    project32: Array32
     system: DriftSystem
     basis: Array
     log_penalty: float
 
     @property
     def project(self) -> Array:
-        """`project32` in double precision, (n, n); made when it is asked for, as all grid points of a long test fill the memory."""
+        """Whitens and removes the nuisance regressors, (n, n); made when it is asked for, as all of a long test fill the memory."""
         white, _ = self.system.whiten(np.eye(self.system.seconds.size))
         return np.asarray(white - self.basis @ (self.basis.T @ white))
 
@@ -183,10 +181,9 @@ def whitening_grid(seconds: Array, variance: Array, nuisance: Array, *, integrat
         system = drift_system(seconds, np.ones((n, 1)), order=kind, ratios=np.array([ratio]), variance=variance)
         white, log_determinant = system.whiten(np.eye(n))
         basis, triangle = np.linalg.qr(white @ nuisance)
-        project32 = (white - basis @ (basis.T @ white)).astype(np.float32)
         log_normal = 2.0 * float(np.log(np.abs(np.diag(triangle))).sum())
         penalty = float(log_determinant + log_normal) / freedom
-        whitenings.append(Whitening(order, per_hour, project32, system, basis, penalty))
+        whitenings.append(Whitening(order, per_hour, system, basis, penalty))
     return Grid(tuple(whitenings), freedom, scale)
 
 
@@ -278,8 +275,10 @@ class Whitened:
 
     Attributes
     ----------
+    projects : (grid, n, n) ndarray
+        `Whitening.project` of every grid point, in single precision; in a temporary file where the series is long.
     series : (grid, draws, n) ndarray
-        Whitened series.
+        Whitened series, likewise.
     penalised : (grid, draws) ndarray
         Sums of squares times the penalty.
     penalty : (grid,) ndarray
@@ -290,6 +289,7 @@ class Whitened:
         Degrees of freedom.
     """
 
+    projects: Array32
     series: Array32
     penalised: Array32
     penalty: Array32
@@ -311,17 +311,22 @@ def whiten_series(bank: NullBank, series: Array) -> Whitened:
     -------
     Whitened
     """
-    projected = np.empty((len(bank.whitenings), *series.shape), np.float32)
+    count, n = len(bank.whitenings), series.shape[1]
+    projects = empty_array((count, n, n), np.float32)
+    projected = empty_array((count, *series.shape), np.float32)
     squares = np.empty(projected.shape[:2])
     for g, point in enumerate(bank.whitenings):
-        white = series @ point.project.T
-        projected[g], squares[g] = white, (white**2).sum(axis=1)
+        project = point.project
+        white = series @ project.T
+        projects[g], projected[g], squares[g] = project, white, (white**2).sum(axis=1)
+        give_back(projects, projected)
     log_penalty = np.array([point.log_penalty for point in bank.whitenings])
     # Only ratios of scores count; a common factor keeps single precision away from its limits.
     reference = np.log(squares[:, 0]) + log_penalty
     penalty = np.exp(log_penalty - reference.min())
     penalised = squares * penalty[:, None]
     return Whitened(
+        projects,
         projected,
         penalised.astype(np.float32),
         penalty.astype(np.float32),
@@ -380,10 +385,11 @@ def likelihood_ratios(bank: NullBank, whitened: Whitened, regressors: Array32) -
     draws = whitened.series.shape[1]
     best = np.empty((draws, regressors.shape[1]), np.float32)
     best[:] = whitened.null_score[:, None]
-    for g, point in enumerate(bank.whitenings):
-        unit, _ = _unit_regressors(point.project32, regressors)
+    for g in range(len(bank.whitenings)):
+        unit, _ = _unit_regressors(whitened.projects[g], regressors)
         products = whitened.series[g] @ unit
         _take_best(products, whitened.penalised[g], whitened.penalty[g], best)
+        give_back(whitened.projects, whitened.series)
     _log_ratio(whitened.null_score, best, float(whitened.freedom))
     return best
 
@@ -405,7 +411,7 @@ class Estimate:
     null_u: Array
 
 
-def estimate_effects(bank: NullBank, regressors: Array32) -> Estimate:
+def estimate_effects(bank: NullBank, regressors: Array32, *, whitened: Whitened | None = None) -> Estimate:
     """Estimate the coefficient of every regressor, with the drift variance profiled.
 
     Parameters
@@ -414,6 +420,8 @@ def estimate_effects(bank: NullBank, regressors: Array32) -> Estimate:
         Null models of the measured series.
     regressors : (n, columns) ndarray of float32, K
         Temperatures at the instants of the series.
+    whitened : Whitened, optional
+        Has the whitenings of these null models, which are otherwise made again.
 
     Returns
     -------
@@ -426,7 +434,8 @@ def estimate_effects(bank: NullBank, regressors: Array32) -> Estimate:
     uncertainty = np.full(columns, np.inf)
     null_u = np.full(columns, np.inf)
     for g, point in enumerate(bank.whitenings):
-        unit, length = _unit_regressors(point.project32, regressors)
+        project = point.project.astype(np.float32) if whitened is None else whitened.projects[g]
+        unit, length = _unit_regressors(project, regressors)
         series = bank.whitened[g]
         product = (series.astype(np.float32) @ unit).astype(float)
         rss = float(series @ series) - product**2
@@ -440,6 +449,7 @@ def estimate_effects(bank: NullBank, regressors: Array32) -> Estimate:
         uncertainty = np.where(better, spread, uncertainty)
         if g == bank.best:
             null_u = np.where(informative, np.sqrt(float(series @ series) / bank.freedom) / safe, np.inf)
+        give_back(project)
     return Estimate(coefficient, uncertainty, null_u)
 
 

@@ -12,7 +12,6 @@ from itertools import chain, combinations
 
 import numpy as np
 import xarray as xr
-from scipy.interpolate import interp1d
 
 from fusion._typing import Array
 from fusion.alignment.align import AxisGeometry, MeasuredLine
@@ -219,10 +218,13 @@ def _alternatives(model: ModelFit, fields: xr.Dataset, axis: AxisGeometry) -> It
     position, seconds = readings.positions_mm, readings.series["axis_integral"].seconds
     along_mm = _on_the_plan(fields, axis)
     line = MeasuredLine(fields, axis, along_mm)
-    integral = interp1d(along_mm, line.integrate(line.sample_rise(fields["frame_temperature"])), axis=1)
+    known = line.integrate(line.sample_rise(fields["frame_temperature"]))
+
+    def integral(ends_mm: Array) -> Array:
+        return _interpolate(ends_mm, along_mm, known)
 
     def column(origin_mm: float, ends_mm: Array) -> Array:
-        return readings.at(Series(seconds, 1e-3 * (integral(ends_mm) - integral([origin_mm])), "K m"))
+        return readings.at(Series(seconds, 1e-3 * (integral(ends_mm) - integral(np.array([origin_mm]))), "K m"))
 
     def inside(ends_mm: Array) -> bool:
         return bool(along_mm[0] <= ends_mm.min() and ends_mm.max() <= along_mm[-1])
@@ -239,6 +241,13 @@ def _alternatives(model: ModelFit, fields: xr.Dataset, axis: AxisGeometry) -> It
         mirrored = position.min() + position.max() - position
         yield "with the targets numbered from the other end", column(0.0, mirrored)
         yield "with deviations of the opposite sign", -column(0.0, position)
+
+
+def _interpolate(ends: Array, places: Array, known: Array) -> Array:
+    """Rows of values that are known at places (k,), rising, interpolated linearly at ends (n,) between them, (rows, n)."""
+    after = np.clip(np.searchsorted(places, ends), 1, places.size - 1)
+    slope = (known[:, after] - known[:, after - 1]) / (places[after] - places[after - 1])
+    return np.asarray(slope * (ends - places[after - 1]) + known[:, after - 1])
 
 
 def _on_the_plan(fields: xr.Dataset, axis: AxisGeometry) -> Array:
