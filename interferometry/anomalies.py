@@ -15,7 +15,7 @@ In this order: the public test; excess scatter; motions over the cycles; the gen
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,6 +41,8 @@ SHORTEST_TEST_CYCLES = 15
 MOST_ANOMALIES = 4
 #: Frequencies of a periodogram that are looked at together.
 _WAVES_AT_ONCE = 128
+#: Permuted values that are made at a time.
+_PERMUTED_VALUES = 1 << 18
 #: Levels of the tests whether a target stands out from the others: by its scatter, both directions together and either alone, and by its
 #: motion over the cycles. Scatter that differs naturally is significant by permutation, so that the first two must share 0.05.
 ESD_LEVELS = {"together": 0.035, "single": 0.01, "motion": 0.02}
@@ -303,12 +305,10 @@ def _series_anomalies(
     # Permuted cycles have no memory: noise that has one would pass for a motion of its position.
     memory = typical_memory(values[[label.direction != "both" for label in labels]])
     values = memory.innovations(values)
-    orders = np.array([rng.permutation(values.shape[1]) for _ in range(permutations)])
+    moving = _permutation_tests(values, {"slow": _slowness, "step": _largest_step}, permutations, rng)
     periodogram = _Periodogram(_cycle_seconds(deviations))
     largest = periodogram.power(values).max(axis=-1)
-    tests = {"periodic": (largest, periodogram.p_values(largest))}
-    for kind, statistic in (("slow", _slowness), ("step", _largest_step)):
-        tests[kind] = _permutation_test(values, statistic, orders)
+    tests = {"periodic": (largest, periodogram.p_values(largest)), **moving}
     significant: dict[str, dict[int, tuple[float, int]]] = {}
     for kind, (strength, p) in tests.items():
         best: dict[int, tuple[float, int]] = {}
@@ -341,16 +341,31 @@ def _moving_apart(labels: list[_Series], strength: Array) -> set[int]:
     return set(targets[marked].tolist())
 
 
-def _permutation_test(
-    values: Array, statistic: Callable[[Array], Array], orders: NDArray[np.int64]
-) -> tuple[Array, Array]:
-    """Return each series' standardised statistic and its p-value against the largest one of each permutation, (series,)."""
-    shuffled = np.concatenate([statistic(values[:, order].transpose(1, 0, 2)) for order in np.array_split(orders, 10)])
+def _permutation_tests(
+    values: Array, statistics: Mapping[str, Callable[[Array], Array]], permutations: int, rng: np.random.Generator
+) -> dict[str, tuple[Array, Array]]:
+    """Return each series' standardised statistic of every kind, and its p-value against the largest one of each permutation, (series,)."""
+    shuffled: dict[str, list[Array]] = {kind: [] for kind in statistics}
+    # Some permutations at a time: all of a long test fill the memory.
+    at_once = max(1, _PERMUTED_VALUES // values.size)
+    for start in range(0, permutations, at_once):
+        some = range(start, min(start + at_once, permutations))
+        permuted = values[:, np.array([rng.permutation(values.shape[1]) for _ in some])].transpose(1, 0, 2)
+        for kind, statistic in statistics.items():
+            shuffled[kind].append(statistic(permuted))
+    return {
+        kind: _against_permuted(statistic(values), np.concatenate(shuffled[kind]))
+        for kind, statistic in statistics.items()
+    }
+
+
+def _against_permuted(measured: Array, shuffled: Array) -> tuple[Array, Array]:
+    """Standardise a statistic (series,) by that of permuted series (permutation, series); return it with its p-values."""
     centre, spread = shuffled.mean(axis=0), shuffled.std(axis=0)
     largest = ((shuffled - centre) / spread).max(axis=1)
-    strength = (statistic(values) - centre) / spread
+    strength = (measured - centre) / spread
     reached = np.count_nonzero(largest[:, None] >= strength, axis=0)
-    return strength, (1 + reached) / (len(orders) + 1)
+    return strength, (1 + reached) / (len(shuffled) + 1)
 
 
 def _series(estimated: xr.Dataset) -> tuple[list[_Series], Array]:

@@ -453,7 +453,8 @@ def _drift_from_state(joint: JointFit, smoothed: Smoothed, at_state: _StateDrift
     fit = joint.fit
     total, per_coefficient = _with_start_rates(smoothed.levels, fit.system.seconds / 3600.0, joint)
     drift = total - at_state.drift
-    dependence = per_coefficient - at_state.per_coefficient
+    dependence = per_coefficient
+    dependence -= at_state.per_coefficient
     joined = (
         smoothed.level_covariance + at_state.covariance - at_state.with_drift - at_state.with_drift.transpose(0, 2, 1)
     )

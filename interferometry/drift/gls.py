@@ -529,8 +529,8 @@ def _filter_with_average(
 ) -> tuple[Array, Array, Array, Array]:
     """Filter with the average as part of the state.
 
-    Returns the last state (size, p) and its covariance (size, size), the predicted covariances (n, size, size) and the gains
-    (n, size), size being order * components of the drift and components of the average.
+    Returns the last state (size, p) and its covariance (size, size), the predicted covariances of the levels (n, components, size) and
+    the gains (n, size), size being order * components of the drift and components of the average.
     """
     n, components = loadings.shape
     m = components * order
@@ -538,13 +538,14 @@ def _filter_with_average(
     state = np.zeros((size, columns.shape[1]))
     covariance = np.zeros((size, size))
     cross_covariance, innovation = np.zeros(size), np.empty(columns.shape[1])
-    predicted = np.zeros((n, size, size))
+    predicted = np.zeros((n, components, size))
     gains = np.zeros((n, size))
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
         kalman.predict_state(state[:m], order, step)
         kalman.predict_covariance(covariance, order, ratios, process_noise_scale[k], step)
-        predicted[k] = covariance
+        for c in range(components):
+            predicted[k, c] = covariance[c * order]
         if observed[k]:
             total = kalman.innovation_variance(covariance, order, loadings, k, variance[k], cross_covariance)
             kalman.update_covariance(covariance, cross_covariance, total)
@@ -592,7 +593,7 @@ def _covariance_with_average(
         for c in range(components):
             for i in range(components):
                 for j in range(size):
-                    with_drift[k, c, i] += predicted[k, c * order, j] * onward[i, j]
+                    with_drift[k, c, i] += predicted[k, c, j] * onward[i, j]
     return with_drift
 
 

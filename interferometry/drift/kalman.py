@@ -205,21 +205,22 @@ def filter_covariance(
         M = P Z' / F; zero for a reading that is not observed.
     innovation_variances : (n,) ndarray
         F, in units of sigma^2.
-    covariances : (n, m, m) ndarray
-        Predicted P of every reading; (1, m, m) and empty of meaning without `keep`.
+    covariances : (n, c, m) ndarray
+        Rows of the predicted P of every reading that belong to the levels; (1, c, m) and empty of meaning without `keep`.
     """
     n, components = loadings.shape
     m = components * order
     gains = np.zeros((n, m))
     innovation_variances = np.empty(n)
-    covariances = np.zeros((n if keep else 1, m, m))
+    covariances = np.zeros((n if keep else 1, components, m))
     covariance = np.zeros((m, m))
     cross_covariance = np.zeros(m)
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
         predict_covariance(covariance, order, ratios, process_noise_scale[k], step)
         if keep:
-            covariances[k] = covariance
+            for c in range(components):
+                covariances[k, c] = covariance[c * order]
         innovation_variances[k] = innovation_variance(covariance, order, loadings, k, variance[k], cross_covariance)
         if observed[k]:
             for i in range(m):
@@ -251,20 +252,21 @@ def filter_columns(
     -------
     innovations : (n, p) ndarray
         One-step prediction errors, in the units of the columns.
-    states : (n, m, p) ndarray
-        Predicted states a; (1, m, p) and empty of meaning without `keep`.
+    states : (n, c, p) ndarray
+        Levels of the predicted states a; (1, c, p) and empty of meaning without `keep`.
     """
     n, components = loadings.shape
     m = gains.shape[1]
     p = columns.shape[1]
     innovations = np.empty((n, p))
-    states = np.zeros((n if keep else 1, m, p))
+    states = np.zeros((n if keep else 1, components, p))
     state = np.zeros((m, p))
     for k in range(n):
         step = seconds[k] - seconds[k - 1] if k > 0 else 0.0
         predict_state(state, order, step)
         if keep:
-            states[k] = state
+            for c in range(components):
+                states[k, c] = state[c * order]
         # One loop over the columns for every term: the compiler then takes several columns at a time.
         innovation = innovations[k]
         for j in range(p):
@@ -383,11 +385,11 @@ def smooth(
         Time of each reading, s, not decreasing.
     loadings : (n, c) ndarray
     order : {1, 2}
-    gains, innovation_variances, covariances : (n, m), (n,), (n, m, m) ndarray
+    gains, innovation_variances, covariances : (n, m), (n,), (n, c, m) ndarray
         From `filter_covariance` with ``keep``.
     observed : (n,) ndarray of bool
-    innovations, states : (n, p), (n, m, p) ndarray
-        From `filter_columns` with ``keep``.
+    innovations, states : (n, p), (n, c, p) ndarray
+        From `filter_columns` with ``keep``; overwritten with the results of the same shape, as those of a long test fill the memory.
 
     Returns
     -------
@@ -415,9 +417,8 @@ def smooth(
     n, components = loadings.shape
     m = gains.shape[1]
     p = innovations.shape[1]
-    levels = np.empty((n, components, p))
+    levels, u = states, innovations
     level_covariance = np.empty((n, components, components))
-    u = np.zeros((n, p))
     D = np.zeros(n)
     r = np.zeros((m, p))
     N = np.zeros((m, m))
@@ -440,7 +441,7 @@ def smooth(
                     NM[i] += N[i, j] * gains[k, j]
                 D[k] += gains[k, i] * NM[i]
             for j in range(p):
-                u[k, j] = innovations[k, j] / innovation_variances[k]
+                u[k, j] /= innovation_variances[k]
             for i in range(m):
                 for j in range(p):
                     u[k, j] -= gains[k, i] * r[i, j]
@@ -453,26 +454,24 @@ def smooth(
                     N[j, level] -= loading * NM[j]
                 for e in range(components):
                     N[level, e * order] += loading * loadings[k, e] * D[k]
-        _smooth_levels(order, covariances[k], states[k], r, N, levels[k], level_covariance[k])
+        else:
+            u[k] = 0.0
+        _smooth_levels(order, covariances[k], r, N, levels[k], level_covariance[k])
     return levels, level_covariance, u, D
 
 
 @njit(cache=True)
-def _smooth_levels(
-    order: int, covariance: Array, state: Array, r: Array, N: Array, levels: Array, level_covariance: Array
-) -> None:
-    """Write a + P r and P - P N P of one reading, at the levels, into the last two arguments (eq. 4.44)."""
+def _smooth_levels(order: int, covariance: Array, r: Array, N: Array, levels: Array, level_covariance: Array) -> None:
+    """Turn a into a + P r and write P - P N P of one reading, at the levels, into the last two arguments (eq. 4.44)."""
     components, p = levels.shape
-    m = covariance.shape[0]
+    m = covariance.shape[1]
     for c in range(components):
-        row = covariance[c * order]
-        for j in range(p):
-            levels[c, j] = state[c * order, j]
+        row = covariance[c]
         for i in range(m):
             for j in range(p):
                 levels[c, j] += row[i] * r[i, j]
         for e in range(components):
-            other = covariance[e * order]
+            other = covariance[e]
             level_covariance[c, e] = row[e * order]
             for i in range(m):
                 for j in range(m):

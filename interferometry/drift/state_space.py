@@ -144,6 +144,8 @@ class DriftSystem:
             parts.append(
                 kalman.smooth(*filtered, innovation_variances, self.observed, innovations, states, covariances)
             )
+        if len(parts) == 1:
+            return Smoothed(*parts[0])
         levels, covariance, u, variance = zip(*parts, strict=True)
         return Smoothed(np.concatenate(levels, axis=2), covariance[0], np.concatenate(u, axis=1), variance[0])
 
