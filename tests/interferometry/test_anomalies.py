@@ -263,16 +263,22 @@ def test_the_excess_of_a_target_is_the_largest_of_both_directions_and_of_either(
     np.testing.assert_allclose(excess, [4.0 / 2.0, 4.0 / np.sqrt(2.0)])
 
 
-def test_a_permutation_test_ranks_every_series_among_the_largest_of_all(rng: np.random.Generator) -> None:
+def test_a_permutation_test_ranks_every_series_among_the_largest_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two series, of which the statistic takes the first cycle: by permutation each value leads equally often."""
     values = np.array([[9.0, 1.0, 2.0, 3.0, 0.0], [2.0, 1.0, 3.0, 9.0, 0.0]])
+    # Ten permutations at a time, and nine at last: the same as all at once.
+    monkeypatch.setattr(anomalies_module, "_PERMUTED_VALUES", 100)
+    statistics = {"first": lambda some: some[..., 0], "last": lambda some: some[..., -1]}
+    tests = anomalies_module._permutation_tests(values, statistics, 99, np.random.default_rng(3))
+    rng = np.random.default_rng(3)
     orders = np.array([rng.permutation(5) for _ in range(99)])
-    first = values[:, orders[:, 0]]
-    strength, p = anomalies_module._permutation_test(values, lambda some: some[..., 0], orders)
-    scaled = (first - first.mean(axis=1, keepdims=True)) / first.std(axis=1, keepdims=True)
-    expected = (values[:, 0] - first.mean(axis=1)) / first.std(axis=1)
-    np.testing.assert_allclose(strength, expected)
-    np.testing.assert_allclose(p, [(1 + (scaled.max(axis=0) >= one - 1e-12).sum()) / 100 for one in expected])
+    for place, name in ((0, "first"), (-1, "last")):
+        strength, p = tests[name]
+        taken = values[:, orders[:, place]]
+        scaled = (taken - taken.mean(axis=1, keepdims=True)) / taken.std(axis=1, keepdims=True)
+        expected = (values[:, place] - taken.mean(axis=1)) / taken.std(axis=1)
+        np.testing.assert_allclose(strength, expected)
+        np.testing.assert_allclose(p, [(1 + (scaled.max(axis=0) >= one - 1e-12).sum()) / 100 for one in expected])
 
 
 def test_one_outlier_is_marked_from_its_percentage_point_on() -> None:
