@@ -32,6 +32,8 @@ from interferometry.iso230.uncertainty import AXIS, ONE_WAY, UncertainTest
 #: positioning error, bidirectional accuracy.
 QUANTITIES = ("B", "R", "E", "M", "A")
 STANDARD_CYCLES = 5
+#: Windows of a long test that are evaluated before their results become one.
+_WINDOWS_AT_ONCE = 64
 
 
 def evaluate_iso230(
@@ -190,14 +192,18 @@ def evaluate_windows(
     numbers = deviations["cycle"].values.tolist()
     windows = [numbers[start : start + length] for start in range(0, len(numbers) - length + 1, length)]
     windows = [window for window in windows if _can_be_evaluated(deviations.sel(cycle=window))] + [numbers]
-    results = [
-        _of_the_axis(
-            evaluate_iso230(deviations, cycles=window, budget=budget, drift=drift, material_degC=material_degC)
-        )
-        for window in windows
-    ]
-    joined = xr.concat(results, dim="window", coords="minimal", compat="override")
-    names = [result.attrs["window"] for result in results]
+    parts, names = [], []
+    # The results of thousands of windows are very many small objects: those of some windows become one at a time.
+    for start in range(0, len(windows), _WINDOWS_AT_ONCE):
+        results = [
+            _of_the_axis(
+                evaluate_iso230(deviations, cycles=window, budget=budget, drift=drift, material_degC=material_degC)
+            )
+            for window in windows[start : start + _WINDOWS_AT_ONCE]
+        ]
+        names += [result.attrs["window"] for result in results]
+        parts.append(xr.concat(results, dim="window", coords="minimal", compat="override"))
+    joined = parts[0] if len(parts) == 1 else xr.concat(parts, dim="window", coords="minimal", compat="override")
     return joined.assign_coords(
         window=names,
         middle_cycle=("window", [float(np.mean(window)) for window in windows]),
