@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,13 @@ from fusion.pipeline.provenance import hash_files, versions
 from fusion.pipeline.run import run_campaign
 from fusion.products.progress import Report, silent
 from fusion.products.results import ResultsError
+from fusion.products.store import is_file_list
 from fusion.remote import fetched_campaign, is_address
 
-#: Differences of numbers that are told one by one; the others are counted.
+#: Differences that are told one by one; the others are counted.
 _MOST_TOLD = 12
+#: Characters of a name or a value that are told.
+_LONGEST = 60
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ def reproduce(results: Path, *, campaign: Path | str | None = None, report: Repo
     Raises
     ------
     ResultsError
-        If the folder holds no finished run, or the campaign file is not found.
+        If the folder holds no finished run, its JSON is none, or the campaign file is not found.
     FusionError, ThermographyError, InterferometryError
         If the campaign cannot be run any more.
 
@@ -76,22 +79,37 @@ def reproduce(results: Path, *, campaign: Path | str | None = None, report: Repo
 def _compare(results: Path, provenance: Mapping[str, Any], path: Path, report: Report) -> Reproduction:
     """Compute a run again from a campaign file of this machine and compare it."""
     loaded = load_campaign(path)
-    strange = tuple(_compare_inputs(provenance["inputs"], hash_files(loaded.input_files(), report=report)))
+    strange = _first(_compare_inputs(provenance["inputs"], hash_files(loaded.input_files(), report=report)))
     if strange:
         return Reproduction(False, (*strange, "the inputs are not those of the run, so it was not computed again"))
-    remarks = tuple(_compare_versions(provenance["versions"], versions()))
+    remarks = _first(_compare_versions(provenance["versions"], versions()))
     before = (results / "results.json").read_bytes()
+    # Before the long work: what is compared afterwards has to be JSON.
+    written = _read_json(results / "results.json")
     with tempfile.TemporaryDirectory(prefix="thermofuse-") as folder:
         run_campaign(path, Path(folder) / "results", report=report)
         after = (Path(folder) / "results" / "results.json").read_bytes()
     if before == after:
         count = f"{len(provenance['inputs'])} input files"
         return Reproduction(True, (*remarks, f"equal: {count} give the same results.json, all {len(before)} bytes"))
-    differences = list(_differences(json.loads(before), json.loads(after), ""))
-    told = differences[:_MOST_TOLD]
-    rest = len(differences) - len(told)
-    more = (f"and {rest} more",) if rest else ()
-    return Reproduction(False, (*remarks, f"different: {len(differences)} values of results.json", *told, *more))
+    differences = list(_differences(written, json.loads(after), ""))
+    told = _first(differences)
+    return Reproduction(False, (*remarks, f"different: {len(differences)} values of results.json", *told))
+
+
+def _first(lines: Iterable[str]) -> tuple[str, ...]:
+    """Return the lines that are told one by one, and how many more there are."""
+    all_of_them = list(lines)
+    rest = len(all_of_them) - _MOST_TOLD
+    return (*all_of_them[:_MOST_TOLD], *((f"and {rest} more",) if rest > 0 else ()))
+
+
+def _read_json(path: Path) -> Any:
+    """Return what a file of a results folder holds."""
+    try:
+        return json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise ResultsError(f"{path}: is not JSON ({error}); run the campaign again") from None
 
 
 def _read_provenance(results: Path) -> dict[str, Any]:
@@ -99,11 +117,12 @@ def _read_provenance(results: Path) -> dict[str, Any]:
     path = results / "provenance.json"
     if not path.is_file() or not (results / "results.json").is_file():
         raise ResultsError(f"{results}: holds no finished run; name a folder with results.json and provenance.json")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ResultsError(f"{path}: is not JSON ({error}); run the campaign again") from None
-    if not isinstance(content, dict) or not all(isinstance(content.get(key), dict) for key in ("inputs", "versions")):
+    content = _read_json(path)
+    if (
+        not isinstance(content, dict)
+        or not is_file_list(content.get("inputs"))
+        or not isinstance(content.get("versions"), dict)
+    ):
         raise ResultsError(f"{path}: is not the provenance of a run; run the campaign again")
     return content
 
@@ -127,25 +146,25 @@ def _compare_inputs(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterat
     """Yield a line for every input that is missing, new or changed."""
     for name in sorted({*before, *now}):
         if name not in now:
-            yield f"{name}: was an input of the run and is none now"
+            yield f"{_cut(name)}: was an input of the run and is none now"
         elif name not in before:
             yield f"{name}: is an input now and was none of the run"
         elif before[name] != now[name]:
-            yield f"{name}: its content has changed (SHA-256 {now[name]['sha256'][:12]}, was {str(before[name].get('sha256'))[:12]})"
+            yield f"{name}: its content has changed (SHA-256 {now[name]['sha256'][:12]}, was {str(before[name]['sha256'])[:12]})"
 
 
-def _compare_versions(before: Mapping[str, str], now: Mapping[str, str]) -> Iterator[str]:
+def _compare_versions(before: Mapping[str, Any], now: Mapping[str, str]) -> Iterator[str]:
     """Yield a line for every package whose version differs."""
     for name in sorted({*before, *now}):
         if before.get(name) != now.get(name):
-            yield f"{name} {now.get(name, 'not used')}, was {before.get(name, 'not used')}"
+            yield f"{_cut(name)} {now.get(name, 'not used')}, was {_cut(str(before.get(name, 'not used')))}"
 
 
 def _differences(before: Any, after: Any, place: str) -> Iterator[str]:
     """Yield a line for every value of two JSON documents that differs."""
     if isinstance(before, dict) and isinstance(after, dict):
         for key in dict.fromkeys([*before, *after]):
-            yield from _differences(before.get(key), after.get(key), f"{place}.{key}" if place else key)
+            yield from _differences(before.get(key), after.get(key), f"{place}.{_cut(key)}" if place else _cut(key))
     elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
         for number, (one, other) in enumerate(zip(before, after, strict=True)):
             yield from _differences(one, other, f"{place}[{number}]")
@@ -154,5 +173,11 @@ def _differences(before: Any, after: Any, place: str) -> Iterator[str]:
 
 
 def _short(value: Any) -> str:
-    text = json.dumps(value, ensure_ascii=False)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    try:
+        return _cut(json.dumps(value, ensure_ascii=False))
+    except RecursionError:
+        return "brackets within brackets"
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."

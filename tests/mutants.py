@@ -35,10 +35,16 @@ from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator, operator_names
 
 _FORK = multiprocessing.get_context("fork")
-#: Quick tests elsewhere that hold promises of a module, beside the file of its name.
+#: Quick tests elsewhere that hold promises of a module, beside the file of its name; of those of the fit the ones that search for nothing,
+#: which would take minutes as plain Python.
+_FIT = "tests/interferometry/drift/test_gls.py"
 _ALSO = {
     "interferometry/drift/kalman.py": (
-        "tests/interferometry/drift/test_gls.py",
+        f"{_FIT}::test_agrees_with_dense_generalised_least_squares",
+        f"{_FIT}::test_deletion_residual_is_the_error_of_predicting_a_reading_from_all_others",
+        f"{_FIT}::test_held_out_readings_do_not_move_the_fit_and_are_predicted_in_open_loop",
+        f"{_FIT}::test_the_average_of_the_drift_and_its_covariance_are_those_of_dense_algebra",
+        f"{_FIT}::test_a_process_noise_scale_multiplies_the_variance_of_its_own_steps",
         "tests/interferometry/drift/test_state_space.py",
     )
 }

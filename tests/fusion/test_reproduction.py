@@ -86,7 +86,48 @@ def test_a_folder_without_a_run_or_its_campaign_is_refused(finished: Path, tmp_p
     elsewhere = shutil.copytree(finished, tmp_path / "elsewhere" / "results")
     with pytest.raises(ResultsError, match="name it with --campaign"):
         reproduce(elsewhere)
-    for text in ("{", "[" * 100_000):
-        (elsewhere / "provenance.json").write_text(text)
+    for text in ("{", "[" * 100_000, '{"inputs": ' + "1" * 5000 + "}", b"\xff\xfe{"):
+        (elsewhere / "provenance.json").write_bytes(text if isinstance(text, bytes) else text.encode())
         with pytest.raises(ResultsError, match=r"provenance\.json: is not JSON"):
             reproduce(elsewhere)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        [],
+        {"inputs": {}},
+        {"inputs": {"laser.csv": 1}, "versions": {}},
+        {"inputs": {"a": {"sha256": "x"}}, "versions": {}},
+    ],
+)
+def test_a_provenance_that_lists_no_files_is_refused(finished: Path, content: object) -> None:
+    (finished / "provenance.json").write_text(json.dumps(content))
+    with pytest.raises(ResultsError, match=r"is not the provenance of a run; run the campaign again"):
+        reproduce(finished)
+
+
+@pytest.mark.parametrize("text", ["{", "[" * 100_000, '{"a": ' + "1" * 5000 + "}", b"\xff"])
+def test_results_that_are_not_json_are_refused_before_the_run(
+    finished: Path, monkeypatch: pytest.MonkeyPatch, text: str | bytes
+) -> None:
+    monkeypatch.setattr(module, "run_campaign", None)
+    (finished / "results.json").write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ResultsError, match=r"results\.json: is not JSON"):
+        reproduce(finished)
+
+
+def test_very_many_and_very_long_differences_are_told_in_short(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    provenance = json.loads((finished / "provenance.json").read_text())
+    long = {f"{number}{'x' * 1000}": {"bytes": 1, "sha256": "0"} for number in range(100)}
+    (finished / "provenance.json").write_text(json.dumps({**provenance, "inputs": {**provenance["inputs"], **long}}))
+    told = reproduce(finished).lines
+    assert len(told) == 14
+    assert told[12:] == ("and 88 more", "the inputs are not those of the run, so it was not computed again")
+    assert max(map(len, told)) < 120
+    (finished / "provenance.json").write_text(json.dumps(provenance))
+    nested = "[" * 900 + "]" * 900
+    (finished / "results.json").write_text(f'{{"{"k" * 1000}": 1, "a": {nested}}}')
+    monkeypatch.setattr(module, "run_campaign", giving('{"a": 1}'))
+    assert reproduce(finished).lines[1] == f"{'k' * 57}...: null, was 1"
+    assert reproduce(finished).lines[2].startswith("a: 1, was ")
