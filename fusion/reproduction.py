@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -130,8 +131,10 @@ def _read_provenance(results: Path) -> dict[str, Any]:
 def _campaign_of(results: Path, provenance: Mapping[str, Any]) -> Path:
     """Return the campaign file where the run found it."""
     place = provenance.get("campaign_file")
-    if isinstance(place, str) and (path := results / place).is_file():
-        return path
+    # A name that is too long for a file is an error of the system.
+    with suppress(OSError):
+        if isinstance(place, str) and (path := results / place).is_file():
+            return path
     address = provenance.get("campaign_address")
     if isinstance(address, str):
         raise ResultsError(

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 from fusion.errors import FusionError
+
+#: Characters of a path that a message repeats.
+_LONGEST = 400
 
 
 class PlaceError(FusionError):
@@ -42,8 +46,12 @@ def place_within(root: Path, written: str | Path) -> Path:
         raise PlaceError("a path holds no zero byte; type it again")
     try:
         place = (top / Path(text).expanduser()).resolve()
-    except (OSError, RuntimeError) as error:
-        raise PlaceError(f"{text}: {error}; type another path") from None
+        with suppress(FileNotFoundError, NotADirectoryError):
+            place.lstat()
+    # A link to itself, a name that is too long, a home of nobody.
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise PlaceError(f"{text[:_LONGEST]}: {reason}; type another path") from None
     if not place.is_relative_to(top):
         raise PlaceError(
             f"{text} lies outside {top}, the folder for which this application was started; "

@@ -10,6 +10,7 @@ import python_calamine
 
 from interferometry.io.faults import LaserFormatError
 from interferometry.io.workbook_limits import MOST_CELLS, refuse_bomb
+from interferometry.io.xls.records import guarded_workbook, is_compound
 
 #: Beginnings of spreadsheet files: a ZIP archive (.xlsx, .ods) and a compound file (.xls).
 _MAGIC = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
@@ -50,6 +51,8 @@ def read_sheets(path: Path, content: bytes) -> dict[str, Rows]:
         The file is damaged, locked with a password, or holds no sheet with a table.
     """
     refuse_bomb(path, io.BytesIO(content))
+    if is_compound(content):
+        content = guarded_workbook(path, content)
     try:
         workbook = python_calamine.CalamineWorkbook.from_filelike(io.BytesIO(content))
         visible = [

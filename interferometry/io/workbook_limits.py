@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 import struct
 import zipfile
@@ -9,7 +10,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, BinaryIO
+from typing import IO, BinaryIO, cast
 
 from interferometry.io.faults import LaserFormatError
 
@@ -50,7 +51,7 @@ _XLSB_SHEET, _XLSB_TEXTS, _XLSB_TEXT, _XLSB_ROW, _XLSB_CELLS, _XLSB_SHARED = 145
 
 
 @dataclass
-class _Extent:
+class Extent:
     """What the cells of a spreadsheet take in memory, counted while they are found.
 
     Attributes
@@ -157,7 +158,7 @@ def refuse_bomb(path: Path, archive: BinaryIO) -> None:
         return
     with parts:
         _refuse_by_contents(path, parts.infolist(), size)
-        extent = _Extent(path)
+        extent = Extent(path)
         looks = [_count_texts, _count_cells]
         if any(part.filename.lower().endswith(_XLSB_CONTENTS) for part in parts.infolist()):
             looks = [_count_texts, _count_binary_texts, _count_cells, _count_binary_cells]
@@ -205,7 +206,7 @@ def _refuse_by_contents(path: Path, parts: list[zipfile.ZipInfo], size: int) -> 
         raise LaserFormatError(f"{path}: its parts lie over one another, as no program writes them; {remedy}")
 
 
-def _count_texts(extent: _Extent, name: str, part: IO[bytes]) -> None:
+def _count_texts(extent: Extent, name: str, part: IO[bytes]) -> None:
     """Count the texts of a part of XML that holds those which cells share."""
     length, inside = 0, False
     for text, end in _pieces(part):
@@ -223,7 +224,7 @@ def _count_texts(extent: _Extent, name: str, part: IO[bytes]) -> None:
         extent.share(name, length)
 
 
-def _count_cells(extent: _Extent, name: str, part: IO[bytes]) -> None:
+def _count_cells(extent: Extent, name: str, part: IO[bytes]) -> None:
     """Count the cells of the sheets in a part of XML. Cells that only have a format cost a reader nothing."""
     row = column = rows = 0
     inside = False
@@ -255,7 +256,7 @@ def _count_cells(extent: _Extent, name: str, part: IO[bytes]) -> None:
                 extent.fill(row, column, text * times * rows)
 
 
-def _text_length(extent: _Extent, attributes: bytes, content: bytes, length: int) -> int:
+def _text_length(extent: Extent, attributes: bytes, content: bytes, length: int) -> int:
     """Return the length of the text in a cell of Office Open XML, with the XML around it; that of a number is 0."""
     if _SHARED.search(attributes):
         number = _NUMBER.search(content)
@@ -287,6 +288,7 @@ def _tags(part: IO[bytes]) -> Iterator[tuple[bytes, bytes, bytes, int]]:
 
 def _pieces(xml: IO[bytes]) -> Iterator[tuple[bytes, int]]:
     """Yield pieces of XML, each with the place up to which its tags are whole: what follows the last bracket comes again."""
+    xml = _in_utf8(xml)
     text = xml.read(_PIECE)
     while text:
         following = xml.read(_PIECE)
@@ -299,7 +301,18 @@ def _pieces(xml: IO[bytes]) -> Iterator[tuple[bytes, int]]:
         text = text[end:] + following
 
 
-def _count_binary_texts(extent: _Extent, name: str, part: IO[bytes]) -> None:
+def _in_utf8(xml: IO[bytes]) -> IO[bytes]:
+    """Return XML in UTF-8: that in UTF-16, with a mark or told by the zero in its first character, is decoded on its way."""
+    start = xml.read(2)
+    xml.seek(0)
+    marked = start in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    if not marked and (len(start) < 2 or 0 not in start):
+        return xml
+    name = "utf-16" if marked else "utf-16-le" if start[1] == 0 else "utf-16-be"
+    return cast("IO[bytes]", codecs.EncodedFile(xml, "utf-8", name, "replace"))
+
+
+def _count_binary_texts(extent: Extent, name: str, part: IO[bytes]) -> None:
     """Count the texts of a binary part that holds those which cells share."""
     inside = False
     for kind, payload in _records(part):
@@ -308,7 +321,7 @@ def _count_binary_texts(extent: _Extent, name: str, part: IO[bytes]) -> None:
             extent.share(name, len(payload))
 
 
-def _count_binary_cells(extent: _Extent, name: str, part: IO[bytes]) -> None:
+def _count_binary_cells(extent: Extent, name: str, part: IO[bytes]) -> None:
     """Count the cells of a binary sheet."""
     row, inside = 0, False
     for kind, payload in _records(part):

@@ -86,6 +86,11 @@ def test_a_folder_without_a_run_or_its_campaign_is_refused(finished: Path, tmp_p
     elsewhere = shutil.copytree(finished, tmp_path / "elsewhere" / "results")
     with pytest.raises(ResultsError, match="name it with --campaign"):
         reproduce(elsewhere)
+    for place in ("../" * 5000, "x" * 5000, "a\0b", 5, None):
+        provenance = json.loads((finished / "provenance.json").read_text())
+        (elsewhere / "provenance.json").write_text(json.dumps({**provenance, "campaign_file": place}))
+        with pytest.raises(ResultsError, match="name it with --campaign"):
+            reproduce(elsewhere)
     for text in ("{", "[" * 100_000, '{"inputs": ' + "1" * 5000 + "}", b"\xff\xfe{"):
         (elsewhere / "provenance.json").write_bytes(text if isinstance(text, bytes) else text.encode())
         with pytest.raises(ResultsError, match=r"provenance\.json: is not JSON"):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import panel as pn
 
@@ -20,6 +22,29 @@ from fusion.errors import FusionError
 from fusion.products.branch import branch_results
 
 _INTERVAL_MS = 500
+#: Effects that a form offers; no library has so many.
+_MOST_EFFECTS = 100
+
+
+def _stated(provenance: Mapping[str, Any], part: str, key: str) -> Any:
+    """Return a parameter of a run as its provenance states it; None where that is not what a run writes."""
+    level: Any = provenance
+    for name in ("parameters", part, key):
+        level = level.get(name) if isinstance(level, Mapping) else None
+    return level
+
+
+def _stated_emissivity(provenance: Mapping[str, Any]) -> float | None:
+    value = _stated(provenance, "thermography", "emissivity")
+    return float(value) if isinstance(value, int | float) and 0.0 < value <= 1.0 else None
+
+
+def _stated_effects(provenance: Mapping[str, Any]) -> list[str]:
+    names = _stated(provenance, "model", "declared")
+    effects = (
+        [name for name in names if isinstance(name, str) and name.isidentifier()] if isinstance(names, list) else []
+    )
+    return effects[:_MOST_EFFECTS]
 
 
 class RunAgain:
@@ -35,11 +60,7 @@ class RunAgain:
 
     def __init__(self, state: State, products: Products) -> None:
         self._state, self._products = state, products
-        stated = products.provenance.get("parameters", {})
-        self._before = (
-            stated.get("thermography", {}).get("emissivity"),
-            list(stated.get("model", {}).get("declared", [])),
-        )
+        self._before = (_stated_emissivity(products.provenance), _stated_effects(products.provenance))
         self._emissivity = pn.widgets.FloatInput(
             label="Emissivity of the table", value=self._before[0], start=0.01, end=1.0, step=0.01, width=200
         )

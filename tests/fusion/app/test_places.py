@@ -39,6 +39,11 @@ def test_what_is_no_folder_is_refused(root: Path) -> None:
             folder_within(root, written)
     with pytest.raises(PlaceError, match="no zero byte"):
         place_within(root, "a\0b")
+    (root / "itself").symlink_to(root / "itself")
+    for written, reason in (("x" * 5000, "File name too long"), ("itself/x", "Symlink loop|symbolic links")):
+        with pytest.raises(PlaceError, match=f"{reason}.*; type another path") as error:
+            folder_within(root, written)
+        assert len(str(error.value)) < 600
 
 
 @pytest.mark.parametrize("written", ["", ".", "..", ".bashrc", "a/b", "a\\b", "C:x", "a\nb", "/etc/passwd"])

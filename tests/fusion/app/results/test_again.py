@@ -42,3 +42,23 @@ def test_a_file_outside_the_folder_is_not_changed(form: tuple[State, RunAgain], 
     products.provenance = {"campaign_file": "../../elsewhere/campaign.toml", "parameters": {}}
     elsewhere = State(root=state.root, results=state.results)
     assert "is not in the folder of the application" in texts([RunAgain(elsewhere, products).view])
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        [],
+        None,
+        {"thermography": [], "model": 5},
+        {"thermography": {"emissivity": "0.9"}, "model": {"declared": 5}},
+        {"thermography": {"emissivity": -5}, "model": {"declared": [1, [2], "<img src=x>"]}},
+        {"thermography": {"emissivity": 1e400}, "model": {"declared": {"a": 1}}},
+    ],
+)
+def test_parameters_that_no_run_wrote_are_left_empty(form: tuple[State, RunAgain], parameters: object) -> None:
+    state, _ = form
+    products = Products(state.results)
+    products.provenance = {"campaign_file": "x" * 5000, "parameters": parameters}
+    view = RunAgain(state, products).view
+    assert [one.value for one in view.select(pn.widgets.FloatInput)] == [None]
+    assert [one.value for one in view.select(pn.widgets.CheckBoxGroup)] == [[]]
