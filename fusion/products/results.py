@@ -70,6 +70,10 @@ __all__ = [
 ]
 
 SCHEMA_VERSION = 2
+#: Faults of a file of which the first is named: each one that is written out takes a kilobyte.
+_MOST_FAULTS = 1_000
+#: Characters of the place of a fault: a key may be as long as the file.
+_LONGEST_PLACE = 200
 
 
 class ResultsError(FusionError):
@@ -216,12 +220,14 @@ def _foreign(path: Path, fault: str) -> ResultsError:
 
 def _first_fault(error: ValidationError) -> str:
     """Return the first fault with its place in the file, and how many there are."""
-    first = error.errors()[0]
+    if error.error_count() > _MOST_FAULTS:
+        return f"{error.error_count()} values are not what they should be"
+    first = error.errors(include_url=False, include_context=False, include_input=False)[0]
     # The tag that a loop was told apart by follows its key and is no place in the file.
     keys = [key for level, key in enumerate(first["loc"]) if not (level == 1 and first["loc"][0] == "loop")]
     place = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys).removeprefix(".")
     others = error.error_count() - 1
-    return f"{place}: {first['msg']}" + (f", and {others} more" if others else "")
+    return f"{place[:_LONGEST_PLACE]}: {first['msg']}" + (f", and {others} more" if others else "")
 
 
 def results_schema() -> dict[str, Any]:

@@ -190,3 +190,39 @@ def test_the_serial_test_looks_along_the_cycles():
     rng = np.random.default_rng(2)
     assert serial_p_value(residual_of(staircase), rng) == 1 / 500
     assert serial_p_value(residual_of(np.tile([1.0, -1.0], (2, CYCLES // 2))), rng) == 1.0
+
+
+def test_the_typical_scatter_is_taken_along_the_cycles_of_each_target():
+    """Of three sound targets at -1, 0, 1 the medians along the cycles are 1, 2, 9; the medians of the cycles would be 2, 9, 2, 9, 3."""
+    design = np.column_stack([np.ones(4), [-1.0, 0.0, 1.0, 0.0]])
+    kept = np.array([1.0, 4.0, 1.0]) / 6.0
+    sizes = np.array([[1.0, 2.0, 9.0], [1.0, 9.0, 9.0], [1.0, 2.0, 9.0], [9.0, 9.0, 3.0], [9.0, 2.0, 3.0]])
+    residuals = np.full((5, 1, 4), 7.0)
+    residuals[:, 0, :3] = np.sqrt(kept) * sizes
+    sound = np.array([True, True, True, False])
+    assert module._typical_scatter(residuals, design, sound, 3) == pytest.approx(1.4826 * 2.0 * np.sqrt(4.0 / 3.0))
+
+
+def test_what_one_direction_gains_in_the_other_is_known_without_a_walk(rng):
+    """Alternating series leave no walk: sizes are plain projections, and each gains half its freedom times the logarithm of its squares."""
+    alternating, other = np.tile([1.0, -1.0], CYCLES // 2), np.tile([1.0, 1.0, -1.0, -1.0], CYCLES // 4)
+    sides = np.array([1.0 * alternating + 0.2 * other, 0.5 * alternating - 0.4 * other])
+    fit = fit_profile(residual_of(sides), alternating[:, None], rng)
+    assert fit.by_direction == pytest.approx((1.0, 0.5), rel=1e-3)
+    positive = np.log((1.0 + 0.2**2) / (0.5**2 + 0.2**2))
+    negative = np.log((0.5**2 + 0.4**2) / (0.5**2 + 0.4**2))
+    assert fit.hold_out_gain == pytest.approx(0.5 * (CYCLES - 1) * (positive + negative), rel=1e-3)
+
+
+def test_a_target_that_the_camera_saw_in_too_few_frames_has_no_temperature(rng):
+    fused = odd_position("structural", rng, rms_um=0.0)
+    seen = np.full((40, fused.sizes["target"]), np.nan)
+    seen[: module.MIN_CYCLES - 1, 2] = 1.0
+    seen[: module.MIN_CYCLES, 3] = 2.0
+    times = fused["time"].values.min() + np.arange(40) * np.timedelta64(60, "s")
+    fused = fused.drop_vars("local_rise_series", errors="ignore").drop_dims("frame_time", errors="ignore")
+    fused = fused.assign(local_rise_series=(("frame_time", "target"), seen)).assign_coords(frame_time=times)
+    assert local_residuals(fused, 3, {3, 4}).temperature is None
+    seconds, rise = local_residuals(fused, 4, {3, 4}).temperature
+    np.testing.assert_allclose(seconds, 60.0 * np.arange(module.MIN_CYCLES))
+    assert rise.tolist() == [2.0] * module.MIN_CYCLES

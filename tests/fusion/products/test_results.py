@@ -119,3 +119,15 @@ def test_several_faults_are_counted_after_the_first(tmp_path: Path) -> None:
     (tmp_path / "results.json").write_text(json.dumps(document))
     with pytest.raises(ResultsError, match=r"\(anomalies\[0\].cause: Input should be .*, and 1 more\)"):
         read_results(tmp_path)
+
+
+def test_very_many_faults_are_counted_alone_and_long_places_are_cut(tmp_path: Path) -> None:
+    """Written out, each of a million faults would take a kilobyte."""
+    document = {"schema": 2, "campaign": "A", "warnings": [1] * 2_000}
+    (tmp_path / "results.json").write_text(json.dumps(document))
+    with pytest.raises(ResultsError, match=r"\(2000 values are not what they should be\); run the campaign again"):
+        read_results(tmp_path)
+    (tmp_path / "results.json").write_text(json.dumps({**document, "warnings": [], "k" * 5_000: 1}))
+    with pytest.raises(ResultsError, match=r"\(k{200}: Extra inputs") as caught:
+        read_results(tmp_path)
+    assert len(str(caught.value)) < 600

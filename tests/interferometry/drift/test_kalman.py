@@ -64,6 +64,28 @@ def test_the_smoother_of_two_readings_of_a_random_walk() -> None:
     np.testing.assert_allclose(D, [1.0, 0.5])
 
 
+@pytest.mark.parametrize(("order", "components"), [(1, 1), (1, 2), (2, 1), (2, 2), (2, 3)])
+def test_readings_are_whitened_in_parts_as_their_innovations_over_their_deviations(
+    rng: np.random.Generator, order: int, components: int
+) -> None:
+    n = 9
+    seconds, loadings, columns = (
+        np.sort(rng.uniform(0, 9, n)),
+        rng.normal(size=(n, components)),
+        rng.normal(size=(n, 3)),
+    )
+    gains, innovation_variances, _ = kalman.filter_covariance(
+        seconds, loadings, order, rng.uniform(0.1, 0.3, components), np.ones(n), np.ones(n), np.ones(n, bool), False
+    )
+    innovations, _ = kalman.filter_columns(seconds, loadings, order, gains, columns, False)
+    rows, state = columns.copy(), np.zeros((components * order, 3))
+    for first, last in ((0, 4), (4, n)):
+        kalman.whiten_rows(
+            seconds, loadings, order, gains, np.sqrt(innovation_variances), first, state, rows[first:last]
+        )
+    np.testing.assert_allclose(rows, innovations / np.sqrt(innovation_variances)[:, None], rtol=1e-12)
+
+
 def test_normal_equations_are_those_of_the_innovations(rng: np.random.Generator) -> None:
     n = 11
     seconds, loadings = np.sort(rng.uniform(0, 9, n)), rng.normal(size=(n, 2))
