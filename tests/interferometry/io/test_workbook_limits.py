@@ -97,6 +97,21 @@ def test_a_sheet_is_found_wherever_it_begins_in_its_part(tmp_path: Path, before:
     assert "take more than 200 million characters" in refused(path, content)
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be"])
+def test_xml_in_utf_16_is_counted_like_other_xml(tmp_path: Path, encoding: str) -> None:
+    """The reader of records takes it: a far cell in five kilobytes would fill 4 GB."""
+    path = tmp_path / "laser.xlsx"
+
+    def written(rows: str) -> io.BytesIO:
+        text = f'<?xml version="1.0" encoding="UTF-16"?><worksheet><sheetData>{rows}</sheetData></worksheet>'
+        return io.BytesIO(archive_of(path, **{"xl/worksheets/sheet1.xml": text.encode(encoding)}))
+
+    near = '<row r="1"><c r="A1" t="str"><v>Größe 漢字</v></c></row>'
+    refuse_bomb(path, written(near))
+    with pytest.raises(LaserFormatError, match="its cells reach at least row 1048576 and column 16384"):
+        refuse_bomb(path, written(near + '<row r="1048576"><c r="XFD1048576"><v>1</v></c></row>'))
+
+
 def test_a_tag_that_does_not_end_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "laser.xlsx"
     content = archive_of(path, sheet1=f"<sheetData><c {' ' * 5_000_000}r='XFD1048576'><v>1</v></c></sheetData>")
