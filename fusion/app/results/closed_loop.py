@@ -10,6 +10,7 @@ from fusion.app.results.charts import shown
 from fusion.app.results.products import Products
 from fusion.app.results.selection import CYCLE, POSITION, Linker
 from fusion.products.results_loop import AxisLoop, RecordLoop
+from fusion.products.store import DamagedProductError
 from fusion.report.charts.drift import cycle_map
 from fusion.report.charts.style import Chart
 from fusion.report.conclusions.actions import next_steps
@@ -65,6 +66,8 @@ def loop_steps(products: Products, linker: Linker) -> list[pn.viewable.Viewable]
         return [*parts, *_record_parts(products, loop)]
     assert isinstance(loop, AxisLoop)
     stored = products.loop
+    if stored is not None:
+        _require_same_run(products, loop, stored)
     parts += _step_parts(products, loop, stored, linker)
     parts += [
         heading("The model in numbers", level=3),
@@ -75,6 +78,18 @@ def loop_steps(products: Products, linker: Linker) -> list[pn.viewable.Viewable]
         ),
     ]
     return [*parts, *_next(products)]
+
+
+def _require_same_run(products: Products, loop: AxisLoop, stored: xr.Dataset) -> None:
+    """Refuse a fusion.nc whose last effects are not the steps of results.json."""
+    # An effect that entered more than once has its place behind its name.
+    kept = [str(name).split(" ")[0] for name in stored["effect"].values]
+    steps = [step.effect for step in loop.steps]
+    if len(kept) < len(steps) or kept[len(kept) - len(steps) :] != steps:
+        raise DamagedProductError(
+            f"{products.folder / 'fusion.nc'}: its effects are not the steps of results.json; put the files of one run back, or run the "
+            "campaign again"
+        )
 
 
 def _next(products: Products) -> list[pn.viewable.Viewable]:

@@ -10,6 +10,7 @@ from fusion.app.results.closed_loop import effects_left, loop_steps, table_of
 from fusion.app.results.products import Products
 from fusion.app.results.selection import Linker, Selection
 from fusion.products.results import AxisLoop
+from fusion.products.store import DamagedProductError
 from fusion.report.tables import table
 from tests.fusion.app.texts import texts
 
@@ -62,3 +63,13 @@ def test_without_a_model_it_says_so(products: Products) -> None:
 def test_text_of_a_table_is_never_markup() -> None:
     shown = table_of(table(["a", "b"], [["<b>x</b>", "1"]]), "<i>caption</i>")
     assert "<b>x" not in shown.object and "&lt;b&gt;x" in shown.object and "<i>" not in shown.object
+
+
+def test_steps_of_another_run_are_refused(products: Products) -> None:
+    loop = products.results.loop
+    assert isinstance(loop, AxisLoop) and loop.steps
+    other = Products(products.folder)
+    for steps in (loop.steps * 20, (loop.steps[0].model_copy(update={"effect": "dead_path"}),)):
+        other.results = products.results.model_copy(update={"loop": loop.model_copy(update={"steps": steps})})
+        with pytest.raises(DamagedProductError, match=r"fusion\.nc: its effects are not the steps of results\.json"):
+            parts_of(other)
