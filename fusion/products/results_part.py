@@ -5,7 +5,11 @@ A number is None (``null`` in the file) where the data do not determine it.
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+from datetime import datetime
+from typing import Annotated
+from zoneinfo import ZoneInfo
+
+from pydantic import AfterValidator, BaseModel, ConfigDict
 
 Number = float | None
 
@@ -75,12 +79,32 @@ class PixelAreaPart(ResultPart):
     """Largest y, px."""
 
 
+def _of_time(text: str) -> str:
+    try:
+        datetime.fromisoformat(text)
+    except ValueError:
+        raise ValueError("no time by ISO 8601") from None
+    return text
+
+
+def _known_zone(name: str) -> str:
+    try:
+        ZoneInfo(name)
+    # Also a name that is too long for a file, or leads out of the data base.
+    except (LookupError, ValueError, OSError):
+        raise ValueError("no zone of the IANA data base") from None
+    return name
+
+
+TimeText = Annotated[str, AfterValidator(_of_time)]
+
+
 class TimePart(ResultPart):
     """When the readings were taken."""
 
-    first: str
+    first: TimeText
     """Time of the first reading, UTC."""
-    last: str
+    last: TimeText
     """Time of the last reading, UTC."""
-    zone: str | None
+    zone: Annotated[str, AfterValidator(_known_zone)] | None
     """Zone that the campaign states, by its name in the IANA data base; null where it states none."""

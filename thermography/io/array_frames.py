@@ -27,6 +27,8 @@ _UNITS = {
 _NUMBERS = "fiu"
 #: Variables that a message names.
 _NAMED = 5
+#: Characters of what a library says.
+_LONGEST_WORDS = 500
 #: Files that a Zarr store of version 3 or 2 begins with; each stands for the whole store.
 _ZARR_METADATA = ("zarr.json", ".zgroup")
 
@@ -205,7 +207,7 @@ class NetcdfReader(TemperatureReader):
                 else xr.open_dataset(store, engine="h5netcdf", phony_dims="access")
             )
         except Exception as error:
-            raise ThermographyError(f"{path}: cannot be opened ({error}); write it again") from None
+            raise ThermographyError(f"{path}: cannot be opened ({_words(error)}); write it again") from None
         with dataset:
             stacks = [name for name, values in dataset.data_vars.items() if values.ndim == 3]
             name = options.variable if options.variable is not None else stacks[0] if len(stacks) == 1 else None
@@ -262,7 +264,13 @@ class NetcdfReader(TemperatureReader):
             try:
                 return np.asarray(values[index].values)
             except Exception as error:
-                raise ThermographyError(f"{path}: frame {index} is damaged ({error}); write it again") from None
+                raise ThermographyError(f"{path}: frame {index} is damaged ({_words(error)}); write it again") from None
+
+
+def _words(error: Exception) -> str:
+    """Return what a library says of a store: it may repeat an attribute that is as long as the store."""
+    text = str(error)
+    return text if len(text) <= _LONGEST_WORDS else f"{text[:_LONGEST_WORDS]}..."
 
 
 def _first(names: list[Any]) -> str:

@@ -40,7 +40,8 @@ class _Sectors:
 
     def chain(self, first: int) -> bytes:
         """Return the sectors of a chain; one that comes back to itself, or leaves the file, is refused."""
-        number, most, parts = first, len(self.content) // self.size + 1, []
+        number, most = first, len(self.content) // self.size + 1
+        parts: list[bytes] = []
         while number != _END:
             if number >= self.table.size or number * self.size >= len(self.content):
                 raise CompoundFileError(f"sector {number} is not in the file")

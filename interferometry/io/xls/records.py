@@ -83,7 +83,8 @@ def guarded_workbook(path: Path, content: bytes) -> bytes:
 
 def _count(path: Path, extent: Extent, stream: bytearray) -> None:
     """Count texts and cells of all sheets, and take the stated sizes out of them."""
-    sheets, texts = [], []
+    sheets: list[int] = []
+    texts: list[tuple[int, int]] = []
     for kind, begin, length in _records(stream, 0):
         if kind == _SHEET:
             sheets.append(struct.unpack_from("<I", stream, begin)[0])

@@ -131,3 +131,17 @@ def test_very_many_faults_are_counted_alone_and_long_places_are_cut(tmp_path: Pa
     with pytest.raises(ResultsError, match=r"\(k{200}: Extra inputs") as caught:
         read_results(tmp_path)
     assert len(str(caught.value)) < 600
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("zone", "x"), ("zone", "../../etc/passwd"), ("zone", "x" * 5_000), ("first", "today"), ("last", "99999-99-99")],
+)
+def test_times_and_zones_that_are_none_are_refused(tmp_path: Path, key: str, value: str) -> None:
+    """The report writes times of day in that zone."""
+    time = {"first": "2026-03-09T06:30:00Z", "last": "2026-03-09T16:30:00Z", "zone": "Europe/Berlin"}
+    document = {"schema": 2, "campaign": "A", "warnings": [], "time": time}
+    assert Results.model_validate(document).time is not None
+    (tmp_path / "results.json").write_text(json.dumps({**document, "time": {**time, key: value}}))
+    with pytest.raises(ResultsError, match=rf"\(time\.{key}: "):
+        read_results(tmp_path)

@@ -141,3 +141,12 @@ def test_of_many_variables_a_message_names_some(tmp_path: Path) -> None:
             file.create_dataset(f"v{number}", (3, 4, 5), "f4")
     with pytest.raises(StackError, match="the variables v0, v1, v2, v3, v4 and 3 more over three dimensions"):
         describe_stack(tmp_path / "a.nc")
+
+
+def test_what_a_library_says_of_a_long_attribute_is_cut(tmp_path: Path) -> None:
+    time = xr.DataArray(np.arange(3), dims="time", attrs={"units": "days since 2026-01-01", "calendar": "x" * 50_000})
+    values = xr.DataArray(np.zeros((3, 4, 5)), dims=("time", "y", "x"), coords={"time": time})
+    values.to_dataset(name="temperature").to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    with pytest.raises(ThermographyError, match=r"cannot be opened .*xxx.*; write it again") as error:
+        describe_stack(tmp_path / "a.nc")
+    assert len(str(error.value)) < 1_000
