@@ -10,6 +10,8 @@ if TYPE_CHECKING:
 
 #: A dataset of more bytes than that, and than so many times those of its file, was not written: deflate packs by 1032 at most.
 _LARGE_BYTES, _MOST_PACKED = 1_000_000_000, 1_100
+#: Datasets and groups of a file: the products of a run have up to 150, and each costs a reader a millisecond whenever it opens the file.
+MOST_OBJECTS = 1_000
 
 
 def hdf5_fault(path: Path) -> str:
@@ -24,7 +26,7 @@ def hdf5_fault(path: Path) -> str:
     -------
     str
         That the values of a dataset stand in another file (external storage, a virtual dataset, a link), or were never written and
-        would be made up by the library in any number.
+        would be made up by the library in any number, or that there are very many datasets.
 
     Raises
     ------
@@ -38,12 +40,16 @@ def hdf5_fault(path: Path) -> str:
     # Loaded with the first such file: a finished run is recognised without it.
     import h5py
 
-    size = path.stat().st_size
+    size, objects = path.stat().st_size, 0
 
     def of_link(name: str, found: Any) -> str | None:
         return f"{name} stands in another file" if isinstance(found, h5py.ExternalLink) else None
 
     def of_object(name: str, found: Any) -> str | None:
+        nonlocal objects
+        objects += 1
+        if objects > MOST_OBJECTS:
+            return f"it holds more than {MOST_OBJECTS} datasets and groups"
         return _dataset_fault(name, found, size) if isinstance(found, h5py.Dataset) else None
 
     with h5py.File(path) as file:

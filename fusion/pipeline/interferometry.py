@@ -79,7 +79,7 @@ def evaluate_interferometry(source: LaserInputs, *, report: Report = silent) -> 
         parts["time"] = {"first": utc(times.min()), "last": utc(times.max()), "zone": zone}
         parts["drift"] = _drift_part(deviations, drift)
     report(LABELS["deviations"], 1, 1)
-    return Outcome(dataset, parts, tuple(_reading_notices(deviations, drift, zone)))
+    return Outcome(dataset, parts, (*_scatter_notices(drift), *_reading_notices(deviations, drift, zone)))
 
 
 def utc(time: np.datetime64) -> str:
@@ -124,6 +124,23 @@ def _approach_notices(deviations: xr.Dataset) -> list[Notice]:
             f"Positions were approached in the {sides[0]} direction only: unidirectional values are given; reversal error, bidirectional "
             "values and the drift of the reversal need both.",
             "Approach every position from both sides.",
+        )
+    ]
+
+
+def _scatter_notices(drift: xr.Dataset | None) -> list[Notice]:
+    """Return the notice that the drift between readings hides their noise."""
+    if drift is None or not drift.attrs["scatter_undetermined"]:
+        return []
+    sigma = float(drift["sigma"])
+    return [
+        Notice(
+            "scatter_undetermined",
+            "The drift from one reading to the next is so large that the noise of the readings vanishes beside it: the search for the "
+            f"variances ended at its limit. The scatter of {sigma:.2g} µm is that limit, not a measured value, and the true one may be "
+            "far smaller; uncertainties, outliers and positions that stand out rest on it.",
+            "Let the machine come to rest before the test, or read the positions in quicker succession; check whether the readings were "
+            "averaged or smoothed before they were written.",
         )
     ]
 

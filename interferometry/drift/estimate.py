@@ -96,7 +96,8 @@ def estimate_drift(
           ``drift_share`` (component, direction, target; 1): its share in a reading.
         - ``noise`` (cycle, direction, target): estimated random part of each reading. ``standardised`` (1): its deletion
           residual in standard deviations, infinite for a gross outlier.
-        - ``attrs``: ``state``, ``order``, ``log_likelihood`` (restricted).
+        - ``attrs``: ``state``, ``order``, ``log_likelihood`` (restricted); ``scatter_undetermined``: 1 where the noise vanishes beside the
+          drift between readings, so that ``sigma`` and ``scatter`` are what the search for the variances was limited to, 0 elsewhere.
 
     Raises
     ------
@@ -498,7 +499,12 @@ def _describe(deviations: xr.Dataset, joint: JointFit, state: str | float) -> xr
         },
         coords={**{name: deviations[name].values for name in DIMS}, "component": list(joint.components)},
     )
-    result.attrs.update(state=str(state), order=int(fit.system.order), log_likelihood=fit.log_likelihood)
+    result.attrs.update(
+        state=str(state),
+        order=int(fit.system.order),
+        log_likelihood=fit.log_likelihood,
+        scatter_undetermined=int(fit.noise_at_limit),
+    )
     return result
 
 

@@ -43,6 +43,8 @@ from interferometry.drift.state_space import (
 #: noise of one reading: from a drift far below the noise to one that hides everything else. A random walk that is a hundred times the noise
 #: passes for noise itself; an integrated one stays smooth, and a good laser reads 10 nm beside 100 um of drift.
 _LOG_RATIO_LIMITS: dict[Order, tuple[float, float]] = {1: (-14.0, 4.0), 2: (-14.0, 8.0)}
+#: A search that comes as near as this to a limit, decades, ended there: twice the accuracy of the search.
+_AT_LIMIT = 0.06
 #: Edge of the first simplex, decades.
 _FIRST_STEP = 1.5
 #: A reading whose deletion residual exceeds this many standard deviations is down-weighted (robust fit).
@@ -109,6 +111,12 @@ class DriftFit:
     def coefficients_u(self) -> Array:
         """Standard uncertainty of the coefficients, (p,)."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def noise_at_limit(self) -> bool:
+        """Whether a drift hides the noise: its variance ended at the upper limit of the search, which then is what `sigma` rests on."""
+        log_ratio = np.log10(np.maximum(self.system.ratios, 1e-300)) - _log_ratio_unit(self.system)
+        return bool((log_ratio >= _LOG_RATIO_LIMITS[self.system.order][1] - _AT_LIMIT).any())
 
     @property
     def drift_rate(self) -> Array:

@@ -31,6 +31,9 @@ def written(path: Path, kind: str) -> Path:
             file["deep/temperature"] = h5py.ExternalLink(str(secret), "/x")
         elif kind == "sparse":
             file.create_dataset("temperature", (1 << 20, 480, 640), "f4", chunks=(1, 480, 640))
+        elif kind == "many":
+            for number in range(1_000):
+                file.create_group(f"g{number}")
         elif kind == "circle":
             file["deep/er/again"] = file["deep"]
             file["temperature"] = np.full(SHAPE, 20.0)
@@ -44,6 +47,7 @@ def written(path: Path, kind: str) -> Path:
         ("virtual", "the values of temperature stand in another file"),
         ("link", "deep/temperature stands in another file"),
         ("sparse", "temperature states 1.29e+03 GB, which a file of"),
+        ("many", "it holds more than 1000 datasets and groups"),
     ],
 )
 def test_what_the_library_would_read_is_refused(tmp_path: Path, kind: str, told: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -14,7 +15,7 @@ import tifffile
 import xarray as xr
 from numpy.typing import NDArray
 
-from thermography._hdf5 import hdf5_fault
+from thermography._hdf5 import MOST_OBJECTS, hdf5_fault
 from thermography.errors import ThermographyError
 from thermography.io.temperature_frames import StackContents, StackError, StackOptions, TemperatureReader
 
@@ -198,7 +199,7 @@ class NetcdfReader(TemperatureReader):
         try:
             store = path.parent if path.name in _ZARR_METADATA else path
             zarr = store.is_dir()
-            fault = "" if zarr else hdf5_fault(store)
+            fault = _zarr_fault(store) if zarr else hdf5_fault(store)
             if fault:
                 raise ValueError(fault)
             dataset = (
@@ -265,6 +266,13 @@ class NetcdfReader(TemperatureReader):
                 return np.asarray(values[index].values)
             except Exception as error:
                 raise ThermographyError(f"{path}: frame {index} is damaged ({_words(error)}); write it again") from None
+
+
+def _zarr_fault(store: Path) -> str:
+    """Return why a Zarr store is not opened: each of its arrays costs the library milliseconds whenever that is done."""
+    with os.scandir(store) as entries:
+        count = sum(1 for entry in entries if entry.is_dir())
+    return f"it holds more than {MOST_OBJECTS} arrays and groups" if count > MOST_OBJECTS else ""
 
 
 def _words(error: Exception) -> str:

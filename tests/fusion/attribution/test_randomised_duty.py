@@ -157,3 +157,26 @@ def test_a_dwell_is_counted_from_change_to_change_within_two_steps_of_the_log():
         module._check_law("speed", seconds, ((seconds >= 1800.0) & (seconds < 2220.0)).astype(float), law)
     # A change in the last step of the log is one.
     module._check_law("speed", seconds, (seconds == seconds[-1]).astype(float), law)
+
+
+def test_responses_are_those_of_bodies_of_the_stated_time_constants():
+    """After a switch a body follows 1 - exp(-t / a); one of b behind it 1 - (a exp(-t / a) - b exp(-t / b)) / (a - b)."""
+    seconds = np.arange(0.0, 20_000.0, 1.0)
+    switched = duty_responses(seconds, np.where(seconds > 0, 1.0, 0.0)[:, None])[:, 0]
+    after = seconds[:, None]
+    first = np.array([600.0, 1800.0, 3600.0, 7200.0])
+    # Between two samples the duty changes within a second, 1/600 of the shortest time constant.
+    np.testing.assert_allclose(switched[:, :4], 1.0 - np.exp(-after / first), atol=1e-3)
+    behind = first[[0, 2, 3]]
+    expected = 1.0 - (behind * np.exp(-after / behind) - 1800.0 * np.exp(-after / 1800.0)) / (behind - 1800.0)
+    np.testing.assert_allclose(switched[:, [4, 6, 7]], expected, atol=1e-3)
+    np.testing.assert_allclose(switched[:, 5], 1.0 - (1.0 + seconds / 1800.0) * np.exp(-seconds / 1800.0), atol=1e-3)
+
+
+def test_every_column_is_held_to_the_law(rng):
+    """The first keeps it, the second is switched every minute."""
+    both = logged(rng)
+    both["load"] = ("time", 1.0 * (np.arange(FINE.size) % 2))
+    assert read_duty(both, ["speed"], DutyLaw(1800.0, 300.0)).sizes["source"] == 1
+    with pytest.raises(RandomisationError, match="load was switched again after"):
+        read_duty(both, ["speed", "load"], DutyLaw(1800.0, 300.0))

@@ -10,7 +10,12 @@ import pytest
 from fusion.campaign.config import load_campaign
 from fusion.campaign.inputs import read_source
 from fusion.pipeline.interferometry import align_recordings, by_direction, evaluate_interferometry
+from fusion.products.results import Notice
 from fusion.products.store import read_dataset
+from fusion.twin import simulate
+from fusion.twin.recipe_file import read_recipe
+from fusion.twin.truth import deviations_of
+from interferometry.drift.estimate import estimate_drift
 
 
 def test_gaps_and_outliers_are_noted_with_what_they_cost(copied: Path) -> None:
@@ -45,6 +50,34 @@ def test_parts_agree_with_the_product(campaign_folder: Path) -> None:
     np.testing.assert_allclose(drift["range_um"], course.max("cycle") - course.min("cycle"))
     assert all(0.0 < u < one for u, one in zip(drift["range_u_um"], drift["range_um"], strict=True))
     assert drift["position_mm"] == outcome.dataset["position"].values.tolist()
+
+
+def test_a_scatter_that_the_drift_hides_is_named_and_no_other(copied: Path) -> None:
+    assert not any(notice.code == "scatter_undetermined" for notice in notices_of(copied))
+    head, *lines = (copied / "laser.csv").read_text().splitlines()
+    column = head.split(",").index("deviation_um")
+    rows = sorted((line.split(",") for line in lines), key=lambda row: row[head.split(",").index("time")])
+    walk = np.cumsum(np.random.default_rng(3).normal(0.0, 1.0, len(rows)))
+    noise = np.random.default_rng(4).normal(0.0, 1e-4, len(rows))
+    for row, value in zip(rows, walk + noise, strict=True):
+        row[column] = f"{value:.6f}"
+    (copied / "laser.csv").write_text("\n".join([head, *(",".join(row) for row in rows)]) + "\n")
+    (notice,) = [one for one in notices_of(copied) if one.code == "scatter_undetermined"]
+    assert "the search for the variances ended at its limit. The scatter of " in notice.message
+    assert notice.remedy.startswith(
+        "Let the machine come to rest before the test, or read the positions in quicker succession"
+    )
+
+
+def test_the_scatter_of_the_demo_is_determined_also_with_a_quieter_laser() -> None:
+    recipe = read_recipe(Path("data/demo.toml"))
+    for noise_um in (recipe.laser.noise_um, 0.1):
+        estimated = estimate_drift(deviations_of(simulate(recipe.vary(laser={"noise_um": noise_um}))))
+        assert estimated.attrs["scatter_undetermined"] == 0
+
+
+def notices_of(campaign: Path) -> tuple[Notice, ...]:
+    return evaluate_interferometry(read_source(load_campaign(campaign / "campaign.toml"))).notices
 
 
 def test_readings_outside_the_frames_are_counted(campaign_folder: Path, results_folder: Path) -> None:

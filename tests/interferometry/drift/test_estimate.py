@@ -308,3 +308,24 @@ def test_a_scatter_that_a_restless_drift_leaves_nothing_of_has_an_uncertainty(rn
     assert (scatter == 0.0).any()
     assert (scatter_u[np.isfinite(scatter)] > 0.0).all()
     assert np.isnan(scatter_u[np.isnan(scatter)]).all()
+
+
+def with_walk(rng: np.random.Generator, *, sigma: float, between_um: float) -> xr.Dataset:
+    """A test whose drift is a walk of so many um from reading to reading, beside noise of sigma."""
+    deviations, _ = simulate(rng, kind="none", cycles=12, sigma=sigma)
+    order = np.argsort(deviations["time"].values, axis=None)
+    walk = np.empty(order.size)
+    walk[order] = np.cumsum(rng.normal(0, between_um, order.size))
+    return deviations.assign(deviation=deviations["deviation"] + walk.reshape(deviations["deviation"].shape))
+
+
+def test_noise_that_vanishes_beside_the_drift_between_readings_is_not_determined(rng: np.random.Generator) -> None:
+    """1 um from reading to reading beside 0.0001 um of noise; with 0.4 um of noise, or none of the drift, the noise is found."""
+    hidden = estimate_drift(with_walk(rng, sigma=1e-4, between_um=1.0))
+    assert hidden.attrs["scatter_undetermined"] == 1
+    # What is stated is the limit of the search: a hundredth of what the walk grows by in an hour, some 20 um.
+    assert float(hidden["sigma"]) > 100 * 1e-4
+    for sigma, between_um in ((0.4, 1.0), (0.1, 0.1), (0.4, 0.0)):
+        found = estimate_drift(with_walk(rng, sigma=sigma, between_um=between_um))
+        assert found.attrs["scatter_undetermined"] == 0
+        assert float(found["sigma"]) == pytest.approx(sigma, rel=0.25)

@@ -419,7 +419,7 @@ def _zarr_of_one() -> Iterator[tuple[str, Write]]:
         "zarr 2: attributes of values",
         partial(zarr_store, 2, metadata("temperature/.zattrs", units=["degC"], scale_factor="x", _FillValue={})),
     )
-    yield "zarr 2: 1,000 arrays", partial(zarr_store, 2, partial(_copies, 1_000))
+    yield "zarr 2: 1,200 arrays", partial(zarr_store, 2, partial(_copies, 1_200))
 
 
 def _copies(count: int, path: Path) -> None:

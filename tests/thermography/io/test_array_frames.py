@@ -150,3 +150,14 @@ def test_what_a_library_says_of_a_long_attribute_is_cut(tmp_path: Path) -> None:
     with pytest.raises(ThermographyError, match=r"cannot be opened .*xxx.*; write it again") as error:
         describe_stack(tmp_path / "a.nc")
     assert len(str(error.value)) < 1_000
+
+
+def test_a_zarr_store_of_very_many_arrays_is_not_opened(tmp_path: Path) -> None:
+    xr.DataArray(np.zeros((3, 4, 5)), dims=("time", "y", "x"), name="temperature").to_dataset().to_zarr(
+        tmp_path / "a", consolidated=False, zarr_format=3
+    )
+    describe_stack(tmp_path / "a" / "zarr.json")
+    for number in range(1_000):
+        (tmp_path / "a" / f"v{number}").mkdir()
+    with pytest.raises(ThermographyError, match="it holds more than 1000 arrays and groups"):
+        describe_stack(tmp_path / "a" / "zarr.json")
