@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from interferometry.errors import InterferometryError
+
 MAGIC = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
 #: Entries of the table of sectors: end of a chain, sector of the table itself, free sector.
 _END, _OF_TABLE, _FREE = 0xFFFFFFFE, 0xFFFFFFFD, 0xFFFFFFFF
@@ -26,7 +28,7 @@ _SHORT = 4096
 _Table = NDArray[np.uint32]
 
 
-class CompoundFileError(ValueError):
+class CompoundFileError(InterferometryError):
     """A container that is not what it states; the message says what is wrong."""
 
 

@@ -113,3 +113,23 @@ def test_there_are_400_permutations_some_at_a_time(monkeypatch, rng):
         assert [len(one) for one in some] == sizes
         rows = np.concatenate(some)
         assert (np.sort(rows, axis=1) == values).all() and len(np.unique(rows, axis=0)) > 390
+
+
+class EnoughSeenError(Exception):
+    """Ends an examination once the statistics were asked for."""
+
+
+def test_a_shift_is_sought_over_as_many_readings_as_a_cycle_has(monkeypatch):
+    readings = readings_of(seed=SEED)
+    per_cycle = np.bincount(readings.cycle)
+    (count,) = np.unique(per_cycle[per_cycle > 0])
+    windows = []
+
+    def statistics(series, window, waves):
+        windows.append(window)
+        raise EnoughSeenError
+
+    monkeypatch.setattr(module, "_time_statistics", statistics)
+    with pytest.raises(EnoughSeenError):
+        residual_of()
+    assert windows == [count]
