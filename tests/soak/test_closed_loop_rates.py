@@ -85,7 +85,8 @@ def test_one_missing_effect_is_named(name):
     assert wilson(sum(one.wrong > 0 for one in found), RUNS)[0] <= 0.05
     named = [one.after_over_floor for one in found if one.right]
     # A step before the hold-out is known to the carried drift, and what is found in all cycles has no held-out error.
-    assert not named or np.median(named) <= 1.05
+    # Half of them, as far as so many campaigns can tell, are within 5 % of the error that the truth leaves.
+    assert not named or wilson(sum(error > 1.05 for error in named), len(named))[0] <= 0.5
 
 
 @pytest.mark.parametrize("name", list(LIBRARY))
