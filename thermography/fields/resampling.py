@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, sparse
+from scipy import sparse
 
 from thermography._typing import Array
 from thermography.errors import ThermographyError
@@ -61,7 +61,11 @@ class PlanWeights:
     @cached_property
     def interior(self) -> NDArray[np.bool_]:
         """Pixels of the window whose eight neighbours have a weight too, (row, column)."""
-        return np.asarray(ndimage.binary_erosion(self.used, np.ones((3, 3))))
+        used, interior = self.used, np.zeros_like(self.used)
+        # A tenth of the time of scipy.ndimage.binary_erosion.
+        across = used[:, :-2] & used[:, 1:-1] & used[:, 2:]
+        interior[1:-1, 1:-1] = across[:-2] & across[1:-1] & across[2:]
+        return interior
 
     @cached_property
     def noise_factor(self) -> Array:
@@ -173,7 +177,8 @@ def plan_weights(registration: Registration, grid: PlanGrid, *, margin_px: float
     with np.errstate(invalid="ignore", divide="ignore"):
         offset = moments / seen_area[:, None] - grid.centres_mm.reshape(-1, 2)
     # The pieces are in the order of the pixels, so that a stable sort by cells leaves the columns of every row sorted.
-    order = np.argsort(cell, kind="stable")
+    # Numbers of 16 bits are sorted by counting.
+    order = np.argsort(cell.astype(np.uint16) if cells <= 1 << 16 else cell, kind="stable")
     starts = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=cells))])
     shape = (cells, (window[0].stop - window[0].start) * window[1].stop)
     areas = sparse.csr_array(((area / seen_area[cell])[order], pixel[order], starts), shape=shape)
