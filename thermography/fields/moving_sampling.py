@@ -82,8 +82,9 @@ def sample_points(registration: Registration, grid: PlanGrid, *, margin_px: floa
     across, down = (side.ravel() for side in np.meshgrid(steps, steps))
     centres = grid.centres_mm.reshape(-1, 2)
     points = np.stack([centres[:, :1] + across, centres[:, 1:] + down], axis=-1)
-    to_mm = np.linalg.inv(registration.projection.jacobian(points.reshape(-1, 2)))
-    pixel_mm = np.linalg.norm(to_mm, axis=1).max(axis=1).reshape(points.shape[:2])
+    # The longer side of a pixel on the plan, by the inverse in closed form: a solver called for every point takes twenty times as long.
+    (a, b), (c, d) = np.moveaxis(registration.projection.jacobian(points.reshape(-1, 2)), 0, -1)
+    pixel_mm = (np.sqrt(np.maximum(a * a + b * b, c * c + d * d)) / np.abs(a * d - b * c)).reshape(points.shape[:2])
     edge = np.minimum.reduce(
         [points[..., 0], grid.width_mm - points[..., 0], points[..., 1], grid.height_mm - points[..., 1]]
     )

@@ -1,7 +1,10 @@
 """Weights of a camera that looks straight down at 2 px/mm, where every area is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from tests.thermography.plan_scene import DISCS, GRID, Scene, overhead
 from thermography.errors import ThermographyError
@@ -41,6 +44,16 @@ def test_coverage_counts_the_unmasked_pixels(registration):
     np.testing.assert_allclose(weights.coverage, expected, atol=1e-9)
     sums = np.asarray(weights.areas.sum(axis=1)).ravel()
     np.testing.assert_allclose(sums[weights.coverage.ravel() > 0], 1.0)
+
+
+def test_inner_pixels_have_all_eight_neighbours(registration):
+    weights = plan_weights(registration, PLAN)
+    assert (weights.interior == ndimage.binary_erosion(weights.used, np.ones((3, 3)))).all()
+    assert 0 < weights.interior.sum() < weights.used.sum()
+    for shape in ((1, 9), (9, 2), (3, 3)):
+        narrow = replace(weights)
+        vars(narrow)["used"] = np.ones(shape, bool)
+        assert narrow.interior.sum() == (shape == (3, 3))
 
 
 def test_a_linear_field_is_exact_in_partly_seen_cells_too(registration):
