@@ -60,10 +60,13 @@ class Extent:
         The spreadsheet.
     texts : list of int
         Lengths of the texts that cells share, with the XML around them.
+    empty_cells : int
+        So many cells may be empty, and 50 more for each that is filled.
     """
 
     path: Path
     texts: list[int] = field(default_factory=list)
+    empty_cells: int = _EMPTY_CELLS
     _longest: int = field(default=0, init=False)
     _filled: int = field(default=0, init=False)
     _text: int = field(default=0, init=False)
@@ -91,7 +94,7 @@ class Extent:
     def end(self) -> None:
         """Refuse sheets in which a reader would make very many empty cells, once all are counted."""
         self._end_sheet()
-        if self._before > _EMPTY_CELLS + _EMPTY_PER_FILLED * self._filled:
+        if self._before > self.empty_cells + _EMPTY_PER_FILLED * self._filled:
             self._refuse()
 
     def _end_sheet(self) -> None:

@@ -27,7 +27,9 @@ from fusion.report.terminal import summary_rows
 from fusion.twin.recipe_file import read_recipe
 from interferometry.io.readers import is_environment_log, read_deviations, read_environment
 from interferometry.io.renishaw import read_rtx
+from interferometry.io.xls.compound_file import read_stream, write_stream
 from tests.interferometry import laser_mutations as laser
+from tests.interferometry.io.xls import old_workbooks as xls
 from tests.soak.fuzz.harness import Kind
 from tests.thermography import flir_mutations as flir
 from thermography.errors import ThermographyError
@@ -117,6 +119,24 @@ def damaged_json(data: bytes, rng: np.random.Generator) -> bytes:
 def damaged_archive(data: bytes, rng: np.random.Generator) -> bytes:
     """Damage an archive as bytes, or one of its parts so that the archive remains whole."""
     return flir.mutate(data, rng) if rng.random() < 0.5 else damaged_part(data, rng)
+
+
+def damaged_compound(data: bytes, rng: np.random.Generator) -> bytes:
+    """Damage an old spreadsheet as a file, or the records of its workbook in a whole container."""
+    if rng.random() < 0.5:
+        return flir.mutate(data, rng)
+    return write_stream("Workbook", flir.mutate(read_stream(data, ["Workbook"]), rng))
+
+
+def old_workbook() -> bytes:
+    """Return a table of readings as a spreadsheet of Excel 97, dates as text."""
+    rows = [line.split(",") for line in laser.LONG.strip().splitlines()]
+    words = sorted({cell for row in rows for cell in row})
+    cells = [
+        xls.shared(at, column, words.index(cell)) for at, row in enumerate(rows) for column, cell in enumerate(row)
+    ]
+    table = xls.sheet(xls.size(len(rows), len(rows[0])), *cells)
+    return xls.file_of(table, xls.sheet(*xls.TABLE), texts=xls.shared_texts(*words))
 
 
 def damaged_part(data: bytes, rng: np.random.Generator) -> bytes:
@@ -293,6 +313,7 @@ def kinds_of_inputs(folder: Path) -> list[Kind]:
         Kind("capture.rtx", [laser._rtx()], text, read_rtx),
         Kind("log.dat", [laser.ECMC.encode()], text, read_laser),
         Kind("long.xlsx", [laser._workbook(folder)], damaged_archive, read_laser),
+        Kind("long.xls", [old_workbook()], damaged_compound, read_laser),
         Kind("drivers.csv", [DRIVERS.encode()], text, read_drivers),
         Kind("record.csv", [TABLE.encode()], text, read_damaged_record, 0.5),
         Kind("fiducials.csv", [FIDUCIALS.encode()], text, read_fiducials),

@@ -65,6 +65,11 @@ def test_a_cell_far_from_the_table_is_refused(far: list[bytes], told: str) -> No
     assert told in refused(file_of(sheet(*TABLE, *far)))
 
 
+def test_a_stray_cell_in_the_last_row_is_read_where_that_costs_little() -> None:
+    assert len(read_sheets(PATH, file_of(sheet(*TABLE, number(65_535, 15))))["s0"]) == 6
+    assert "its cells reach row 65536 and column 20, and most" in refused(file_of(sheet(*TABLE, number(65_535, 19))))
+
+
 def test_far_cells_of_several_sheets_add_up() -> None:
     assert "its cells reach at least row 65536 and column 256" in refused(
         file_of(*[sheet(*TABLE, number(65_535, 255))] * 2)
