@@ -11,6 +11,7 @@ ExifTool (P. Harvey, "FLIR Tags").
 from __future__ import annotations
 
 import struct
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -61,6 +62,19 @@ FIRST_SENSOR, SENSOR_SIZE, SENSOR_NAME = 0x47C, 28, (4, 20)
 _LOWEST_K, _HIGHEST_K = 150.0, 450.0
 #: The largest FLIR detectors have 3 million pixels; a file that claims more is damaged or hostile.
 _MAX_PIXELS = 1 << 24
+#: Memory for packed samples until they are decoded, one buffer per thread of up to so many bytes. Fresh memory for them would push what a
+#: frame takes beyond what the C library keeps when it is freed; asking for all of it again costs a seventh of reading a PNG.
+_MOST_ROOM = 1 << 22
+_own = threading.local()
+_NO_ROOM = np.empty(0, np.uint8)
+
+
+def _room(size: int) -> NDArray[np.uint8]:
+    """Memory of this thread, (size,)."""
+    if getattr(_own, "room", _NO_ROOM).size < size:
+        _own.room = np.empty(size, np.uint8)
+    room: NDArray[np.uint8] = _own.room[:size]
+    return room
 
 
 class FffSource:
@@ -104,9 +118,14 @@ class FffSource:
             offset = max(0, offset - available)
         return b"".join(pieces)
 
-    def read_once(self, offset: int, length: int) -> memoryview:
-        """Return `length` bytes from `offset` of the record, or fewer at its end, read to their place without a copy between."""
-        data, filled = memoryview(np.empty(max(0, min(length, self.size - offset)), np.uint8)), 0  # type: ignore[arg-type]
+    def read_once(self, offset: int, length: int, *, kept: bool = True) -> memoryview:
+        """Return `length` bytes from `offset` of the record, or fewer at its end, read to their place without a copy between.
+
+        Bytes that are not to be kept stand in memory of this thread, which the next call overwrites.
+        """
+        size = max(0, min(length, self.size - offset))
+        room = np.empty(size, np.uint8) if kept or size > _MOST_ROOM else _room(size)
+        data, filled = memoryview(room), 0  # type: ignore[arg-type]
         for start, available in self.segments:
             if offset < available and filled < len(data):
                 self.file.seek(start + offset)
@@ -564,11 +583,14 @@ def read_counts(source: FffSource, samples: SampleLocation) -> NDArray[np.uint16
 
 
 def _read_samples(source: FffSource, samples: SampleLocation) -> memoryview:
-    """Return the bytes of the samples, fewer at the end of the record, after comparing the record with its checksum."""
-    offset, length = samples.record
+    """Return the bytes of the samples, fewer at the end of the record, after comparing the record with its checksum.
+
+    Packed ones are overwritten by the next call in this thread.
+    """
+    (offset, length), kept = samples.record, samples.encoding == "raw"
     if not samples.checksum or length > 2 * _MAX_PIXELS:
-        return source.read_once(samples.offset, min(samples.length, 2 * _MAX_PIXELS))
-    record = source.read_once(offset, length)
+        return source.read_once(samples.offset, min(samples.length, 2 * _MAX_PIXELS), kept=kept)
+    record = source.read_once(offset, length, kept=kept)
     # A record without its last padding bytes cannot be compared.
     if len(record) == length and _differs(record, samples.checksum):
         raise source.error(

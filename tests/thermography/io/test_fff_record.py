@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -169,6 +170,20 @@ def test_samples_of_every_encoding_are_equal_and_read_only(tmp_path: Path, encod
     counts = reference.read_counts()
     np.testing.assert_array_equal(counts, written.counts)
     assert counts.dtype == np.uint16 and counts.dtype.isnative and not counts.flags.writeable
+
+
+@pytest.mark.parametrize("encoding", ["raw", "png", "jpegls"])
+def test_a_frame_keeps_its_counts_while_others_are_read(tmp_path: Path, encoding: str) -> None:
+    """Packed samples of every frame pass through the same memory of a thread, those of a larger frame after a smaller one too."""
+    written = [frame(rows, 24, seconds=rows) for rows in (12, 36, 6, 36)]
+    paths = [tmp_path / f"{number}.fff" for number in range(len(written))]
+    for path, each in zip(paths, written, strict=True):
+        write_sequence(path, [each], encoding=encoding)
+    alone = [read_frame(path) for path in paths]
+    with ThreadPoolExecutor(2) as executor:
+        by_threads = list(executor.map(read_frame, paths * 20))
+    for read, each in zip(alone + by_threads, written * 21, strict=True):
+        np.testing.assert_array_equal(read.counts, each.counts)
 
 
 def test_big_endian_samples_are_read_by_their_own_mark(tmp_path: Path) -> None:
