@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
+import thermography.fields.tasks.spool as spool_module
 from fusion.attribution.likelihood_ratio import (
     estimate_effects,
     likelihood_ratios,
@@ -184,3 +185,18 @@ def test_the_unit_of_the_readings_changes_no_likelihood_ratio(problem):
 
     np.testing.assert_allclose(ratios(1e4), ratios(1.0), atol=1e-3)
     np.testing.assert_allclose(ratios(1e-4), ratios(1.0), atol=1e-3)
+
+
+def test_whitenings_in_a_temporary_file_give_the_same_bits(problem, monkeypatch):
+    seconds, values, nuisance, regressors = problem
+    bank = null_bank(values, seconds, np.ones(40), nuisance)
+    draws = np.vstack([values, values[::-1]])
+    at_hand = whiten_series(bank, draws)
+    monkeypatch.setattr(spool_module, "IN_MEMORY_BYTES", 100)
+    in_file = whiten_series(bank, draws)
+    assert isinstance(in_file.projects.base, np.memmap) and isinstance(in_file.series.base, np.memmap)
+    found = likelihood_ratios(bank, in_file, regressors)
+    assert (found == likelihood_ratios(bank, at_hand, regressors)).all()
+    alone, beside = estimate_effects(bank, regressors), estimate_effects(bank, regressors, whitened=in_file)
+    assert (alone.coefficient == beside.coefficient).all() and (alone.coefficient_u == beside.coefficient_u).all()
+    assert (alone.null_u == beside.null_u).all()

@@ -10,7 +10,7 @@ import xarray as xr
 
 from fusion.alignment.align import AxisGeometry, align
 from fusion.alignment.readings import read_fused
-from fusion.consistency.axis_line import LineComparison, compare_lines
+from fusion.consistency.axis_line import LineComparison, _interpolate, compare_lines
 from fusion.consistency.coefficients import check_coefficients
 from fusion.effects.library import library
 from fusion.loop.axis import declare
@@ -134,3 +134,9 @@ def test_without_an_expected_expansion_nothing_is_compared() -> None:
     free = Term(expansion.effect, replace(expansion.candidate, prior=None))
     assert compare_lines(fit_model(readings, [free]), 1, fields, TRUE) is None
     assert compare_lines(fit_model(readings, []), 0, fields, TRUE) is None
+
+
+def test_rows_are_interpolated_between_their_places_and_at_both_ends() -> None:
+    places, known = np.array([-1.0, 0.0, 4.0]), np.array([[2.0, 4.0, 0.0], [0.0, 1.0, 9.0]])
+    found = _interpolate(np.array([-1.0, -0.5, 0.0, 1.0, 4.0]), places, known)
+    np.testing.assert_allclose(found, [[2.0, 3.0, 4.0, 3.0, 0.0], [0.0, 0.5, 1.0, 3.0, 9.0]])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import interferometry.iso230.evaluation as evaluation_module
 from interferometry.io.readers import read_deviations
 from interferometry.iso230 import Iso230Budget, evaluate_iso230, evaluate_windows, settled_window
 from tests.interferometry.iso230.made_tests import by_hand, test_made
@@ -144,6 +145,16 @@ def test_short_tests_and_empty_windows_have_the_windows_that_can_be_evaluated(rn
     x = rng.normal(0, 1, (15, 2, 4))
     x[5:10] = np.nan
     assert evaluate_windows(test_made(x))["window"].values[:2].tolist() == ["cycles 1 to 5", "cycles 11 to 15"]
+
+
+def test_windows_that_are_evaluated_some_at_a_time_are_those_of_all_at_once(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    test = test_made(rng.normal(0, 1, (28, 2, 4)))
+    together = evaluate_windows(test)
+    monkeypatch.setattr(evaluation_module, "_WINDOWS_AT_ONCE", 2)
+    xr.testing.assert_identical(evaluate_windows(test), together)
+    assert together.sizes["window"] == 6
 
 
 def test_windows_show_how_drift_enters_repeatability_and_accuracy(rng: np.random.Generator) -> None:
