@@ -44,7 +44,15 @@ from fusion.loop.decisions import FINAL, Decision, Reason
 from fusion.loop.detectability import detection_limits
 from fusion.loop.restless_drift import refuse_in_restless_drift
 from fusion.loop.result import AddedEffect, LoopResult, declared_coefficients, nuisance_size, report_steps, rmse
-from fusion.loop.scoring import WORTH_CONFIRMING, Families, collect_candidates, of_same_kind, refine, score_effects
+from fusion.loop.scoring import (
+    WORTH_CONFIRMING,
+    Families,
+    collect_candidates,
+    kept_on_disk,
+    of_same_kind,
+    refine,
+    score_effects,
+)
 from fusion.loop.state import Confirmed, HoldOutQuestion, LoopState, Round, Score
 from fusion.loop.verdict import has_skill
 from fusion.model.fit import ModelFit, Term, again, fit_model, refit_fixed, settled
@@ -278,7 +286,7 @@ class AxisProblem:
 
         def offer(name: str) -> list[Candidate]:
             offered = self.effects[name].candidates(self.readings, model.coefficients(), None)
-            return [candidate for candidate in offered if (name, candidate.event_s) not in happened]
+            return list(kept_on_disk(one for one in offered if (name, one.event_s) not in happened))
 
         offers = {name: partial(offer, name) for name in self.effects if name not in not_tried and name not in present}
         families, faults = collect_candidates(offers, self.readings.seconds.size, built_in=_BUILT_IN)

@@ -7,7 +7,7 @@ Equations and error rates: docs/method/closed-loop.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from fusion.loop.decisions import Decision, Reason
 from fusion.loop.parameter_ranges import DERIVED_WORDS, parameter_ranges
 from fusion.loop.state import Score, SearchError
 from fusion.model.null_simulation import critical_gain, sidak, sidak_level, tail_probability
+from thermography.fields.tasks.spool import IN_MEMORY_BYTES, empty_arrays, give_back
 
 #: Effects with a larger family-unaware p-value are not looked at more closely, because they will not enter anyway.
 WORTH_CONFIRMING = 0.1
@@ -81,6 +82,32 @@ def collect_candidates(
     return families, decisions
 
 
+def kept_on_disk(candidates: Iterable[Candidate]) -> Iterator[Candidate]:
+    """Yield the same candidates, their columns in temporary files where many are large: those of a long test fill the memory.
+
+    Parameters
+    ----------
+    candidates : made one after the other, so that few are in memory at a time
+    """
+    held: list[Candidate] = []
+    for candidate in candidates:
+        held.append(candidate)
+        if sum(one.columns.nbytes for one in held if isinstance(one.columns, np.ndarray)) > IN_MEMORY_BYTES:
+            yield from _moved(held)
+            held = []
+    yield from held
+
+
+def _moved(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Candidates with their columns in one temporary file."""
+    dense = {k: one.columns for k, one in enumerate(candidates) if isinstance(one.columns, np.ndarray)}
+    stored = dict(zip(dense, empty_arrays([columns.shape for columns in dense.values()], float), strict=True))
+    for k, columns in dense.items():
+        stored[k][...] = columns
+    give_back(*stored.values())
+    return [replace(one, columns=stored[k]) if k in stored else one for k, one in enumerate(candidates)]
+
+
 def _check_columns(candidates: Sequence[Candidate], rows: int) -> None:
     """Refuse columns that are not one finite number per row."""
     for candidate in candidates:
@@ -89,7 +116,9 @@ def _check_columns(candidates: Sequence[Candidate], rows: int) -> None:
             raise SearchError(f"columns have shape {columns.shape}; expected ({rows}, columns)")
         # Of columns that share courses these are looked at, and all columns only where one is not finite.
         parts = (*map(_made_of, columns.courses), columns.weights) if isinstance(columns, Separable) else (columns,)
-        if not all(np.isfinite(part).all() for part in parts):
+        finite = all(np.isfinite(part).all() for part in parts)
+        give_back(*parts)
+        if not finite:
             not_finite = int((~np.isfinite(np.asarray(columns))).sum())
             raise SearchError(f"{not_finite} values are not finite at {dict(candidate.parameters)}")
         if len(candidate.units) != columns.shape[1]:

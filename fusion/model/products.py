@@ -50,6 +50,11 @@ class Group:
         """Number of columns whose products are summed."""
         return self.width * self.places.size
 
+    @property
+    def stored(self) -> list[Array]:
+        """Columns that may be in temporary files: those that are not multiplied out."""
+        return [one.columns for one in self.candidates if isinstance(one.columns, np.ndarray)]
+
     def columns(self, rows: slice) -> Array:
         """Columns at some readings of the fit, (rows, held): the first of each candidate, then the second of each.
 
@@ -361,6 +366,8 @@ def _sums_over(
                 counted = part[rows]
                 products.add(*((whitened, roots) if counted.all() else (whitened[counted], roots[counted])))
         give_back(*measured)
+        for group in groups:
+            give_back(*group.stored)
     return sums
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusion.effects.effect import Candidate
+import fusion.loop.scoring as scoring_module
+import thermography.fields.tasks.spool as spool_module
+from fusion.effects.effect import Candidate, Separable
 from fusion.loop.decisions import Reason
-from fusion.loop.scoring import Gains, collect_candidates, of_same_kind, refine, score_effects
+from fusion.loop.scoring import Gains, collect_candidates, kept_on_disk, of_same_kind, refine, score_effects
 from fusion.loop.state import Score, SearchError
 from fusion.model.null_simulation import critical_gain, sidak, sidak_level, tail_probability
 
@@ -195,3 +197,18 @@ def test_any_fault_of_a_users_effect_is_recorded():
 
     families, (decision,) = collect_candidates({"own": broken}, 3, built_in=frozenset())
     assert families == {} and decision.sentence.endswith("KeyError: 'no such series'")
+
+
+def test_columns_of_many_candidates_are_kept_on_disk_with_the_same_values(monkeypatch, rng):
+    for module in (scoring_module, spool_module):
+        monkeypatch.setattr(module, "IN_MEMORY_BYTES", 200)
+    steps = Separable((np.arange(8.0),), np.zeros(8, int), np.ones((1, 1)))
+    made = [Candidate(rng.normal(size=(8, 2)), {"place": float(k)}, ("um", "um")) for k in range(5)]
+    made[1:1] = [Candidate(steps, {"place": 9.0}, ("um",))]
+    kept = list(kept_on_disk(iter(made)))
+    assert [one.parameters for one in kept] == [one.parameters for one in made]
+    assert kept[1].columns is steps
+    assert all((np.asarray(one.columns) == np.asarray(own.columns)).all() for one, own in zip(kept, made, strict=True))
+    # Two of 128 bytes at a time; the last is alone.
+    on_disk = [isinstance(getattr(one.columns, "base", None), np.ndarray) for one in kept]
+    assert on_disk == [True, False, True, True, True, False]
