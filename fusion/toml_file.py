@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import tomllib
 from pathlib import Path
@@ -11,6 +12,8 @@ from fusion.errors import FusionError
 
 #: More than any campaign or recipe that a person writes, with thousands of file names listed one by one, bytes.
 _MOST_BYTES = 1_000_000
+#: Files that Linux makes when they are read, some of which wait or never end.
+OF_THE_SYSTEM = ("/proc/", "/sys/")
 #: More levels than any key of a campaign or recipe has: ``table.key`` with lists of lists is four.
 _MOST_LEVELS = 32
 _STRING = r"""(?:"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
@@ -60,6 +63,8 @@ def read_toml(path: Path) -> tuple[dict[str, Any], str]:
     -----
     TOML 1.0, https://toml.io/en/v1.0.0.
     """
+    if os.path.realpath(path).startswith(OF_THE_SYSTEM):
+        raise TomlError("it is a part of the system and no file that was written; name a campaign file or a recipe")
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise TomlError("it is a pipe, a socket or a device; name a file")
     with path.open("rb") as file:

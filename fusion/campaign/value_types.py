@@ -16,13 +16,12 @@ from pydantic_core import PydanticCustomError
 
 from fusion.campaign.messages import suggest
 from fusion.campaign.quantities import QuantityError, read_quantity
+from fusion.toml_file import OF_THE_SYSTEM
 
 #: Folders of a pattern, each of which is searched within the one before.
 _MOST_PARTS = 64
 #: Most files and folders that are looked through for one pattern: a test of 10,000 cycles with 100 frames in each.
 _MOST_SEARCHED = 1_000_000
-#: Files that Linux makes when they are read, some of which wait or never end.
-_OF_THE_SYSTEM = ("/proc/", "/sys/")
 _WILDCARD = re.compile(r"[*?[]")
 
 
@@ -161,7 +160,7 @@ def not_a_file(path: str | Path) -> str:
     if "\0" in str(path):
         return ""
     real = os.path.realpath(path)
-    if real.startswith(_OF_THE_SYSTEM):
+    if real.startswith(OF_THE_SYSTEM):
         return f"{path} is a part of the system and no file that was written; name a measured file"
     if os.path.isdir(real):  # noqa: PTH112 - a name that is too long is none
         return f"{path} is a folder; name a file in it"

@@ -142,3 +142,10 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "campaign.toml")
     with pytest.raises(TomlError, match="it is a pipe, a socket or a device; name a file"):
         read_toml(tmp_path / "campaign.toml")
+
+
+def test_a_part_of_the_system_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    (tmp_path / "campaign.toml").symlink_to("/proc/kmsg")
+    for path in (tmp_path / "campaign.toml", Path("/proc/kmsg"), tmp_path / "../../../../../../proc/version"):
+        with pytest.raises(TomlError, match="it is a part of the system and no file that was written"):
+            read_toml(path)
