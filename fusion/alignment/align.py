@@ -17,7 +17,7 @@ from scipy import ndimage
 from fusion._typing import Array
 from fusion.alignment.reflection_patch import find_switching_patch, seen_throughout
 from fusion.errors import FusionError
-from thermography.fields.tasks.pieces import in_pieces
+from thermography.fields.tasks.pieces import in_pieces, piece_slices
 
 _DIMS = ("cycle", "direction", "target")
 #: Half the width of line and point averages, in plan cells: enough to halve the noise of a single cell.
@@ -356,6 +356,13 @@ class MeasuredLine:
 
     def integrate(self, samples: Array) -> Array:
         """Return the integral of samples (time, sample), K, from axis position 0 to every target, (time, target), K mm."""
+        return np.concatenate([self._integrate_some(samples[some]) for some in piece_slices(samples.shape)])
+
+    def integrate_rise(self, frames: Array | xr.DataArray) -> Array:
+        """Return the same of the rise of frames (time, y, x), degC, since the first one; the samples are not held."""
+        return np.concatenate([self._integrate_some(self._sample_some(rise)) for rise in rise_since_first(frames)])
+
+    def _integrate_some(self, samples: Array) -> Array:
         steps = 0.5 * (samples[:, 1:] + samples[:, :-1]) * np.diff(self.along_mm)
         integral = np.concatenate([np.zeros((samples.shape[0], 1)), np.cumsum(steps, axis=1)], axis=1)
         zero = int(np.argmin(np.abs(self.along_mm)))

@@ -218,7 +218,7 @@ def _alternatives(model: ModelFit, fields: xr.Dataset, axis: AxisGeometry) -> It
     position, seconds = readings.positions_mm, readings.series["axis_integral"].seconds
     along_mm = _on_the_plan(fields, axis)
     line = MeasuredLine(fields, axis, along_mm)
-    known = line.integrate(line.sample_rise(fields["frame_temperature"]))
+    known = line.integrate_rise(fields["frame_temperature"])
 
     def integral(ends_mm: Array) -> Array:
         return _interpolate(ends_mm, along_mm, known)
