@@ -289,15 +289,18 @@ class _Rate:
             for source in _SOURCE_S
             for table in _TABLE_S
         ]
-        columns = np.array(
-            [
-                [np.diff(np.interp(self.seconds + shift, grid, shape)) * self.weight for shape in shapes]
-                for shift in shifts_s
-            ]
-        )
-        columns -= (columns @ self.trend) @ self.trend.T
-        length = np.linalg.norm(columns, axis=-1, keepdims=True)
-        return np.where(length > 1e-9 * max(float(length.max()), 1e-12), columns / np.maximum(length, 1e-12), 0.0)
+        columns = np.empty((len(shifts_s), len(shapes), self.weight.size))
+        length = np.empty((*columns.shape[:2], 1))
+        # Shift after shift and in place: the columns of a long test fill the memory.
+        for place, shift in enumerate(shifts_s):
+            own = columns[place]
+            for row, shape in zip(own, shapes, strict=True):
+                row[:] = np.diff(np.interp(self.seconds + shift, grid, shape)) * self.weight
+            own -= (own @ self.trend) @ self.trend.T
+            length[place] = np.linalg.norm(own, axis=-1, keepdims=True)
+        columns /= np.maximum(length, 1e-12)
+        columns[~(length[..., 0] > 1e-9 * max(float(length.max()), 1e-12))] = 0.0
+        return columns
 
 
 def _load_shift(rate: _Rate, at: Array, load: Array) -> Shift | None:
