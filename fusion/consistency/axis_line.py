@@ -237,7 +237,7 @@ def _alternatives(model: ModelFit, fields: xr.Dataset, axis: AxisGeometry) -> It
             if other and inside(ends):
                 words = f"along a line that runs {way} from x {x[0]:.0f} mm, y {y[0]:.0f} mm"
                 yield words, sign * column(float(origin), ends)
-    if inside(position):
+    if inside(position) and inside(np.zeros(1)):
         mirrored = position.min() + position.max() - position
         yield "with the targets numbered from the other end", column(0.0, mirrored)
         yield "with deviations of the opposite sign", -column(0.0, position)

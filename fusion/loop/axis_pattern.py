@@ -121,7 +121,8 @@ def pattern_p_value(model: ModelFit, term: Term) -> float:
     share = size * (other @ (vt[kept].T @ (score * s[kept])))
     per_target = np.bincount(sites // 2, share)
     freedom = int(kept.sum())
-    left = float(score @ score) - max(0.0, float(per_target.max()))
+    # Where one target carries everything, rounding may leave less than nothing.
+    left = max(0.0, float(score @ score) - max(0.0, float(per_target.max())))
     return float(special.chdtrc(max(1, freedom - 2), left))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import logging
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -22,6 +23,8 @@ from fusion.products.store import Product, StageStamps, annotate, digest, write_
 
 if TYPE_CHECKING:
     from fusion.report.charts.campaign import Drawn
+
+_log = logging.getLogger(__name__)
 
 #: Where each stage keeps its Dataset; what ends up in fusion.nc is kept apart while it may have to be resumed.
 FILES = {
@@ -74,10 +77,14 @@ def _timed(compute: Callable[..., Outcome[Product]], *, report: Report) -> tuple
 
 def _timed_and_drawn(
     compute: Callable[..., Outcome[Product]], draw: Callable[[Outcome[Product]], Drawn], *, report: Report
-) -> tuple[tuple[Outcome[Product], float], Drawn]:
-    """Compute a stage, and draw what it found where that is at hand; see `_timed`."""
+) -> tuple[tuple[Outcome[Product], float], Drawn | None]:
+    """Compute a stage, and draw what it found where that is at hand; see `_timed`. A chart that cannot be drawn costs no result."""
     outcome, spent_s = _timed(compute, report=report)
-    return (outcome, spent_s), draw(outcome)
+    try:
+        return (outcome, spent_s), draw(outcome)
+    except Exception as error:
+        _log.warning("what the stage found could not be drawn (%r); it is tried again for the report", error)
+        return (outcome, spent_s), None
 
 
 def _return_freed_memory() -> None:
@@ -168,7 +175,12 @@ class Run:
         if draw is None:
             return partial(self._finish, stage, self.beside.start(partial(_timed, stage.compute), self.report))
         both = cache(self.beside.start(partial(_timed_and_drawn, stage.compute, draw), self.report))
-        self.drawn.append(lambda: both()[1])
+
+        def drawn() -> Drawn:
+            (outcome, _), charts = both()
+            return draw(outcome) if charts is None else charts
+
+        self.drawn.append(drawn)
         return partial(self._finish, stage, lambda: both()[0])
 
     def draw(self, work: Callable[[], Drawn]) -> None:

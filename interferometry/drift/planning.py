@@ -20,6 +20,8 @@ LONGEST_SEARCH_CYCLES = 100_000
 SHORTEST_TEST_CYCLES = 10
 #: An exponential is reported where it explains a component better than a constant at this level.
 SETTLING_LEVEL = 1e-3
+#: Rounding of a drift component, relative to its size.
+_ROUNDING = 1e-14
 
 
 @dataclass(frozen=True)
@@ -257,7 +259,11 @@ def _fit_exponential(name: str, seconds: Array, series: Array) -> Settling | Non
     lowest, coefficients, residual = solve(float(best.x))
     correlation = float((residual[1:] * residual[:-1]).sum() / max(float((residual**2).sum()), 1e-300))
     independent = max(seconds.size * (1 - max(correlation, 0.0)) / (1 + max(correlation, 0.0)), 5.0)
-    f_ratio = (float(((series - series.mean()) ** 2).sum()) - lowest) / 2 / max(lowest / (independent - 3), 1e-300)
+    total = float(((series - series.mean()) ** 2).sum())
+    # What is constant to rounding has nothing that settles, whatever share of the rounding an exponential explains.
+    if total <= (_ROUNDING * np.abs(series).max(initial=0.0)) ** 2 * series.size:
+        return None
+    f_ratio = max(total - lowest, 0.0) / 2 / max(lowest / (independent - 3), 1e-300)
     if special.fdtrc(2, independent - 3, f_ratio) > SETTLING_LEVEL:
         return None
     limit = max(lowest, 1e-12) * (1 + 3.84 / (independent - 3))

@@ -38,6 +38,8 @@ LIBRARY = {
     "laser_warm_up": 0.85,
     "material_compensation": 0.85,
 }
+#: Campaigns from which the median of their errors is held.
+_ENOUGH_NAMED = 20
 PAIRS = (("air_index", "reversal_drift"), ("step_event", "reversal_drift"), ("unseen_heat_source:flat", "step_event"))
 
 
@@ -85,8 +87,8 @@ def test_one_missing_effect_is_named(name):
     assert wilson(sum(one.wrong > 0 for one in found), RUNS)[0] <= 0.05
     named = [one.after_over_floor for one in found if one.right]
     # A step before the hold-out is known to the carried drift, and what is found in all cycles has no held-out error.
-    # Half of them, as far as so many campaigns can tell, are within 5 % of the error that the truth leaves.
-    assert not named or wilson(sum(error > 1.05 for error in named), len(named))[0] <= 0.5
+    # The median of fewer scatters by more than the 5 % that are asked for.
+    assert len(named) < _ENOUGH_NAMED or np.median(named) <= 1.05
 
 
 @pytest.mark.parametrize("name", list(LIBRARY))

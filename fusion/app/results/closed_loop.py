@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import panel as pn
 import xarray as xr
 
@@ -83,7 +85,7 @@ def loop_steps(products: Products, linker: Linker) -> list[pn.viewable.Viewable]
 def _require_same_run(products: Products, loop: AxisLoop, stored: xr.Dataset) -> None:
     """Refuse a fusion.nc whose last effects are not the steps of results.json."""
     # An effect that entered more than once has its place behind its name.
-    kept = [str(name).split(" ")[0] for name in stored["effect"].values]
+    kept = [re.sub(r" \d+$", "", str(name)) for name in stored["effect"].values]
     steps = [step.effect for step in loop.steps]
     if len(kept) < len(steps) or kept[len(kept) - len(steps) :] != steps:
         raise DamagedProductError(

@@ -122,7 +122,8 @@ def _entry(entries: bytes, kind: int, names: Collection[str]) -> tuple[int, int]
     for begin in range(0, len(entries) - _ENTRY + 1, _ENTRY):
         length, stated = struct.unpack_from("<HB", entries, begin + 64)
         name = entries[begin : begin + min(max(length - 2, 0), 64)].decode("utf-16-le", "replace")
-        if stated == kind and (kind == _ROOT or name in names):
+        # Names differ by more than the case of letters, [MS-CFB] 2.6.4.
+        if stated == kind and (kind == _ROOT or name.casefold() in {one.casefold() for one in names}):
             first, size = struct.unpack_from("<II", entries, begin + 116)
             return first, size
     return None

@@ -27,8 +27,9 @@ _EMPTY_CELLS = 1_200_000
 _MOST_SHEETS = 2_000
 _STREAMS = ("Workbook", "Book")
 _REMEDY = "open it, remove a password if it has one, and save it again as XLSX"
-#: Kinds of records: end of a part, a sheet of the workbook, texts that cells share, what follows of a long record, stated size of a sheet.
-_END, _SHEET, _TEXTS, _CONTINUED, _SIZE = 0x000A, 0x0085, 0x00FC, 0x003C, 0x0200
+#: Kinds of records: end of a part, a sheet of the workbook, texts that cells share, what follows of a long record, stated size of a sheet,
+#: and the one behind which a password hides the contents of all others.
+_END, _SHEET, _TEXTS, _CONTINUED, _SIZE, _LOCKED = 0x000A, 0x0085, 0x00FC, 0x003C, 0x0200, 0x002F
 #: Cells: with a shared text; several numbers in one record; these and the others, but for empty ones, which a reader leaves out.
 _SHARED, _SEVERAL = 0x00FD, 0x00BD
 _CELLS = {2, 3, 4, 5, 6, 0x00D6, 0x0203, 0x0204, 0x0205, 0x0206, 0x027E, 0x0406, _SHARED, _SEVERAL}
@@ -65,8 +66,8 @@ def guarded_workbook(path: Path, content: bytes) -> bytes:
     Raises
     ------
     LaserFormatError
-        The file has more than 100 MB, is no workbook, its sheets are more than 2,000 or lie over one another, or its cells reach too far
-        or hold too much text, see `workbook_limits.refuse_bomb`.
+        The file has more than 100 MB, is no workbook, is locked with a password, its sheets are more than 2,000 or lie over one another, or
+        its cells reach too far or hold too much text, see `workbook_limits.refuse_bomb`.
     """
     if len(content) > _MOST_BYTES:
         raise LaserFormatError(
@@ -92,9 +93,14 @@ def _count(path: Path, extent: Extent, stream: bytearray) -> None:
             sheets.append(struct.unpack_from("<I", stream, begin)[0])
         elif kind == _TEXTS or (kind == _CONTINUED and texts):
             texts.append((begin, length))
+        elif kind == _LOCKED:
+            raise LaserFormatError(f"{path}: is locked with a password; remove it and save the file as XLSX")
         elif texts:
             _share(extent, stream, texts)
             texts = []
+    # Nothing may follow them: a reader does not miss the end.
+    if texts:
+        _share(extent, stream, texts)
     if len(sheets) > _MOST_SHEETS:
         raise LaserFormatError(
             f"{path}: holds {len(sheets)} sheets, at most {_MOST_SHEETS} are read; save the sheet with the measured values alone"

@@ -111,6 +111,22 @@ def test_what_a_stage_found_is_drawn_where_it_was_computed_or_from_what_is_kept(
     assert seen == [({"drift": 1.0}, [0.5, 1.0])] * 2, "drawn once by each run"
 
 
+def test_a_chart_that_cannot_be_drawn_costs_no_result(copied: Path, tmp_path: Path) -> None:
+    work = Counting()
+
+    def draw(outcome: Outcome[xr.Dataset]) -> Drawn:
+        raise MemoryError("no room for a chart")
+
+    run = run_of(copied / "campaign.toml", tmp_path / "results", Elsewhere())
+    begun = run.begin(deviations(work), draw)
+    assert begun()["drift"].values.tolist() == [0.5, 1.0]
+    assert (tmp_path / "results" / "deviations.nc").is_file() and work.times == 1
+    with pytest.raises(MemoryError, match="no room for a chart"):
+        run.drawn[0]()
+    again = run_of(copied / "campaign.toml", tmp_path / "results", Elsewhere())
+    assert again.stage(deviations(work))["drift"].size == 2 and work.times == 1
+
+
 def test_a_stage_begun_beside_counts_the_time_of_its_work_and_not_of_the_wait(copied: Path, tmp_path: Path) -> None:
     def slow(*, report: Report) -> Outcome[xr.Dataset]:
         time.sleep(0.3)

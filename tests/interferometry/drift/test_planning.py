@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from interferometry.drift.estimate import estimate_drift
-from interferometry.drift.planning import estimate_settling, plan_cycles, spacing_warnings
+from interferometry.drift.planning import _fit_exponential, estimate_settling, plan_cycles, spacing_warnings
 from tests.interferometry.simulated_campaigns import CYCLE_S, simulate
 
 
@@ -67,6 +67,16 @@ def test_a_shape_that_the_readings_add_settles_with_the_others(rng: np.random.Ge
 def test_a_stable_machine_has_nothing_to_settle(rng: np.random.Generator) -> None:
     deviations, _ = simulate(rng, kind="none")
     assert estimate_settling(estimate_drift(deviations), deviations) == []
+
+
+def test_what_is_constant_to_rounding_does_not_settle(rng: np.random.Generator) -> None:
+    """An exponential explains rounding by any share, and by less than none."""
+    seconds = np.linspace(0.0, 7200.0, 24)
+    for level in (0.0, 0.1, -3.7, 12.3):
+        assert _fit_exponential("shift", seconds, np.full(24, level)) is None
+        assert _fit_exponential("shift", seconds, level * (1.0 + 2e-16 * rng.normal(size=24))) is None
+    settles = _fit_exponential("shift", seconds, 1e-9 * (1.0 - np.exp(-seconds / 1800.0)))
+    assert settles is not None and settles.t63_s == pytest.approx(1800.0, rel=1e-3), "however small"
 
 
 def test_a_test_too_short_to_see_the_end_says_so(rng: np.random.Generator) -> None:

@@ -14,6 +14,8 @@ from interferometry.io.xls.compound_file import write_stream
 from interferometry.io.xls.records import guarded_workbook, is_compound
 from tests.interferometry.io.xls.old_workbooks import (
     CONTINUED,
+    END,
+    SHEET,
     TABLE,
     TEXTS,
     file_of,
@@ -91,6 +93,37 @@ def test_a_text_counts_as_often_as_cells_share_it() -> None:
         file_of(sheet(*cells), texts=texts)
     )
     assert len(read_sheets(PATH, file_of(sheet(*cells), texts=shared_texts("short", "other")))["s0"]) == 10_000
+
+
+def test_texts_at_the_end_of_a_stream_count_too() -> None:
+    """A reader does not miss the record that should end the part of the shared texts."""
+    cells = b"".join(shared(row, column, 0) for row in range(1_500) for column in range(3))
+    page = record(0x0809, struct.pack("<HHHHII", 0x600, 0x10, 0, 0, 0, 0)) + cells + record(END)
+    begun = record(0x0809, struct.pack("<HHHHII", 0x600, 5, 0, 0, 0, 0))
+    count = 7
+    place = len(begun) + count * 14 + 4
+    heads = b"".join(
+        record(SHEET, struct.pack("<IBBBB", place + k * (len(page) + 4), 0, 0, 2, 0) + b"s%d" % k) for k in range(count)
+    )
+    hidden = b"".join(struct.pack("<HH", 0x1234, len(page)) + page for _ in range(count))
+    stream = begun + heads + hidden + shared_texts("x" * 8_000)
+    told = "take more than 200 million characters"
+    for end in (record(END), b""):
+        with pytest.raises(LaserFormatError, match=told):
+            module._count(PATH, module.Extent(PATH), bytearray(stream + end))
+
+
+def test_a_workbook_that_is_locked_says_so() -> None:
+    """Behind the record of the password the cells are noise, and so are their places."""
+    stream = record(0x0809, bytes(16)) + record(0x002F, bytes(54)) + record(END)
+    assert refused(write_stream("Workbook", stream)) == (
+        "old.xls: is locked with a password; remove it and save the file as XLSX"
+    )
+
+
+@pytest.mark.parametrize("name", ["WORKBOOK", "workbook", "BOOK"])
+def test_the_name_of_the_stream_may_be_written_in_any_case(name: str) -> None:
+    assert len(read_sheets(PATH, write_stream(name, workbook([sheet(*TABLE)])))["s0"]) == 5
 
 
 def test_lengths_of_texts_are_found_in_formats_readings_and_parts() -> None:
