@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion._typing import Array
+from fusion.alignment.readings import sample_noise
 from fusion.alignment.sensor_changes import (
     Excursion,
     Grid,
@@ -24,7 +25,6 @@ from fusion.alignment.sensor_changes import (
     level_beyond_prediction,
     predicted_changes,
 )
-from thermography._robust import scatter_by_median
 
 #: Probability of naming any sensor of a sound record.
 FAMILY_LEVEL = 0.01
@@ -388,10 +388,9 @@ def _noisier(seconds: Array, temperature: Array, grid: Grid, kept: Sequence[int]
         least = float(digits.min(initial=np.inf)) / np.sqrt(12.0)
         for window in range(_NOISE_WINDOWS):
             values = temperature[window * size : (window + 1) * size, k]
-            values = np.diff(values[np.isfinite(values)], 2)
-            if values.size >= _NOISE_SAMPLES // 2:
-                noise = scatter_by_median(values) / np.sqrt(6.0)
-                scale[window, place] = max(noise, least)
+            values = values[np.isfinite(values)]
+            if values.size - 2 >= _NOISE_SAMPLES // 2:
+                scale[window, place] = max(sample_noise(values), least)
     with np.errstate(all="ignore"):
         course = np.log(scale) - np.log(np.nanmedian(scale, axis=0))
     limit = excursion_limit(len(kept))

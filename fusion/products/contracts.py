@@ -87,12 +87,8 @@ def read_product(folder: Path, name: str) -> xr.Dataset:
     """
     path = folder / ("fusion.nc" if name == "record" else f"{name}.nc")
     require_own(folder, [path.name])
-    product = (open_dataset if name == "fields" else read_dataset)(path)
-    try:
-        return require_kind(product, name, path)
-    except DamagedProductError:
-        product.close()
-        raise
+    read = open_dataset if name == "fields" else read_dataset
+    return require_kind(read(path), name, path)
 
 
 def read_fusion(folder: Path) -> xr.DataTree:
@@ -125,7 +121,7 @@ def require_kind(product: xr.Dataset, name: str, path: Path) -> xr.Dataset:
     Raises
     ------
     DamagedProductError
-        With the variables that are missing, or lie over other dims.
+        With the variables that are missing, or lie over other dims. What is refused is closed.
     """
     lacks = [
         f"{variable} {_tuple(dims)}"
@@ -133,6 +129,7 @@ def require_kind(product: xr.Dataset, name: str, path: Path) -> xr.Dataset:
         if variable not in product.variables or product[variable].dims != dims
     ]
     if lacks:
+        product.close()
         raise DamagedProductError(
             f"{path}: is another kind of file: {', '.join(lacks[:3])}{' and more' if len(lacks) > 3 else ''} not in it; "
             "put the file of this run back, or run the campaign again"

@@ -452,9 +452,8 @@ def _with_start_rates(levels: Array, hours: Array, joint: JointFit) -> tuple[Arr
 def _drift_from_state(joint: JointFit, smoothed: Smoothed, at_state: _StateDrift) -> tuple[Array, Array]:
     """Return the drift from the thermal state (n, components) and its covariance (n, components, components) in um and um2."""
     fit = joint.fit
-    total, per_coefficient = _with_start_rates(smoothed.levels, fit.system.seconds / 3600.0, joint)
+    total, dependence = _with_start_rates(smoothed.levels, fit.system.seconds / 3600.0, joint)
     drift = total - at_state.drift
-    dependence = per_coefficient
     dependence -= at_state.per_coefficient
     joined = (
         smoothed.level_covariance + at_state.covariance - at_state.with_drift - at_state.with_drift.transpose(0, 2, 1)

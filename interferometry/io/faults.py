@@ -51,6 +51,21 @@ class BadReading(InterferometryError):
         self.reason = reason
 
 
+def unreadable_spreadsheet(path: Path, fault: object) -> LaserFormatError:
+    """Return the error of a spreadsheet that its reader, or the look into it beforehand, cannot take.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The file.
+    fault : object
+        What is wrong, as text or exception.
+    """
+    return LaserFormatError(
+        f"{path}: cannot be read as a spreadsheet ({fault}); open it, remove a password if it has one, and save it again as XLSX"
+    )
+
+
 def raise_if_mostly_invalid(path: Path, kept: int, left_out: list[RejectedLine]) -> None:
     """Raise where fewer than half of the lines can be used: that is a fault of the file, not of single readings.
 

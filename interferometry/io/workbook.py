@@ -8,12 +8,12 @@ from pathlib import Path
 
 import python_calamine
 
-from interferometry.io.faults import LaserFormatError
+from interferometry.io.faults import LaserFormatError, unreadable_spreadsheet
 from interferometry.io.workbook_limits import MOST_CELLS, refuse_bomb
 from interferometry.io.xls.records import guarded_workbook, is_compound
 
-#: Beginnings of spreadsheet files: a ZIP archive (.xlsx, .ods) and a compound file (.xls).
-_MAGIC = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
+#: Beginning of a ZIP archive, which .xlsx and .ods are.
+_ZIP = b"PK\x03\x04"
 Rows = list[tuple[int, list[str]]]
 
 
@@ -25,7 +25,7 @@ def is_workbook(start: bytes) -> bool:
     start : bytes
         Its first four bytes or more.
     """
-    return start.startswith(_MAGIC)
+    return start.startswith(_ZIP) or is_compound(start)
 
 
 def read_sheets(path: Path, content: bytes) -> dict[str, Rows]:
@@ -68,9 +68,7 @@ def read_sheets(path: Path, content: bytes) -> dict[str, Rows]:
     except BaseException as fault:
         if isinstance(fault, KeyboardInterrupt | SystemExit):
             raise
-        raise LaserFormatError(
-            f"{path}: cannot be read as a spreadsheet ({fault}); open it, remove a password if it has one, and save it again as XLSX"
-        ) from None
+        raise unreadable_spreadsheet(path, fault) from None
     filled = {name: rows for name, rows in sheets.items() if rows}
     if not filled:
         raise LaserFormatError(f"{path}: no visible sheet holds a value; export the measured values again")

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, BinaryIO, cast
 
-from interferometry.io.faults import LaserFormatError
+from interferometry.io.faults import LaserFormatError, unreadable_spreadsheet
 
 #: Cells of a spreadsheet, empty ones between the others among them; no laser test has that many.
 MOST_CELLS = 20_000_000
@@ -183,10 +183,7 @@ def refuse_bomb(path: Path, archive: BinaryIO) -> None:
                     EOFError,
                     struct.error,
                 ) as fault:
-                    raise LaserFormatError(
-                        f"{path}: cannot be read as a spreadsheet ({each.filename}: {fault}); open it, remove a password if it has one, "
-                        "and save it again as XLSX"
-                    ) from None
+                    raise unreadable_spreadsheet(path, f"{each.filename}: {fault}") from None
         extent.end()
     archive.seek(0)
 

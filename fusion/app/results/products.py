@@ -12,7 +12,7 @@ import xarray as xr
 from fusion.products.contracts import read_product, require_kind
 from fusion.products.grouped import group, has
 from fusion.products.results import RecordLoop, Results, read_results
-from fusion.products.store import DamagedProductError, open_in_file, read_json_object, require_own
+from fusion.products.store import open_in_file, read_json_object, require_own
 from fusion.report.charts.thermal_map import LAYERS, Layer, scale_of
 
 #: Cycles from which the one colour scale of all cycles is taken; of a longer test evenly spaced ones.
@@ -66,12 +66,7 @@ class Products:
             return None
         if path.stat().st_size <= _HASHED_BYTES:
             require_own(self.folder, [path.name])
-        opened = open_in_file(path)
-        try:
-            return require_kind(opened, "fields", path)
-        except DamagedProductError:
-            opened.close()
-            raise
+        return require_kind(open_in_file(path), "fields", path)
 
     @cached_property
     def deviations(self) -> xr.Dataset | None:

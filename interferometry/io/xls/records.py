@@ -15,7 +15,7 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-from interferometry.io.faults import LaserFormatError
+from interferometry.io.faults import LaserFormatError, unreadable_spreadsheet
 from interferometry.io.workbook_limits import Extent
 from interferometry.io.xls.compound_file import MAGIC, CompoundFileError, read_stream, write_stream
 
@@ -26,7 +26,6 @@ _EMPTY_CELLS = 1_200_000
 #: Sheets, charts and macros.
 _MOST_SHEETS = 2_000
 _STREAMS = ("Workbook", "Book")
-_REMEDY = "open it, remove a password if it has one, and save it again as XLSX"
 #: Kinds of records: end of a part, a sheet of the workbook, texts that cells share, what follows of a long record, stated size of a sheet,
 #: and the one behind which a password hides the contents of all others.
 _END, _SHEET, _TEXTS, _CONTINUED, _SIZE, _LOCKED = 0x000A, 0x0085, 0x00FC, 0x003C, 0x0200, 0x002F
@@ -43,7 +42,7 @@ def is_compound(content: bytes) -> bool:
     Parameters
     ----------
     content : bytes
-        Its first eight bytes or more.
+        Its first four bytes or more.
     """
     return content.startswith(MAGIC[:4])
 
@@ -81,7 +80,7 @@ def guarded_workbook(path: Path, content: bytes) -> bytes:
         extent.end()
         return write_stream(_STREAMS[0], bytes(stream))
     except (CompoundFileError, struct.error) as fault:
-        raise LaserFormatError(f"{path}: cannot be read as a spreadsheet ({fault}); {_REMEDY}") from None
+        raise unreadable_spreadsheet(path, fault) from None
 
 
 def _count(path: Path, extent: Extent, stream: bytearray) -> None:
